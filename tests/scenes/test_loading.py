@@ -1,0 +1,217 @@
+"""Names, files, text, descriptions, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+
+from torchrl_gn.scenes import (
+    SYSTEMS,
+    SceneChangedWarning,
+    SceneError,
+    UnsupportedSceneError,
+    load_scene,
+    scene_from_description,
+)
+from torchrl_gn.scenes.systems.system import model_file
+
+
+def _model(actuators: str, rest: str = "") -> str:
+    return f"""
+    <mujoco model="small"><worldbody>
+      <body name="a"><joint name="j"/><geom size=".1" pos=".2 0 0"/><site name="s"/>
+        <body name="b" pos=".5 0 0"><joint name="k"/><geom size=".1" pos=".2 0 0"/></body></body>
+    </worldbody>{rest}<actuator>{actuators}</actuator></mujoco>"""
+
+
+GOOD = _model('<motor name="m" joint="j" ctrlrange="-1 2"/>')
+_TENDON = '<tendon><fixed name="t"><joint joint="j" coef="1"/><joint joint="k" coef="2"/></fixed></tendon>'
+
+
+def test_text_file_and_spec_give_the_same_scene(tmp_path):
+    path = tmp_path / "two_links.xml"
+    path.write_text(GOOD)
+    scenes = [load_scene(source) for source in (GOOD, path, str(path), mujoco.MjSpec.from_string(GOOD))]
+    assert [scene.name for scene in scenes] == ["small", "two_links", "two_links", "small"]
+    assert len({scene.fingerprint() for scene in scenes}) == 1
+    assert (scenes[0].action_low[0], scenes[0].action_high[0]) == (-1, 2)
+    assert load_scene(path, name="mine").name == "mine"
+
+
+def test_loading_leaves_a_spec_as_it_was():
+    spec = mujoco.MjSpec.from_string(GOOD)
+    before = spec.to_xml()
+    load_scene(spec)
+    assert spec.to_xml() == before
+
+
+@pytest.mark.parametrize(
+    ("actuators", "rest", "named"),
+    [
+        ('<motor name="pull" tendon="t" ctrlrange="-1 1"/>', _TENDON, ["'pull'", "tendon"]),
+        ('<motor name="jet" site="s" ctrlrange="-1 1"/>', "", ["'jet'", "site"]),
+        ('<adhesion name="glue" body="b" ctrlrange="0 1"/>', "", ["'glue'", "body"]),
+        ('<motor name="m" joint="j"/>', "", ["'m'", "ctrlrange"]),
+        (
+            '<motor name="m" joint="j" ctrlrange="-1 1"/><velocity name="v" joint="j" ctrlrange="-1 1"/>',
+            "",
+            ["'m'", "'v'", "'j'"],
+        ),
+        ('<intvelocity name="i" joint="j" ctrlrange="-1 1" actrange="-1 1"/>', "", ["'i'", "activation"]),
+        ('<motor joint="j" ctrlrange="-1 1"/><motor tendon="t" ctrlrange="-1 1"/>', _TENDON, ["'actuator1'"]),
+        ('<motor name="late" joint="j" ctrlrange="-1 1" delay=".01" nsample="9"/>', "", ["'late'", "delay"]),
+    ],
+)
+def test_refusals_name_the_element(actuators, rest, named):
+    with pytest.raises(UnsupportedSceneError) as error:
+        load_scene(_model(actuators, rest))
+    for text in named:
+        assert text in str(error.value)
+
+
+@pytest.mark.parametrize("domain", ["hopper", "humanoid", "ball_in_cup", "reacher", "finger"])
+def test_other_suite_domains_work(domain):
+    scene = load_scene(model_file(f"suite/{domain}.xml"))
+    assert scene.static.edge_names == load_scene("pendulum").static.edge_names
+    assert scene.num_edges == 2 * scene.model.njnt
+    assert scene.num_actions == scene.model.nu > 0
+    assert scene.timestep == scene.model.opt.timestep
+
+
+@pytest.mark.parametrize(
+    ("domain", "element"),
+    [("quadruped", "yaw_front_left"), ("fish", "fins_flap"), ("point_mass", "t1"), ("manipulator", "grasp")],
+)
+def test_other_suite_domains_are_refused_by_name(domain, element):
+    with pytest.raises(UnsupportedSceneError, match=element):
+        load_scene(model_file(f"suite/{domain}.xml"))
+
+
+def test_humanoid_has_one_edge_type_for_its_free_joint():
+    scene = load_scene(model_file("suite/humanoid.xml"))
+    free = scene.static.edges[:, scene.static.edge_names.index("jnt_type[FREE]")]
+    np.testing.assert_array_equal(np.flatnonzero(free), [0, 1])
+    np.testing.assert_array_equal(scene.translation_invariant, [True, True, False])
+    assert scene.live[1:].all()
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("walker", "'walker2d'"), ("swimer6", "'swimmer6'"), ("Jaco", "'jaco'"), ("zzz", "pendulum, cartpole")],
+)
+def test_unknown_name_lists_the_names(name, hint):
+    with pytest.raises(ValueError, match="Unknown scene") as error:
+        load_scene(name)
+    assert repr(name) in str(error.value) and hint in str(error.value)
+    assert all(known in str(error.value) for known in SYSTEMS if known != "swimmer6")
+
+
+def test_bad_sources():
+    with pytest.raises(ValueError, match="at least 3"):
+        load_scene("swimmer2")
+    with pytest.raises(FileNotFoundError, match="nowhere/there.xml"):
+        load_scene("nowhere/there.xml")
+    with pytest.raises(SceneError, match="bdy"):
+        load_scene("<mujoco><worldbody><bdy/></worldbody></mujoco>")
+    with pytest.raises(SceneError, match="no joint"):
+        load_scene("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    with pytest.raises(SceneError, match="cannot compile scene 'massless'.*inertia"):
+        load_scene("<mujoco model='massless'><worldbody><body><joint/></body></worldbody></mujoco>")
+    with pytest.raises(TypeError, match="MjModel"):
+        load_scene(mujoco.MjModel.from_xml_string(GOOD))
+    with pytest.raises(TypeError, match="int"):
+        load_scene(3)
+
+
+def test_broken_file_is_named_with_mujocos_message(tmp_path):
+    path = tmp_path / "broken.xml"
+    path.write_text("<mujoco><worldbody><bdy/></worldbody></mujoco>")
+    with pytest.raises(SceneError, match=r"broken\.xml.*unrecognized element") as error:
+        load_scene(path)
+    assert "bdy" in str(error.value)
+
+
+@pytest.mark.parametrize("timestep", [0.021, 0.0, -0.02, float("nan"), float("inf")])
+def test_control_step_must_be_whole_physics_steps(timestep):
+    with pytest.raises(SceneError, match="whole multiple of the physics step"):
+        load_scene("swimmer6", timestep=timestep)
+
+
+def test_control_step_can_be_chosen():
+    scene = load_scene("swimmer6", timestep=0.03)
+    assert scene.substeps == 15
+    assert scene.static.globals_[scene.static.global_names.index("timestep")] == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize("source", [*SYSTEMS, "swimmer4", GOOD])
+def test_description_rebuilds_the_scene(source):
+    scene = load_scene(source)
+    again = scene_from_description(json.loads(json.dumps(scene.description())))
+    assert again.fingerprint() == scene.fingerprint()
+    assert (again.name, again.timestep, again.settle_steps) == (
+        scene.name,
+        scene.timestep,
+        scene.settle_steps,
+    )
+    for name in ("body_mass", "body_inertia", "geom_size", "jnt_range", "dof_damping"):
+        np.testing.assert_array_equal(getattr(again.model, name), getattr(scene.model, name))
+
+
+def test_description_of_a_file_needs_no_other_file(tmp_path):
+    """Includes and meshes travel inside the description, with every digit."""
+    (tmp_path / "meshes").mkdir()
+    corners = "v 0 0 0\nv 1 0 0\nv 0 .7 0\nv 0 0 .3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "meshes" / "corner.obj").write_text(corners)
+    (tmp_path / "part.xml").write_text("<mujocoinclude><option density='1.23456789012345'/></mujocoinclude>")
+    (tmp_path / "main.xml").write_text(
+        "<mujoco><compiler meshdir='meshes'/><include file='part.xml'/>"
+        "<asset><mesh name='c' file='corner.obj'/></asset><worldbody><body pos='.123456789012345 0 0'>"
+        "<joint/><geom type='mesh' mesh='c'/></body></worldbody></mujoco>"
+    )
+    scene = load_scene(tmp_path / "main.xml")
+    description = json.loads(json.dumps(scene.description()))
+    for path in (tmp_path / "meshes" / "corner.obj", tmp_path / "part.xml", tmp_path / "main.xml"):
+        path.unlink()
+    again = scene_from_description(description)
+    for name in ("body_mass", "body_inertia", "body_pos", "mesh_vert"):
+        np.testing.assert_array_equal(getattr(again.model, name), getattr(scene.model, name))
+    assert again.model.opt.density == 1.23456789012345
+
+
+def test_changed_physics_warns():
+    description = load_scene(GOOD).description()
+    description["mjcf"] = description["mjcf"].replace('size=".1"', 'size=".11"', 1)
+    with pytest.warns(SceneChangedWarning, match="small"):
+        scene_from_description(description)
+
+
+def test_spec_scene_has_no_exact_description():
+    with pytest.raises(SceneError, match="MjSpec"):
+        load_scene(mujoco.MjSpec.from_string(GOOD)).description()
+
+
+def test_unnamed_elements_get_names():
+    text = GOOD.replace('name="b"', "").replace('name="k"', "")
+    scene = load_scene(text)
+    assert scene.node_names == ("world", "a", "body2")
+    assert scene.joint_names == ("j", "joint1")
+
+
+def test_sleeping_and_disabled_sensors_are_undone():
+    text = GOOD.replace("<worldbody>", '<option><flag sensor="disable" sleep="enable"/></option><worldbody>')
+    flags = load_scene(text).model.opt
+    assert not flags.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
+    assert not flags.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+
+
+def test_printed_summary():
+    text = str(load_scene("jaco"))
+    for part in ("Scene jaco: 10 nodes, 18 edges, 9 actions", "100 ms = 50 x 2 ms", "no axis", "b_base"):
+        assert part in text
+    text = str(load_scene("swimmer6"))
+    for part in ("along xy", "segment_4", "head - segment_0", "0: motor_0", "[-1, 1]", "7 nodes"):
+        assert part in text
+    assert "1 action\n" in str(load_scene("pendulum"))

@@ -1,0 +1,25 @@
+"""Physical scenes as graphs, read from MuJoCo models.
+
+Example:
+    >>> from torchrl_gn.scenes import load_scene
+    >>> scene = load_scene("swimmer6")
+    >>> scene.num_nodes, scene.num_edges, scene.num_actions
+    (7, 16, 5)
+"""
+
+from torchrl_gn.scenes.errors import SceneChangedWarning, SceneError, UnsupportedSceneError
+from torchrl_gn.scenes.load import load_scene, scene_from_description
+from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
+from torchrl_gn.scenes.systems import SYSTEMS
+
+__all__ = [
+    "SYSTEMS",
+    "Attachment",
+    "Scene",
+    "SceneChangedWarning",
+    "SceneError",
+    "StaticGraph",
+    "UnsupportedSceneError",
+    "load_scene",
+    "scene_from_description",
+]

@@ -1,0 +1,165 @@
+"""From an MJCF model to a scene: compile, add the frame sensors, read the graph."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.errors import SceneError, UnsupportedSceneError
+from torchrl_gn.scenes.invariance import translation_invariant
+from torchrl_gn.scenes.mobility import live_channels
+from torchrl_gn.scenes.scene import Attachment, Scene
+from torchrl_gn.scenes.static_features import static_graph
+from torchrl_gn.scenes.topology import Topology, offset, topology
+
+_FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the state
+    mujoco.mjtSensor.mjSENS_FRAMEPOS,
+    mujoco.mjtSensor.mjSENS_FRAMEQUAT,
+    mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+    mujoco.mjtSensor.mjSENS_FRAMEANGVEL,
+)
+
+
+def build_scene(
+    spec: mujoco.MjSpec,
+    *,
+    name: str,
+    timestep: float | None = None,
+    settle_steps: int = 0,
+    origin: dict | None = None,
+) -> Scene:
+    """Read a scene from an MJCF model.
+
+    Changes made to (a copy of) the model: frame sensors of every node are added
+    last, unnamed bodies that carry them are named, warm starts and sleeping are
+    switched off so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone,
+    and sensors are switched on. Contacts, equality constraints and passive tendons
+    have no edge: they act within the physics and a model learns them through nodes
+    and globals.
+
+    Args:
+        spec: the MJCF model, left as it is.
+        name: the scene's name.
+        timestep: control step, seconds, a multiple of the physics step; None is one
+            physics step.
+        settle_steps: physics steps without control after a reset.
+        origin: what :meth:`Scene.description` tells about where the model came from.
+
+    Raises:
+        SceneError: if MuJoCo cannot compile the model or ``timestep`` does not fit it.
+        UnsupportedSceneError: if the graph cannot represent an element, which it names.
+    """
+    model, graph = _compile(spec, name)
+    actuator_of_joint = _actuator_of_joint(model)
+    substeps = _substeps(model, timestep, name)
+    named = _namer(model)
+    return Scene(
+        name=name,
+        model=model,
+        node_names=tuple(named(mujoco.mjtObj.mjOBJ_BODY, body) for body in graph.body),
+        joint_names=tuple(named(mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in range(model.njnt)),
+        actuator_names=tuple(named(mujoco.mjtObj.mjOBJ_ACTUATOR, motor) for motor in range(model.nu)),
+        body=graph.body,
+        parent=graph.parent,
+        senders=graph.senders,
+        receivers=graph.receivers,
+        edge_action=np.repeat(actuator_of_joint, 2),
+        static=static_graph(model, graph, actuator_of_joint, substeps * model.opt.timestep),
+        live=live_channels(model, graph.body),
+        translation_invariant=translation_invariant(model, graph),
+        action_low=model.actuator_ctrlrange[:, 0].copy(),
+        action_high=model.actuator_ctrlrange[:, 1].copy(),
+        substeps=substeps,
+        attachments=_attachments(model, graph),
+        settle_steps=settle_steps,
+        origin=origin or {},
+    )
+
+
+def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
+    spec = spec.copy()
+    flags = mujoco.mjtDisableBit
+    spec.option.disableflags |= int(flags.mjDSBL_WARMSTART)
+    spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
+    spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    try:
+        graph = topology(spec.compile())
+        for body in spec.bodies:
+            if body.id in graph.body:
+                body.name = body.name or f"body{body.id}"
+                for kind in _FRAME_SENSORS:
+                    spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname=body.name)
+        model = spec.compile()
+    except ValueError as error:
+        raise SceneError(f"MuJoCo cannot compile scene {name!r}: {error}") from error
+    if model.njnt == 0:
+        raise SceneError(f"Scene {name!r} has no joint: nothing in it can move.")
+    return model, graph
+
+
+def _namer(model: mujoco.MjModel):
+    def named(kind: mujoco.mjtObj, element: int) -> str:
+        return mujoco.mj_id2name(model, kind, int(element)) or f"{kind.name.removeprefix('mjOBJ_').lower()}{element}"
+
+    return named
+
+
+def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
+    """``[J]`` actuator of each joint, -1 without; refuses what an edge cannot carry."""
+    named = _namer(model)
+    transmission = mujoco.mjtTrn
+    actuators = np.full(model.njnt, -1, dtype=np.int64)
+    for motor in range(model.nactuator):
+        label = f"Actuator {named(mujoco.mjtObj.mjOBJ_ACTUATOR, motor)!r}"
+        kind = transmission(model.actuator_trntype[motor])
+        if kind not in (transmission.mjTRN_JOINT, transmission.mjTRN_JOINTINPARENT):
+            what = kind.name.removeprefix("mjTRN_").lower()
+            raise UnsupportedSceneError(
+                f"{label} acts through a {what}, but an action enters the graph at one joint's "
+                "edges. Give it a joint transmission or remove it."
+            )
+        joint = int(model.actuator_trnid[motor, 0])
+        if model.actuator_ctrlnum[motor] != 1:
+            raise UnsupportedSceneError(f"{label} has {model.actuator_ctrlnum[motor]} controls; an edge carries one.")
+        if model.actuator_dyntype[motor] != mujoco.mjtDyn.mjDYN_NONE or model.actuator_history[motor, 0] > 0:
+            raise UnsupportedSceneError(
+                f"{label} has activation dynamics or a delay, a hidden state that body frames do "
+                "not show. Use an actuator without (dyntype none)."
+            )
+        if not model.actuator_ctrllimited[motor]:
+            raise UnsupportedSceneError(f"{label} has no bounds. Give it a ctrlrange (and ctrllimited).")
+        if actuators[joint] >= 0:
+            other = named(mujoco.mjtObj.mjOBJ_ACTUATOR, int(actuators[joint]))
+            raise UnsupportedSceneError(
+                f"{label} and actuator {other!r} drive the same joint "
+                f"{named(mujoco.mjtObj.mjOBJ_JOINT, joint)!r}; an edge carries one action. Remove one."
+            )
+        actuators[joint] = motor
+    if model.npluginstate:
+        raise UnsupportedSceneError(
+            f"Plugin {named(mujoco.mjtObj.mjOBJ_PLUGIN, 0)!r} keeps a hidden state that body frames do not show."
+        )
+    return actuators
+
+
+def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
+    physics = model.opt.timestep
+    if timestep is None:
+        return 1
+    substeps = round(timestep / physics) if np.isfinite(timestep) else 0
+    if substeps < 1 or abs(substeps * physics - timestep) > 1e-6 * physics:
+        raise SceneError(
+            f"timestep={timestep} s is not a positive whole multiple of the physics step "
+            f"{physics:g} s of scene {name!r}; the nearest is {max(substeps, 1) * physics:g} s."
+        )
+    return substeps
+
+
+def _attachments(model: mujoco.MjModel, graph: Topology) -> dict[str, Attachment]:
+    attachments = {}
+    for body in range(1, model.nbody):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body)
+        node = int(graph.node_of_body[body])
+        if name and body != graph.body[node]:
+            attachments[name] = Attachment(node, *offset(model, body, int(graph.body[node])))
+    return attachments

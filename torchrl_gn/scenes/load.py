@@ -1,0 +1,105 @@
+"""Loading scenes by name, from MJCF, or from their description."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from torchrl_gn.scenes.build import build_scene
+from torchrl_gn.scenes.errors import SceneChangedWarning
+from torchrl_gn.scenes.mjcf_source import is_mjcf_text, read_mjcf, rebuild_mjcf
+from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.systems import SYSTEMS, find_system
+
+
+def load_scene(source: str | Path | mujoco.MjSpec, *, timestep: float | None = None, name: str | None = None) -> Scene:
+    """Load a scene.
+
+    Args:
+        source: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``,
+            ``"swimmerN"`` with N of at least 3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), the
+            path of an MJCF file, MJCF text, or an ``MjSpec``.
+        timestep: control step, seconds, a whole multiple of the model's physics step. By
+            default the paper's for its systems (SM "Description of the simulated
+            environments"), one physics step for any other model.
+        name: name of the scene; by default the system's, the file's or the model's.
+
+    Raises:
+        ValueError: if the name is unknown.
+        FileNotFoundError: if the file does not exist.
+        SceneError: if the MJCF is broken or ``timestep`` does not fit.
+        UnsupportedSceneError: if the graph cannot represent an element, which it names.
+
+    Example:
+        >>> load_scene("swimmer6").timestep
+        0.02
+    """
+    if isinstance(source, mujoco.MjSpec):
+        spec: Any = source
+        return build_scene(spec, name=name or spec.modelname, timestep=timestep)
+    if isinstance(source, mujoco.MjModel):
+        raise TypeError("load_scene needs the MJCF, not a compiled MjModel: give its file, text or MjSpec.")
+    if not isinstance(source, (str, os.PathLike)):
+        raise TypeError(f"load_scene takes a name, a path, MJCF text or an MjSpec, got {type(source).__name__}.")
+    if isinstance(source, str) and not is_mjcf_text(source):
+        system = find_system(source)
+        if system is not None:
+            return build_scene(
+                system.build(),
+                name=name or system.name,
+                timestep=system.timestep if timestep is None else timestep,
+                settle_steps=system.settle_steps,
+                origin={"system": system.name},
+            )
+        if not _looks_like_path(source):
+            raise ValueError(_unknown(source))
+    spec, origin = read_mjcf(source if isinstance(source, str) else Path(source))
+    own_name = spec.modelname if isinstance(source, str) and is_mjcf_text(source) else Path(source).stem
+    return build_scene(spec, name=name or own_name, timestep=timestep, origin=origin)
+
+
+def scene_from_description(description: dict) -> Scene:
+    """Build again the scene that :meth:`Scene.description` described.
+
+    Warns:
+        SceneChangedWarning: if the rebuilt scene has other physics, as another version of
+            MuJoCo or of the model files can give it.
+    """
+    system = find_system(description["system"]) if "system" in description else None
+    if system is None and "system" in description:
+        raise ValueError(_unknown(description["system"]))
+    keys = ("system",) if system else ("mjcf", "assets")
+    scene = build_scene(
+        system.build() if system else rebuild_mjcf(description),
+        name=description["name"],
+        timestep=description["timestep"],
+        settle_steps=description["settle_steps"],
+        origin={key: description[key] for key in keys},
+    )
+    if scene.fingerprint() != description["fingerprint"]:
+        warnings.warn(
+            f"Scene {scene.name!r} does not have the physics it was described with; results may differ "
+            f"(MuJoCo {mujoco.__version__} here).",
+            SceneChangedWarning,
+            stacklevel=2,
+        )
+    return scene
+
+
+def _looks_like_path(source: str) -> bool:
+    return source.endswith((".xml", ".mjcf")) or any(sep in source for sep in "/\\") or Path(source).is_file()
+
+
+def _unknown(name: str) -> str:
+    names = ["swimmerN" if known == "swimmer6" else known for known in SYSTEMS]
+    close = difflib.get_close_matches(name.lower(), SYSTEMS, n=1)
+    hint = f" Did you mean {close[0]!r}?" if close else ""
+    return (
+        f"Unknown scene {name!r}.{hint} Known systems: {', '.join(names)} (N of at least 3); "
+        "or give the path of an MJCF file."
+    )

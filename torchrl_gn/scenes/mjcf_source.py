@@ -1,0 +1,88 @@
+"""Reading MJCF text so that it can be stored whole: includes inlined, assets beside it."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+
+from torchrl_gn.scenes.errors import SceneError
+
+
+def read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
+    """Parse an MJCF file or string.
+
+    Args:
+        source: path of a file, or MJCF text (its first character is ``<``).
+
+    Returns:
+        The parsed model and what rebuilds it: ``{"mjcf": text, "assets": {path: base64}}``.
+
+    Raises:
+        FileNotFoundError: if the file does not exist.
+        SceneError: if the text is no valid MJCF, with MuJoCo's message.
+    """
+    path = None if isinstance(source, str) and is_mjcf_text(source) else Path(source)
+    if path is not None and not path.is_file():
+        raise FileNotFoundError(f"MJCF file not found: {path}")
+    try:
+        if path is None:
+            spec = mujoco.MjSpec.from_string(str(source))
+        else:
+            spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        label = "string" if path is None else f"file {path}"
+        raise SceneError(f"MuJoCo cannot read the MJCF {label}: {error}") from error
+    text = str(source) if path is None else path.read_text()
+    folder = Path() if path is None else path.parent
+    return spec, {"mjcf": _inline(text, folder), "assets": _assets(spec, folder)}
+
+
+def rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
+    """Parse again what :func:`read_mjcf` stored."""
+    assets = {name: base64.b64decode(content) for name, content in origin["assets"].items()}
+    return mujoco.MjSpec.from_string(origin["mjcf"], assets=assets)
+
+
+def is_mjcf_text(source: str) -> bool:
+    """Whether a string is MJCF text rather than a name or a path."""
+    return source.lstrip().startswith("<")
+
+
+def _inline(text: str, folder: Path) -> str:
+    """Replace every ``<include file=.../>`` by the content of its file."""
+    if "<include" not in text:
+        return text
+    root = ElementTree.fromstring(text)
+    _inline_children(root, folder)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _inline_children(element: ElementTree.Element, folder: Path) -> None:
+    children = list(element)
+    for child in children:
+        element.remove(child)
+    for child in children:
+        if child.tag == "include":  # always relative to the main file
+            child = ElementTree.parse(folder / child.attrib["file"]).getroot()
+            _inline_children(child, folder)
+            element.extend(list(child))
+        else:
+            _inline_children(child, folder)
+            element.append(child)
+
+
+def _assets(spec: mujoco.MjSpec, folder: Path) -> dict[str, str]:
+    """Files that the model reads, in base64, by the path under which MuJoCo asks for them."""
+    textures = [texture.file for texture in spec.textures]
+    textures += [file for texture in spec.textures for file in texture.cubefiles]
+    wanted = [(spec.meshdir, mesh.file) for mesh in [*spec.meshes, *spec.hfields, *spec.skins]]
+    wanted += [(spec.texturedir, file) for file in textures]
+    assets = {}
+    for directory, file in wanted:
+        path = folder / directory / file
+        if file and path.is_file():
+            assets[str(Path(directory, file))] = base64.b64encode(path.read_bytes()).decode("ascii")
+    return assets

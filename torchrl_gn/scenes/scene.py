@@ -1,0 +1,210 @@
+"""A physical scene as a graph: bodies are nodes, joints are directed edge pairs."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.errors import SceneError
+
+
+@dataclass(frozen=True)
+class StaticGraph:
+    """Static graph ``G_s`` of a scene (paper, SM "Mujoco variables", float64).
+
+    Attributes:
+        nodes: ``[N, F_n]`` static features of every node, parent-relative frames.
+        edges: ``[E, F_e]`` static features of every directed edge.
+        globals_: ``[F_g]`` static features of the whole scene.
+        node_names: names of the ``F_n`` columns, for example ``"mass"`` or ``"inertia[0]"``.
+        edge_names: names of the ``F_e`` columns.
+        global_names: names of the ``F_g`` columns.
+    """
+
+    nodes: np.ndarray
+    edges: np.ndarray
+    globals_: np.ndarray
+    node_names: tuple[str, ...]
+    edge_names: tuple[str, ...]
+    global_names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A named body welded into a node, at a fixed offset from the node's frame.
+
+    Attributes:
+        node: index of the node that carries the body.
+        pos: ``[3]`` position of the body in the node's frame, metres.
+        quat: ``[4]`` orientation of the body in the node's frame, w-first.
+    """
+
+    node: int
+    pos: np.ndarray
+    quat: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One physical system as a graph, read from a MuJoCo model.
+
+    Node 0 is the world. A node is a group of bodies welded together and its
+    state is the frame of the group's root body. Every joint gives two directed
+    edges, parent to child then child to parent.
+
+    Attributes:
+        name: the system's name, for messages and files.
+        model: compiled MuJoCo model; frame sensors of every node are its last
+            sensors, warm starts are off so that a step depends on
+            ``(physics, action)`` alone.
+        node_names: ``N`` names, ``"world"`` first.
+        joint_names: names of the ``E / 2`` joints, in edge order.
+        actuator_names: ``A`` names, in the order of ``mjData.ctrl``.
+        body: ``[N]`` MuJoCo id of each node's root body.
+        parent: ``[N]`` parent node of each node; the world's is -1.
+        senders: ``[E]`` sending node of each edge.
+        receivers: ``[E]`` receiving node of each edge.
+        edge_action: ``[E]`` index of the action applied at the edge's joint, -1 without motor.
+        static: the static graph, float64.
+        live: ``[N, 12]`` bool, which components of the state change (position 3, rotation
+            3, linear velocity 3, angular velocity 3; world frame) can ever differ from zero.
+        translation_invariant: ``[3]`` bool, world axes along which the dynamics do not
+            depend on where the scene is.
+        action_low: ``[A]`` lower bounds of the controls.
+        action_high: ``[A]`` upper bounds of the controls.
+        substeps: physics steps in one control step.
+        attachments: named bodies that are not a node's root, by name.
+        settle_steps: physics steps without control after a reset, before an episode starts.
+        origin: where the model came from, see :meth:`description`.
+    """
+
+    name: str
+    model: mujoco.MjModel
+    node_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    actuator_names: tuple[str, ...]
+    body: np.ndarray
+    parent: np.ndarray
+    senders: np.ndarray
+    receivers: np.ndarray
+    edge_action: np.ndarray
+    static: StaticGraph
+    live: np.ndarray
+    translation_invariant: np.ndarray
+    action_low: np.ndarray
+    action_high: np.ndarray
+    substeps: int
+    attachments: dict[str, Attachment] = field(default_factory=dict)
+    settle_steps: int = 0
+    origin: dict = field(default_factory=dict, repr=False)
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes ``N``, world included."""
+        return len(self.node_names)
+
+    @property
+    def num_edges(self) -> int:
+        """Number of directed edges ``E``."""
+        return len(self.senders)
+
+    @property
+    def num_actions(self) -> int:
+        """Number of controls ``A``."""
+        return len(self.actuator_names)
+
+    @property
+    def timestep(self) -> float:
+        """Control time step, seconds."""
+        return self.substeps * self.model.opt.timestep
+
+    @cached_property
+    def physics_size(self) -> int:
+        """Length ``S`` of the full MuJoCo state (``mjSTATE_FULLPHYSICS``)."""
+        return mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+
+    @property
+    def sensor_slice(self) -> slice:
+        """Where ``mjData.sensordata`` holds the state.
+
+        ``sensordata[..., scene.sensor_slice]`` reshaped to ``[..., N, 13]`` is position 3,
+        quaternion 4, linear velocity 3, angular velocity 3 of every node, world frame.
+        """
+        return slice(self.model.nsensordata - 13 * self.num_nodes, self.model.nsensordata)
+
+    @property
+    def predicted(self) -> np.ndarray:
+        """``[N]`` bool, nodes with at least one live component; the others never move."""
+        return np.any(self.live, axis=1)
+
+    def description(self) -> dict:
+        """Plain, JSON-able values from which :func:`scene_from_description` builds the scene again.
+
+        A named system is described by its name, a file or string by its MJCF text
+        (includes inlined) and its asset files in base64.
+
+        Raises:
+            SceneError: if the scene was made from an ``MjSpec``, whose XML would round its numbers.
+        """
+        if not self.origin:
+            raise SceneError(
+                f"Scene {self.name!r} was made from an MjSpec and cannot be described exactly; "
+                "write the model as an MJCF file and load that."
+            )
+        return {
+            "name": self.name,
+            "timestep": self.timestep,
+            "settle_steps": self.settle_steps,
+            **self.origin,
+            "fingerprint": self.fingerprint(),
+        }
+
+    def fingerprint(self) -> str:
+        """Hash of topology, static features (six digits) and bounds: equal physics, equal hash."""
+        static = self.static
+        values = (static.nodes, static.edges, static.globals_, self.action_low, self.action_high)
+        text = [*self.node_names, *self.joint_names, *self.actuator_names, str(self.substeps)]
+        text += [f"{value:.6g}" for array in values for value in array.ravel() + 0.0]
+        return hashlib.sha256("\n".join(text).encode()).hexdigest()[:16]
+
+    def __str__(self) -> str:
+        """Readable summary: time steps, nodes, joints, motors, what moves, where it is invariant."""
+        axes = "".join(axis for axis, free in zip("xyz", self.translation_invariant, strict=True) if free)
+        step, physics_step = 1e3 * self.timestep, 1e3 * self.model.opt.timestep
+        counts = ((self.num_nodes, "node"), (self.num_edges, "edge"), (self.num_actions, "action"))
+        lines = [
+            f"Scene {self.name}: " + ", ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts),
+            f"  control step {step:g} ms = {self.substeps} x {physics_step:g} ms",
+            f"  after a reset, {self.settle_steps} physics steps without control",
+            f"  translation-invariant along {axes or 'no axis'}",
+        ]
+        mass = dict(zip(self.static.node_names, self.static.nodes.T, strict=True))["mass"]
+        rows = [("node", "parent", "mass [kg]", "live position", "live rotation", "welded bodies")]
+        for node, name in enumerate(self.node_names):
+            parent = self.node_names[self.parent[node]] if node else "-"
+            welded = [body for body, attachment in self.attachments.items() if attachment.node == node]
+            live = [_axes(self.live[node, :3]), _axes(self.live[node, 3:6])]
+            rows.append((name, parent, f"{mass[node]:.4g}", live[0], live[1], ", ".join(welded) or "-"))
+        lines += _table(rows)
+        rows = [("joint", "type", "between", "action", "bounds")]
+        for joint, name in enumerate(self.joint_names):
+            kind = mujoco.mjtJoint(self.model.jnt_type[joint]).name.removeprefix("mjJNT_").lower()
+            parent, child = (self.node_names[ends[2 * joint]] for ends in (self.senders, self.receivers))
+            action = int(self.edge_action[2 * joint])
+            motor = "-" if action < 0 else f"{action}: {self.actuator_names[action]}"
+            bounds = "-" if action < 0 else f"[{self.action_low[action]:.4g}, {self.action_high[action]:.4g}]"
+            rows.append((name, kind, f"{parent} - {child}", motor, bounds))
+        return "\n".join(lines + _table(rows))
+
+
+def _axes(flags: np.ndarray) -> str:
+    return "".join(axis for axis, live in zip("xyz", flags, strict=True) if live) or "-"
+
+
+def _table(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]

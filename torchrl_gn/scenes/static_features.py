@@ -1,0 +1,169 @@
+"""Static graph of a scene (paper, SM "Mujoco variables included in the graph conversion").
+
+Every scene has the same columns, so that one set of weights binds to any scene.
+Differences from the paper's list:
+
+* ``opt.collision`` no longer exists in MuJoCo: left out.
+* ``actuator_invweight0`` no longer exists: ``actuator_acc0`` (acceleration of the
+  joint under unit force in the initial pose) replaces it.
+* ``timestep`` is the control step, what the model predicts, not the physics step.
+* Bodies welded together are one node: mass, inertia, ipos and iquat are the
+  group's composite, expressed in its root body's frame; pos and quat are relative
+  to the parent group's root frame.
+* ``dof_damping``, ``dof_armature`` and ``dof_frictionloss`` of the joint are added:
+  the paper's list omits them, yet damping and armature set the motion of the
+  cheetah, the walker and the arm. A joint with several degrees of freedom shows
+  the first one's (MJCF gives all of them the same).
+* The bits of ``enableflags`` and ``disableflags``, and the one-hot types, are those
+  of the installed MuJoCo, named after its enumerations.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.scene import StaticGraph
+from torchrl_gn.scenes.topology import Topology, offset
+
+Columns = list[tuple[str, np.ndarray]]
+
+
+def static_graph(model: mujoco.MjModel, graph: Topology, actuator_of_joint: np.ndarray, timestep: float) -> StaticGraph:
+    """Read the static features of every node, edge and of the scene.
+
+    Args:
+        model: compiled model.
+        graph: its topology.
+        actuator_of_joint: ``[J]`` actuator of each joint, -1 without motor.
+        timestep: control step, seconds.
+    """
+    nodes, node_names = _join(_node_columns(model, graph), len(graph.body))
+    joints, joint_names = _join(_joint_columns(model, actuator_of_joint), model.njnt)
+    globals_, global_names = _join(_global_columns(model, timestep), 1)
+    direction = np.tile([1.0, -1.0], model.njnt)
+    return StaticGraph(
+        nodes=nodes,
+        edges=np.concatenate([direction[:, None], np.repeat(joints, 2, axis=0)], axis=1),
+        globals_=globals_[0],
+        node_names=node_names,
+        edge_names=("direction", *joint_names),
+        global_names=global_names,
+    )
+
+
+def _join(columns: Columns, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Put ``[rows]`` and ``[rows, k]`` columns side by side, naming the latter ``name[i]``."""
+    arrays, names = [], []
+    for name, values in columns:
+        values = np.asarray(values, dtype=np.float64)
+        arrays.append(values.reshape(rows, -1))
+        names += [name] if values.ndim < 2 else [f"{name}[{i}]" for i in range(values.shape[1])]
+    return np.concatenate(arrays, axis=1), tuple(names)
+
+
+def _members(enum: type, prefix: str) -> list[tuple[str, int]]:
+    return [(key.removeprefix(prefix), int(value)) for key, value in enum.__members__.items()]
+
+
+def _one_hot(name: str, values: np.ndarray, enum: type, prefix: str) -> Columns:
+    return [(f"{name}[{key}]", (values == code).astype(float)) for key, code in _members(enum, prefix)]
+
+
+def _bits(name: str, value: int, enum: type, prefix: str) -> Columns:
+    return [
+        (f"{name}[{key}]", np.array([float(bool(value & code))]))
+        for key, code in _members(enum, prefix)
+        if not key.startswith("mjN")  # the number of bits, not a bit
+    ]
+
+
+def _global_columns(model: mujoco.MjModel, timestep: float) -> Columns:
+    opt = model.opt
+    scalars = ("density", "viscosity", "impratio", "o_margin")
+    vectors = ("gravity", "wind", "magnetic", "o_solref", "o_solimp")
+    return [
+        ("timestep", np.array([timestep])),
+        *[(name, np.array([getattr(opt, name)])) for name in scalars],
+        *[(name, getattr(opt, name)[None]) for name in vectors],
+        *_bits("enableflags", opt.enableflags, mujoco.mjtEnableBit, "mjENBL_"),
+        *_bits("disableflags", opt.disableflags, mujoco.mjtDisableBit, "mjDSBL_"),
+    ]
+
+
+def _node_columns(model: mujoco.MjModel, graph: Topology) -> Columns:
+    rows = []
+    for node, root in enumerate(graph.body):
+        parent = int(graph.body[graph.parent[node]]) if node else 0
+        bodies = np.flatnonzero(graph.node_of_body == node)
+        rows.append((*offset(model, int(root), parent), *_composite(model, bodies, int(root))))
+    pos, quat, mass, inertia, ipos, iquat = (np.array(column) for column in zip(*rows, strict=True))
+    return [
+        ("mass", mass),
+        ("pos", pos),
+        ("quat", quat),
+        ("inertia", inertia),
+        ("ipos", ipos),
+        ("iquat", iquat),
+    ]
+
+
+def _composite(
+    model: mujoco.MjModel, bodies: np.ndarray, root: int
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """Mass, principal inertia ``[3]``, its origin ``[3]`` and frame ``[4]`` of welded bodies."""
+    heavy = [int(body) for body in bodies if model.body_mass[body] > 0]
+    if len(heavy) <= 1 and (not heavy or heavy[0] == root):
+        return model.body_mass[root], model.body_inertia[root], model.body_ipos[root], model.body_iquat[root]
+
+    mass = model.body_mass[heavy].sum()
+    centers, tensors = [], []
+    for body in heavy:
+        pos, quat = offset(model, body, root)
+        center, principal, matrix = np.empty(3), np.empty(4), np.empty(9)
+        mujoco.mju_rotVecQuat(center, model.body_ipos[body], quat)
+        mujoco.mju_mulQuat(principal, quat, model.body_iquat[body])
+        mujoco.mju_quat2Mat(matrix, principal)
+        rotation = matrix.reshape(3, 3)
+        centers.append(pos + center)
+        tensors.append(rotation @ np.diag(model.body_inertia[body]) @ rotation.T)
+    center = np.average(centers, axis=0, weights=model.body_mass[heavy])
+    total = np.zeros((3, 3))
+    for body, point, tensor in zip(heavy, centers, tensors, strict=True):
+        arm = point - center
+        total += tensor + model.body_mass[body] * (arm @ arm * np.eye(3) - np.outer(arm, arm))  # Steiner
+    inertia, vectors, iquat = np.empty(3), np.empty(9), np.empty(4)
+    mujoco.mju_eig3(inertia, vectors, iquat, total.reshape(-1))
+    return mass, inertia, center, iquat
+
+
+def _joint_columns(model: mujoco.MjModel, actuator_of_joint: np.ndarray) -> Columns:
+    motorized = actuator_of_joint >= 0
+    dof = model.jnt_dofadr
+    vectors = ("axis", "pos", "solimp", "solref", "stiffness", "limited", "range", "margin")
+    columns: Columns = [
+        ("motorized", motorized.astype(float)),
+        *_one_hot("jnt_type", model.jnt_type, mujoco.mjtJoint, "mjJNT_"),
+        *[(f"jnt_{name}", getattr(model, f"jnt_{name}")) for name in vectors],
+        ("dof_damping", model.dof_damping[dof]),
+        ("dof_armature", model.dof_armature[dof]),
+        ("dof_frictionloss", model.dof_frictionloss[dof]),
+    ]
+    for name, values in _actuator_columns(model):
+        per_joint = np.zeros((model.njnt, *values.shape[1:]))
+        per_joint[motorized] = values[actuator_of_joint[motorized]]
+        columns.append((name, per_joint))
+    return columns
+
+
+def _actuator_columns(model: mujoco.MjModel) -> Columns:
+    vectors = (
+        *("biasprm", "cranklength", "ctrllimited", "ctrlrange", "dynprm", "forcelimited", "forcerange"),
+        *("gainprm", "gear", "acc0", "length0", "lengthrange"),
+    )
+    return [
+        *_one_hot("actuator_biastype", model.actuator_biastype, mujoco.mjtBias, "mjBIAS_"),
+        *_one_hot("actuator_dyntype", model.actuator_dyntype, mujoco.mjtDyn, "mjDYN_"),
+        *_one_hot("actuator_gaintype", model.actuator_gaintype, mujoco.mjtGain, "mjGAIN_"),
+        *[(f"actuator_{name}", getattr(model, f"actuator_{name}")) for name in vectors],
+    ]
