@@ -1,0 +1,218 @@
+"""Data sets on disk: repeatable, resumable, refused when damaged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_gn.data import (
+    DatasetError,
+    Simulator,
+    UnstableSimulationError,
+    collect,
+    collect_trajectories,
+    create_dataset,
+    dataset,
+    load_dataset,
+)
+from torchrl_gn.data.dataset_files import DatasetFiles
+from torchrl_gn.scenes import Scene, load_scene
+
+from .conftest import repelled_hinge
+
+SIZES = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
+
+
+@pytest.fixture(autouse=True)
+def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "CHUNK", 4)
+    monkeypatch.setattr(dataset, "CHUNK", 4)
+
+
+def _equal(first: TensorDictBase, second: TensorDictBase) -> bool:
+    assert set(first.keys()) == set(second.keys())
+    return all(torch.equal(first[key], second[key]) for key in first.keys())
+
+
+def _digest(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def test_collected_data_repeat_and_replay(pendulum: Scene) -> None:
+    data = collect_trajectories(pendulum, 10, 6, seed=3)
+    assert data["state"].shape == (10, 7, 2, 13) and data["action"].shape == (10, 6, 1)
+    assert _equal(data, collect_trajectories(pendulum, 10, 6, seed=3, simulator=Simulator(pendulum, 1)))
+    again = Simulator(pendulum).rollout(data["physics"][:, 2], data["action"][:, 2:])
+    assert torch.equal(again["state"], data["state"][:, 2:])
+    starts = torch.cat([collect_trajectories(pendulum, 10, 1, 3, split=split)["physics"][:, 0] for split in range(3)])
+    assert len(starts.unique(dim=0)) == 30
+
+
+def test_on_disk_as_in_memory(tmp_path: Path, pendulum: Scene) -> None:
+    seen = []
+    made = create_dataset(tmp_path / "d", pendulum, **SIZES, progress=lambda *counts: seen.append(counts))
+    assert seen == [(4, 19), (8, 19), (10, 19), (14, 19), (15, 19), (19, 19)]
+    loaded = load_dataset(tmp_path / "d")
+    assert loaded.scene.fingerprint() == pendulum.fingerprint()
+    for number, split in enumerate(("train", "validation", "test")):
+        assert _equal(getattr(made, split), getattr(loaded, split))
+        expected = collect_trajectories(pendulum, SIZES[split], 6, seed=3, split=number)
+        assert _equal(getattr(loaded, split), expected)
+    assert {path.suffix for path in (tmp_path / "d").rglob("*") if path.is_file()} == {".bin", ".json"}
+    assert loaded.rejected == {"train": 0, "validation": 0, "test": 0}
+    assert load_dataset(tmp_path / "d", pendulum).scene is pendulum
+    before = _digest(tmp_path)
+    loaded.train["state"].zero_()
+    assert _equal(create_dataset(tmp_path / "d", pendulum, **SIZES).train, made.train)
+    assert _digest(tmp_path) == before
+
+
+@pytest.mark.parametrize("after", [1, 3, 5])
+@pytest.mark.parametrize("where", ["progress", "write"])
+def test_interrupted_resumes_to_identical_data(
+    after: int, where: str, tmp_path: Path, pendulum: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    create_dataset(tmp_path / "whole", pendulum, **SIZES)
+    calls, write = [], DatasetFiles._write
+
+    def interrupt(*_) -> None:
+        calls.append(None)
+        if len(calls) == after:
+            raise KeyboardInterrupt
+
+    def interrupted_write(files: DatasetFiles, manifest: dict) -> None:
+        if any(manifest["chunks"].values()):  # the rows are on disk, the manifest is not
+            interrupt()
+        write(files, manifest)
+
+    with monkeypatch.context() as patch:
+        if where == "write":
+            patch.setattr(DatasetFiles, "_write", interrupted_write)
+        with pytest.raises(KeyboardInterrupt):
+            progress = interrupt if where == "progress" else None
+            create_dataset(tmp_path / "parts", pendulum, **SIZES, progress=progress)
+    with pytest.raises(DatasetError, match=r"unfinished.*create_dataset"):
+        load_dataset(tmp_path / "parts")
+    seen = []
+    create_dataset(tmp_path / "parts", pendulum, **SIZES, progress=lambda done, _: seen.append(done))
+    assert len(seen) == 6 - after + (where == "write")
+    whole, parts = (
+        {Path(name).relative_to(tmp_path / part): value for name, value in _digest(tmp_path / part).items()}
+        for part in ("whole", "parts")
+    )
+    assert whole == parts
+
+
+def _truncate(folder: Path) -> Path:
+    file = folder / "train" / "state.bin"
+    file.write_bytes(file.read_bytes()[:-8])
+    return file
+
+
+def _extend(folder: Path) -> Path:
+    file = folder / "test" / "physics.bin"
+    file.write_bytes(file.read_bytes() + b"\0" * 8)
+    return file
+
+
+def _flip(folder: Path) -> Path:
+    file = folder / "validation" / "action.bin"
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    return file
+
+
+def _remove(folder: Path) -> Path:
+    (folder / "test" / "action.bin").unlink()
+    return folder / "test" / "action.bin"
+
+
+def _break_manifest(folder: Path) -> Path:
+    file = folder / "manifest.json"
+    file.write_text(file.read_text()[:-20])
+    return file
+
+
+def _drop_from_manifest(folder: Path) -> Path:
+    file = folder / "manifest.json"
+    manifest = json.loads(file.read_text())
+    del manifest["chunks"]
+    file.write_text(json.dumps(manifest))
+    return file
+
+
+def _newer(folder: Path) -> Path:
+    file = folder / "manifest.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "format": 99}))
+    return file
+
+
+@pytest.mark.parametrize("damage", [_truncate, _extend, _flip, _remove, _break_manifest, _drop_from_manifest, _newer])
+def test_damaged_is_refused_named_and_kept(damage, tmp_path: Path, pendulum: Scene) -> None:
+    create_dataset(tmp_path / "d", pendulum, **SIZES)
+    file = damage(tmp_path / "d")
+    before = _digest(tmp_path)
+    for attempt in (
+        lambda: load_dataset(tmp_path / "d"),
+        lambda: create_dataset(tmp_path / "d", pendulum, **SIZES),
+    ):
+        with pytest.raises(DatasetError) as caught:
+            attempt()
+        assert str(file) in str(caught.value)
+        assert ("Update torchrl_gn" if damage is _newer else "create it again") in str(caught.value)
+    assert _digest(tmp_path) == before
+
+
+def test_another_is_not_overwritten(tmp_path: Path, pendulum: Scene) -> None:
+    create_dataset(tmp_path / "d", pendulum, **SIZES)
+    before = _digest(tmp_path)
+    with pytest.raises(DatasetError, match="seed is 3, not 4"):
+        create_dataset(tmp_path / "d", pendulum, **{**SIZES, "seed": 4})
+    with pytest.raises(DatasetError, match="scene is pendulum, not acrobot"):
+        create_dataset(tmp_path / "d", load_scene("acrobot"), **SIZES)
+    with pytest.raises(DatasetError, match="'pendulum'.*not of 'acrobot'"):
+        load_dataset(tmp_path / "d", load_scene("acrobot"))
+    assert _digest(tmp_path) == before
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "thesis.txt").write_text("important")
+    with pytest.raises(DatasetError, match="not empty and has no manifest"):
+        create_dataset(tmp_path / "notes", pendulum, **SIZES)
+    with pytest.raises(DatasetError, match="no such file"):
+        load_dataset(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="validation must be at least 1, got 0"):
+        create_dataset(tmp_path / "e", pendulum, validation=0)
+    with pytest.raises(ValueError, match="seed must not be negative, got -1"):
+        create_dataset(tmp_path / "e", pendulum, seed=-1)
+    assert not (tmp_path / "e").exists()
+
+
+def test_resuming_with_other_versions_is_refused(
+    tmp_path: Path, pendulum: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        create_dataset(tmp_path / "d", pendulum, **SIZES, progress=interrupt)
+    monkeypatch.setattr(dataset, "package_versions", lambda: {"mujoco": "9"})
+    with pytest.raises(DatasetError, match="would go on differently with {'mujoco': '9'}"):
+        create_dataset(tmp_path / "d", pendulum, **SIZES)
+
+
+def test_unstable_sequences_are_drawn_again_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()  # chunks of the usual size
+    scene = repelled_hinge(3.0)  # 4.5 % of the starts are beyond
+    made = create_dataset(tmp_path / "d", scene, train=300, validation=20, test=20, steps=2)
+    assert 3 <= made.rejected["train"] < 40
+    assert (made.train["physics"][..., 1].abs() < 3.001).all()
+    assert len(np.unique(made.train["physics"][:, 0], axis=0)) == 300
+    with pytest.raises(UnstableSimulationError, match="'repelled' became unstable"):
+        collect_trajectories(repelled_hinge(1.5), 100, 2)

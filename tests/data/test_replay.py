@@ -1,0 +1,141 @@
+"""Replay buffer: true transitions, every one equally likely, repeatable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from scipy import stats
+from tensordict import TensorDict
+from torchrl.data import ReplayBufferEnsemble
+
+from torchrl_gn.data import collect_trajectories, create_dataset, load_dataset, trajectory_buffer
+from torchrl_gn.scenes import Scene, load_scene
+
+
+def _counting(num: int, steps: int, first: int = 0) -> TensorDict:
+    """States and actions that tell their trajectory and time: ``100 m + t``."""
+    here = 100.0 * torch.arange(first, first + num)[:, None] + torch.arange(steps + 1)
+    return TensorDict(
+        {
+            "state": here[..., None, None].expand(num, steps + 1, 2, 13).double().contiguous(),
+            "action": here[:, :-1, None].double().contiguous(),
+            "physics": here[..., None].double().contiguous(),
+        },
+        batch_size=[num],
+    )
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_samples_are_consecutive_transitions(swimmer: Scene, window: int) -> None:
+    data = collect_trajectories(swimmer, 6, 9, seed=0)
+    batch = trajectory_buffer(data, batch_size=50, window=window, seed=0).sample()
+    shape = (50,) if window == 1 else (50, window)
+    assert batch.shape == shape and batch["next"].shape == shape
+    assert batch["state"].shape == (*shape, 7, 13) and batch["action"].shape == (*shape, 5)
+    assert batch["state"].dtype == torch.float64
+    trajectory, time = batch["index"].unbind(-1)
+    assert torch.equal(batch["state"], data["state"][trajectory, time])
+    assert torch.equal(batch["next", "state"], data["state"][trajectory, time + 1])
+    assert torch.equal(batch["action"], data["action"][trajectory, time])
+    if window > 1:
+        assert torch.equal(batch["next", "state"][:, :-1], batch["state"][:, 1:])
+        assert (trajectory == trajectory[:, :1]).all() and (time.diff(dim=1) == 1).all()
+
+
+def test_a_part_of_the_time(swimmer: Scene) -> None:
+    data = collect_trajectories(swimmer, 3, 9, seed=0)
+    part = TensorDict({"state": data["state"][:, 4:8], "action": data["action"][:, 4:7]}, [3])
+    batch = trajectory_buffer(part, batch_size=50, seed=0).sample()
+    trajectory, time = batch["index"].unbind(-1)
+    assert torch.equal(batch["next", "state"], data["state"][trajectory, time + 5])
+
+
+@pytest.mark.parametrize("window", [1, 3, 5])
+def test_every_window_is_equally_likely(window: int) -> None:
+    buffer = trajectory_buffer(_counting(4, 5), batch_size=20_000, window=window, seed=1)
+    drawn = buffer.sample()["index"].reshape(20_000, window, 2)[:, 0]
+    counts = torch.zeros(4, 5 - window + 1).index_put_(drawn.unbind(-1), torch.ones(20_000), accumulate=True)
+    assert stats.chisquare(counts.flatten().numpy()).pvalue > 1e-3
+
+
+def test_draws_repeat_and_resume() -> None:
+    data = _counting(5, 7)
+    first, second = (trajectory_buffer(data, batch_size=8, seed=3) for _ in range(2))
+    assert torch.equal(first.sample()["index"], second.sample()["index"])
+    saved = first.state_dict()
+    expected = [first.sample()["index"] for _ in range(3)]
+    torch.manual_seed(0)  # the global generator has no part in it
+    resumed = trajectory_buffer(data, batch_size=8, seed=99)
+    resumed.load_state_dict(saved)
+    assert all(torch.equal(resumed.sample()["index"], index) for index in expected)
+    assert not saved["_storage"]  # the data are not part of a checkpoint
+    other = trajectory_buffer(data, batch_size=8, seed=4)
+    assert not torch.equal(other.sample()["index"], expected[0])
+
+
+def test_statics_are_gathered_by_trajectory() -> None:
+    data = _counting(5, 7)
+    mass = torch.arange(5.0)[:, None]
+    data["static"] = TensorDict({"nodes": mass[..., None].expand(5, 2, 1)}, batch_size=[5])
+    for window in (1, 3):
+        batch = trajectory_buffer(data, batch_size=20, window=window, seed=0).sample()
+        assert batch["static"].batch_size == batch.batch_size
+        assert torch.equal(batch["static", "nodes"][..., 0, 0], batch["index"][..., 0].float())
+
+
+def test_extending_gives_way_to_the_newest() -> None:
+    buffer = trajectory_buffer(_counting(3, 5), batch_size=500, window=2, seed=0, capacity=5)
+    assert len(buffer) == 3 and set(_trajectories(buffer)) == {0, 1, 2}
+    buffer.extend(_counting(4, 5, first=3))
+    assert len(buffer) == 5 and set(_trajectories(buffer)) == {2, 3, 4, 5, 6}
+    batch = buffer.sample()
+    assert torch.equal(batch["next", "state"], batch["state"] + 1)
+    saved = buffer.state_dict()
+    other = trajectory_buffer(_counting(3, 5, first=50), batch_size=500, window=2, seed=7, capacity=5)
+    other.load_state_dict(saved)
+    assert torch.equal(other.sample()["state"], buffer.sample()["state"])
+
+
+def _trajectories(buffer) -> list[int]:
+    return (buffer.sample()["action"][..., 0] // 100).long().unique().tolist()
+
+
+def test_reads_a_data_set_on_disk_silently(tmp_path: Path, pendulum: Scene, capfd) -> None:
+    create_dataset(tmp_path, pendulum, train=6, validation=1, test=1, steps=8)
+    data = load_dataset(tmp_path).train
+    buffer = trajectory_buffer(data, batch_size=10, window=8, seed=0)
+    batch = buffer.sample()
+    assert torch.equal(batch["next", "state"], data["state"][batch["index"][:, 0, 0], 1:])
+    assert torch.equal(buffer[2]["state"], data["state"][2])
+    with pytest.raises(RuntimeError, match="doesn't allow writing"):
+        buffer.extend(data.clone())
+    assert "".join(capfd.readouterr()) == ""
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_several_systems_give_a_sub_batch_each(window: int, pendulum: Scene) -> None:
+    data = [collect_trajectories(scene, 4, 6) for scene in (pendulum, load_scene("acrobot"))]
+    buffers = [trajectory_buffer(each, batch_size=5, window=window, seed=0) for each in data]
+    both = ReplayBufferEnsemble(*buffers, batch_size=10, sample_from_all=True)
+    for stored, batch in zip(data, both.sample().unbind(0), strict=True):
+        assert len(batch) == 5
+        trajectory, time = batch["index", "index"].unbind(-1)
+        assert torch.equal(batch["next", "state"], stored["state"][trajectory, time + 1])
+
+
+def test_what_cannot_be_sampled_is_refused() -> None:
+    data = _counting(3, 5)
+    with pytest.raises(ValueError, match="window is 6 transitions, but the trajectories have 5"):
+        trajectory_buffer(data, batch_size=2, window=6)
+    with pytest.raises(ValueError, match="no trajectory"):
+        trajectory_buffer(data[:0], batch_size=2)
+    with pytest.raises(KeyError, match="no 'action'"):
+        trajectory_buffer(data.exclude("action"), batch_size=2)
+    with pytest.raises(ValueError, match="one state more than actions"):
+        trajectory_buffer(TensorDict({**data, "state": data["state"][:, 1:]}, [3]), batch_size=2)
+    with pytest.raises(ValueError, match="capacity is 2, but 3"):
+        trajectory_buffer(data, batch_size=2, capacity=2)
+    with pytest.raises(ValueError, match="batch_size and window"):
+        trajectory_buffer(data, batch_size=0)

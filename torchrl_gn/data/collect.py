@@ -1,0 +1,121 @@
+"""Trajectories under random control, in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.data.controls import spline_controls
+from torchrl_gn.data.errors import UnstableSimulationError
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.scenes.scene import Scene
+
+CHUNK = 250
+"""Sequences that share one derived seed; part of what makes data repeat, so it never changes."""
+
+_ATTEMPTS = 20
+_MAX_REJECTED = 0.1
+
+
+def collect_trajectories(
+    scene: Scene,
+    num: int,
+    steps: int = 100,
+    seed: int = 0,
+    *,
+    split: int = 0,
+    knot_interval: float = 10.0,
+    simulator: Simulator | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> TensorDict:
+    """Simulate a scene under random control (paper, SM "Datasets").
+
+    Starts are those of :func:`~torchrl_gn.data.sample_start_states`, actions those of
+    :func:`~torchrl_gn.data.spline_controls`. The result depends on the arguments alone, not on
+    the number of threads.
+
+    Args:
+        scene: the scene.
+        num: number of sequences.
+        steps: control steps ``T`` of each.
+        seed: seed of starts and actions.
+        split: data of equal seed and another split are independent;
+            :func:`~torchrl_gn.data.create_dataset` gives 0, 1, 2 to train, validation, test.
+        knot_interval: control steps between the knots of the random actions.
+        simulator: simulator of that scene, to reuse its threads.
+        progress: called with sequences done and wanted.
+
+    Returns:
+        TensorDict ``[num]``, float64: ``state`` ``[num, T+1, N, 13]``, ``action`` ``[num, T, A]``,
+        ``physics`` ``[num, T+1, S]``.
+
+    Raises:
+        ValueError: ``num`` or ``steps`` is below one.
+        UnstableSimulationError: more than a tenth of the simulations become unstable (fewer are
+            drawn again).
+    """
+    if num < 1 or steps < 1:
+        raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
+    simulator = simulator or Simulator(scene)
+    chunks = []
+    for first in range(0, num, CHUNK):
+        count = min(CHUNK, num - first)
+        chunk, _ = collect_chunk(simulator, count, steps, seed, (split, first // CHUNK), knot_interval=knot_interval)
+        chunks.append(chunk)
+        if progress is not None:
+            progress(first + count, num)
+    return cast(TensorDict, torch.cat(chunks)) if len(chunks) > 1 else chunks[0]
+
+
+def collect_chunk(
+    simulator: Simulator,
+    count: int,
+    steps: int,
+    seed: int,
+    key: tuple[int, ...],
+    *,
+    knot_interval: float,
+) -> tuple[TensorDict, int]:
+    """Simulate the sequences that share one derived seed, drawing unstable ones again.
+
+    Args:
+        simulator: simulator of one scene.
+        count: number of sequences.
+        steps: control steps of each.
+        seed: the data set's seed.
+        key: distinguishes the chunk's seed from all others'.
+        knot_interval: control steps between the knots of the random actions.
+
+    Returns:
+        TensorDict ``[count]`` of ``state``, ``action`` and ``physics``, and the number of
+        unstable simulations that were rejected.
+    """
+    scene = simulator.scene
+    result, rejected, pending = None, 0, torch.arange(count)
+    for attempt in range(_ATTEMPTS):
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*key, attempt)))
+        start, bad_starts = draw_start_states(scene, len(pending), rng, simulator)
+        action = spline_controls(scene, len(pending), steps, rng, knot_interval=knot_interval)
+        drawn = simulator.rollout(start, action)
+        drawn["action"] = torch.from_numpy(action)
+        stable = drawn.pop("stable")
+        if result is None:
+            result = drawn
+        else:
+            result[pending] = drawn
+        pending = pending[~stable]
+        rejected += len(pending) + bad_starts
+        if rejected > max(_MAX_REJECTED * count, 10):
+            break
+        if not len(pending):
+            return result, rejected
+    raise UnstableSimulationError(
+        f"{rejected} simulations of {scene.name!r} became unstable while {count} sequences of {steps} steps "
+        "were wanted. Use a smaller physics step in the model, smaller action bounds, or a larger "
+        "knot_interval."
+    )

@@ -1,0 +1,59 @@
+"""Random control signals (paper, SM "Random control")."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from torchrl_gn.scenes.scene import Scene
+
+_MARGIN = 2  # knots before and after the sequence, so that the ends are like the middle
+
+
+def spline_controls(
+    scene: Scene, num: int, steps: int, rng: int | np.random.Generator, *, knot_interval: float = 10.0
+) -> np.ndarray:
+    """Smooth random action sequences (paper, SM "Random control").
+
+    The paper takes "randomly selected time steps from spline interpolations of randomly
+    generated values": here cubic splines through knots uniform within each action's
+    bounds, read from a random phase between two knots on. A spline overshoots its knots, so
+    values are clipped to the bounds.
+
+    Paper: it does not say how far apart the knots are; 10 control steps is our choice.
+
+    Args:
+        scene: the scene, for the number of actions and their bounds.
+        num: number of sequences.
+        steps: control steps ``T`` of each.
+        rng: generator or seed; equal seeds give equal signals.
+        knot_interval: control steps between knots, above 0; the larger, the slower the signal.
+
+    Returns:
+        ``[num, T, A]`` float64, in the actuators' units.
+
+    Raises:
+        ValueError: ``num`` or ``steps`` is negative or ``knot_interval`` not above 0.
+    """
+    if num < 0 or steps < 0:
+        raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")
+    if not (knot_interval > 0 and math.isfinite(knot_interval)):
+        raise ValueError(f"knot_interval must be above 0, got {knot_interval}")
+    rng = np.random.default_rng(rng)
+    if num == 0 or steps == 0 or scene.num_actions == 0:
+        return np.zeros((num, steps, scene.num_actions))
+
+    knots = math.ceil((steps - 1) / knot_interval) + 2 + 2 * _MARGIN
+    values = rng.uniform(scene.action_low, scene.action_high, (knots, num, scene.num_actions))
+    phase = rng.uniform(0.0, 1.0, (num, 1))
+    spline = CubicSpline(np.arange(knots), values, bc_type="natural")
+
+    # CubicSpline reads all sequences at the same times; each has its own phase.
+    time = _MARGIN + phase + np.arange(steps) / knot_interval  # [num, T], in knots
+    segment = np.minimum(time.astype(np.int64), knots - 2)
+    x = (time - segment)[..., None]
+    cubic = spline.c[:, segment, np.arange(num)[:, None]]  # [4, num, T, A]
+    controls = ((cubic[0] * x + cubic[1]) * x + cubic[2]) * x + cubic[3]
+    return np.clip(controls, scene.action_low, scene.action_high)

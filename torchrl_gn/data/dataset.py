@@ -1,0 +1,216 @@
+"""Data sets of random trajectories on disk (paper, SM "Datasets")."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from operator import index
+from pathlib import Path
+
+from tensordict import TensorDict
+
+from torchrl_gn.data.collect import CHUNK, collect_chunk, collect_trajectories
+from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, package_versions
+from torchrl_gn.data.errors import DatasetError
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.scenes.errors import SceneError
+from torchrl_gn.scenes.load import scene_from_description
+from torchrl_gn.scenes.scene import Scene
+
+__all__ = ["TrajectoryDataset", "collect_trajectories", "create_dataset", "load_dataset"]
+
+
+@dataclass(frozen=True)
+class TrajectoryDataset:
+    """Trajectories of a scene under random control, in three splits.
+
+    Each split is a TensorDict ``[M]``, float64: ``state`` ``[M, T+1, N, 13]``, ``action`` ``[M, T, A]`` and
+    ``physics`` ``[M, T+1, S]``. They are mapped from disk, read when needed; writing to them changes
+    memory only, never the files.
+
+    Attributes:
+        scene: the scene.
+        train: sequences to train on.
+        validation: sequences to stop early on.
+        test: sequences to report errors on.
+        rejected: for each split, how many simulations were unstable and drawn again.
+        manifest: the data set's manifest: seed, steps, package versions, checksums.
+    """
+
+    scene: Scene
+    train: TensorDict
+    validation: TensorDict
+    test: TensorDict
+    rejected: dict[str, int]
+    manifest: dict = field(repr=False)
+
+
+def create_dataset(
+    path: str | os.PathLike,
+    scene: Scene,
+    train: int = 10_000,
+    validation: int = 1_000,
+    test: int = 1_000,
+    steps: int = 100,
+    seed: int = 0,
+    *,
+    knot_interval: float = 10.0,
+    num_threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> TrajectoryDataset:
+    """Simulate a data set onto disk, or finish or load the one that is there.
+
+    The default sizes are the paper's. Data depend on the scene, sizes, ``steps``, ``seed`` and
+    ``knot_interval`` alone. They are written in chunks; after an interruption the same call goes on
+    where it stopped and gives the same bits. Splits have independent seeds. Unstable simulations
+    are drawn again and counted.
+
+    Args:
+        path: folder of the data set, new, empty or begun by an equal call.
+        scene: the scene.
+        train: number of training sequences.
+        validation: number of validation sequences.
+        test: number of test sequences.
+        steps: control steps of each sequence.
+        seed: seed, not negative.
+        knot_interval: control steps between the knots of the random actions.
+        num_threads: threads of the simulation. Default: the cores this process may use.
+        progress: called with sequences done and wanted, after every chunk.
+
+    Raises:
+        ValueError: a size or ``steps`` is below one, or ``seed`` below zero.
+        DatasetError: the folder holds something else, another or a damaged data set; nothing of it
+            is changed.
+        UnstableSimulationError: more than a tenth of a chunk's simulations become unstable.
+    """
+    sizes = dict(zip(SPLITS, map(index, (train, validation, test)), strict=True))
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}")
+    for name, value in {**sizes, "steps": steps}.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    files = DatasetFiles(Path(path))
+    request = {
+        "scene": scene.name,
+        "fingerprint": scene.fingerprint(),
+        "sizes": sizes,
+        "steps": index(steps),
+        "seed": index(seed),
+        "knot_interval": float(knot_interval),
+        "chunk": CHUNK,
+    }
+    if files.exists():
+        manifest = files.read()
+        _check_same(files, manifest, request)
+        files.verify(manifest)
+    else:
+        manifest = {
+            "format": FORMAT,
+            "request": request,
+            "description": _description(scene),
+            "entries": {
+                "state": [steps + 1, scene.num_nodes, 13],
+                "action": [steps, scene.num_actions],
+                "physics": [steps + 1, scene.physics_size],
+            },
+            "versions": package_versions(),
+            "chunks": {split: [] for split in SPLITS},
+        }
+        files.create(manifest)
+    if not files.is_complete(manifest):
+        _collect_missing(files, manifest, scene, num_threads, progress)
+    return _open(files, manifest, scene)
+
+
+def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify: bool = True) -> TrajectoryDataset:
+    """Open a finished data set.
+
+    Args:
+        path: folder of the data set.
+        scene: the scene it must be of. Default: the one it was made with, built again.
+        verify: compare every file with its checksums (reads all of it once).
+
+    Raises:
+        DatasetError: it is missing, unfinished, damaged, of another scene or made by a newer
+            version of this library. The message names the file and what to do.
+    """
+    files = DatasetFiles(Path(path))
+    manifest = files.read()
+    if not files.is_complete(manifest):
+        done = {split: len(chunks) for split, chunks in manifest["chunks"].items()}
+        raise DatasetError(
+            f"{files.manifest_path}: the data set is unfinished (chunks done: {done}). Call create_dataset "
+            "with the arguments it was begun with to finish it."
+        )
+    files.verify(manifest, checksums=verify)
+    if scene is None:
+        if manifest["description"] is None:
+            raise DatasetError(
+                f"{files.manifest_path}: scene {manifest['request']['scene']!r} was made from an MjSpec and "
+                "cannot be built again from the data set. Pass it as load_dataset(path, scene)."
+            )
+        scene = scene_from_description(manifest["description"])
+    elif scene.fingerprint() != manifest["request"]["fingerprint"]:
+        raise DatasetError(
+            f"{files.manifest_path}: the data set is of scene {manifest['request']['scene']!r} "
+            f"(fingerprint {manifest['request']['fingerprint']}), not of {scene.name!r} "
+            f"({scene.fingerprint()}). Load the data set of that scene, or create one in another folder."
+        )
+    return _open(files, manifest, scene)
+
+
+def _collect_missing(
+    files: DatasetFiles,
+    manifest: dict,
+    scene: Scene,
+    num_threads: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    request, versions = manifest["request"], package_versions()
+    if manifest["versions"] != versions:
+        raise DatasetError(
+            f"{files.manifest_path}: the data set was begun with {manifest['versions']} and would go on "
+            f"differently with {versions}. Finish it with those versions, or use another folder."
+        )
+    simulator = Simulator(scene, num_threads)
+    total = sum(request["sizes"].values())
+    done = sum(min(len(manifest["chunks"][split]) * CHUNK, size) for split, size in request["sizes"].items())
+    for number, (split, size) in enumerate(request["sizes"].items()):
+        for first in range(len(manifest["chunks"][split]) * CHUNK, size, CHUNK):
+            chunk, rejected = collect_chunk(
+                simulator,
+                min(CHUNK, size - first),
+                request["steps"],
+                request["seed"],
+                (number, first // CHUNK),
+                knot_interval=request["knot_interval"],
+            )
+            arrays = {name: chunk.get(name).numpy() for name in manifest["entries"]}
+            files.append(manifest, split, arrays, rejected)
+            done += len(chunk)
+            if progress is not None:
+                progress(done, total)
+
+
+def _open(files: DatasetFiles, manifest: dict, scene: Scene) -> TrajectoryDataset:
+    rejected = {split: sum(chunk["rejected"] for chunk in chunks) for split, chunks in manifest["chunks"].items()}
+    splits = {split: files.open(manifest, split) for split in SPLITS}
+    return TrajectoryDataset(scene=scene, rejected=rejected, manifest=manifest, **splits)
+
+
+def _check_same(files: DatasetFiles, manifest: dict, request: dict) -> None:
+    there = manifest["request"]
+    differing = [key for key in request if there.get(key) != request[key]]
+    if differing:
+        what = ", ".join(f"{key} is {there.get(key)}, not {request[key]}" for key in differing)
+        raise DatasetError(
+            f"{files.manifest_path}: another data set is there ({what}). Use another folder, or delete this one."
+        )
+
+
+def _description(scene: Scene) -> dict | None:
+    try:
+        return scene.description()
+    except SceneError:  # made from an MjSpec
+        return None

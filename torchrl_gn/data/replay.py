@@ -1,0 +1,236 @@
+"""Replay buffer of transitions and windows over whole trajectories."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
+from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictRoundRobinWriter
+
+_KEYS = ("state", "action", "static")
+
+
+def trajectory_buffer(
+    trajectories: TensorDictBase,
+    *,
+    batch_size: int,
+    window: int = 1,
+    seed: int | None = None,
+    capacity: int | None = None,
+) -> TensorDictReplayBuffer:
+    """Replay buffer that draws transitions, or windows of them, from trajectories.
+
+    Every (trajectory, start time) is equally likely, with replacement. Trajectories stay as
+    they are, in memory or on disk, and the next state is read from them: nothing is
+    stored twice.
+
+    ``sample()`` gives a TensorDict ``[batch_size]``, or ``[batch_size, window]`` for windows longer
+    than one, with ``state`` ``[..., N, 13]``, ``action`` ``[..., A]``, ``("next", "state")`` ``[..., N, 13]``
+    and ``index`` ``[..., 2]``, trajectory and time. Entries of ``static``, stored once per trajectory, are
+    gathered with them (windows see views). ``buffer[i]`` gives whole trajectories.
+
+    To resume a run save ``buffer.state_dict()``: it holds the state of the random draws, and the
+    trajectories only with ``capacity``.
+
+    Args:
+        trajectories: ``[M]`` with ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and possibly
+            ``static`` (a tensor ``[M, ...]`` or a TensorDict ``[M]``); other entries are left out.
+        batch_size: how many transitions or windows a sample has.
+        window: consecutive transitions in one draw.
+        seed: seed of the draws. Default: drawn from torch's global generator.
+        capacity: number of trajectories to make room for in memory, to ``extend`` the buffer with
+            more of equal shape, the oldest giving way. Default: the buffer is read-only.
+
+    Raises:
+        KeyError: ``state`` or ``action`` is missing.
+        ValueError: no trajectory, trajectories shorter than ``window``, shapes that do not fit, or
+            ``capacity`` smaller than the number of trajectories.
+
+    Example:
+        >>> from torchrl_gn.data import collect_trajectories
+        >>> from torchrl_gn.scenes import load_scene
+        >>> trajectories = collect_trajectories(load_scene("pendulum"), num=4, steps=10)
+        >>> buffer = trajectory_buffer(trajectories, batch_size=32, window=5, seed=0)
+        >>> buffer.sample()["next", "state"].shape
+        torch.Size([32, 5, 2, 13])
+    """
+    if batch_size < 1 or window < 1:
+        raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
+    trajectories = _checked(trajectories, window)
+    count = len(trajectories)
+    if capacity is None:
+        storage, writer = TrajectoryStorage(trajectories), ImmutableDatasetWriter()
+    elif capacity < count:
+        raise ValueError(f"capacity is {capacity}, but {count} trajectories are given")
+    else:
+        room = trajectories.apply(lambda x: x.new_zeros(capacity, *x.shape[1:]), batch_size=[capacity])
+        storage, writer = TrajectoryStorage(room, writable=True), TensorDictRoundRobinWriter()
+    buffer = TensorDictReplayBuffer(
+        storage=storage, sampler=WindowSampler(window, seed), writer=writer, batch_size=batch_size
+    )
+    if capacity is not None:
+        buffer.extend(trajectories.copy())
+    return buffer
+
+
+class TrajectoryStorage(TensorStorage):
+    """TorchRL storage of whole trajectories that is read by (trajectory, time).
+
+    Args:
+        trajectories: ``[M]`` with ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]``, possibly ``static``.
+        writable: whether trajectories can be added; the storage then starts empty.
+    """
+
+    def __init__(self, trajectories: TensorDictBase, *, writable: bool = False):
+        super().__init__(trajectories, device=cast(Tensor, trajectories["state"]).device)
+        self.writable = writable
+        if writable:
+            self._len = 0
+
+    @property
+    def trajectories(self) -> TensorDictBase:
+        """All there is room for, ``[M]``."""
+        return cast(TensorDictBase, self._storage)
+
+    @property
+    def steps(self) -> int:
+        """Transitions ``T`` in each trajectory."""
+        return self.trajectories.get("action").shape[1]
+
+    def get(self, index: Any) -> TensorDictBase:
+        """Transitions at ``(trajectory, time)``, two integer tensors of one shape ``[B]`` or ``[B, W]``.
+
+        One tensor ``[..., 2]`` of both does too (ReplayBufferEnsemble gives that). Rows of a
+        ``[B, W]`` index are windows of one trajectory each. Any other index gives whole trajectories.
+        """
+        if isinstance(index, Tensor) and index.ndim > 1:
+            index = index.unbind(-1)
+        if not isinstance(index, tuple):
+            return super().get(cast(Any, index))
+        trajectory, time = index
+        stored = self.trajectories
+        here = trajectory * (self.steps + 1) + time
+        entries = {
+            "state": _rows(stored.get("state"), here),
+            "action": _rows(stored.get("action"), trajectory * self.steps + time),
+            "next": TensorDict({"state": _rows(stored.get("state"), here + 1)}, batch_size=here.shape),
+        }
+        static = stored.get("static", None)
+        if static is not None:
+            entries["static"] = _of_trajectory(static, trajectory)
+        return TensorDict(entries, batch_size=here.shape, device=stored.device)
+
+    def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
+        """Write trajectories of the stored shape; entries that are not stored are left out."""
+        super().set(cursor, data.select(*self.trajectories.keys()), set_cursor=set_cursor)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Contents if trajectories can be added, else nothing: they are somebody else's."""
+        return super().state_dict() if self.writable else {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        if self.writable:
+            super().load_state_dict(state_dict)
+
+
+class WindowSampler(Sampler):
+    """TorchRL sampler of (trajectory, time), uniform over all windows, reproducible from a seed.
+
+    Reads a :class:`TrajectoryStorage`.
+
+    Args:
+        window: consecutive transitions in one draw.
+        seed: seed of the draws. Default: drawn from torch's global generator.
+    """
+
+    def __init__(self, window: int = 1, seed: int | None = None):
+        self.window = window
+        self._generator = torch.Generator()
+        self._generator.manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+
+    def sample(self, storage: TrajectoryStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
+        """Draw ``batch_size`` windows.
+
+        Returns:
+            Trajectory and time, ``[batch_size]`` or ``[batch_size, window]`` each, and no metadata.
+        """
+        starts = storage.steps - self.window + 1
+        if not len(storage):
+            raise RuntimeError("The buffer has no trajectory yet: extend it first.")
+        drawn = torch.randint(len(storage) * starts, (batch_size,), generator=self._generator)
+        trajectory = drawn.div(starts, rounding_mode="floor")
+        time = drawn - trajectory * starts
+        if self.window > 1:
+            time = time[:, None] + torch.arange(self.window)
+            trajectory = trajectory[:, None].expand_as(time)
+        return (trajectory, time), {}
+
+    def _empty(self) -> None:
+        """Nothing is remembered between draws."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """State of the random draws."""
+        return {"generator": self._generator.get_state()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue the random draws where they were."""
+        self._generator.set_state(state_dict["generator"])
+
+    def dumps(self, path: str) -> None:
+        """Not needed: :meth:`state_dict` holds everything."""
+        raise NotImplementedError("Save state_dict() instead.")
+
+    def loads(self, path: str) -> None:
+        """Not needed: :meth:`load_state_dict` restores everything."""
+        raise NotImplementedError("Use load_state_dict() instead.")
+
+
+def _rows(values: Tensor, row: Tensor) -> Tensor:
+    """``values`` ``[M, T, ...]`` at flat positions ``row`` of its first two dimensions."""
+    flat, row_shape = values.flatten(0, 1).flatten(1), row.shape
+    if values.device.type == "cpu":
+        # On one thread: index_select would wake all of them for a copy of a megabyte, which takes
+        # a hundred times longer when another process has the cores.
+        picked = torch.from_numpy(np.take(flat.numpy(), row.reshape(-1).numpy(), axis=0))
+    else:
+        picked = flat.index_select(0, row.reshape(-1))
+    return picked.view(*row_shape, *values.shape[2:])
+
+
+def _of_trajectory(static: Tensor | TensorDictBase, trajectory: Tensor) -> Tensor | TensorDictBase:
+    if trajectory.ndim == 1:
+        return static[trajectory]
+    return static[trajectory[:, 0]].unsqueeze(1).expand(*trajectory.shape, *static.shape[1:])
+
+
+def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:
+    for key in ("state", "action"):
+        if key not in trajectories:
+            raise KeyError(f"trajectories have no {key!r}, only {sorted(map(str, trajectories.keys()))}")
+    trajectories = trajectories.select(*_KEYS, strict=False)
+    state, action = trajectories.get("state"), trajectories.get("action")
+    if trajectories.batch_dims != 1 or state.ndim < 3 or action.ndim != 3:
+        raise ValueError(
+            "trajectories must be a TensorDict [M] of state [M, T+1, ...] and action [M, T, A], got "
+            f"{list(trajectories.shape)}, {list(state.shape)} and {list(action.shape)}"
+        )
+    if state.shape[1] != action.shape[1] + 1:
+        raise ValueError(
+            f"a trajectory has one state more than actions, got state {list(state.shape)} and "
+            f"action {list(action.shape)}"
+        )
+    if not len(trajectories):
+        raise ValueError("there is no trajectory to sample from")
+    if action.shape[1] < window:
+        raise ValueError(
+            f"window is {window} transitions, but the trajectories have {action.shape[1]}: "
+            "use a smaller window or longer trajectories"
+        )
+    # Samples are gathered from flat views, which strided tensors (a part of the time, say) do not have.
+    return trajectories.apply(lambda x: x.detach().contiguous())

@@ -1,0 +1,274 @@
+"""Batched simulation of the true physics, on MuJoCo's own threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.rollout import Rollout
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_gn.scenes.scene import Scene
+
+_PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_HUGE = float(mujoco.mjMAXVAL)  # MuJoCo resets a simulation whose numbers grow beyond this
+
+
+class Simulator:
+    """Simulate a scene: any batch, float64, with a control held over each control step.
+
+    The next state is a function of (physics, action) alone, so a recorded physics state
+    and actions replay bit for bit, whatever the batch or the number of threads.
+
+    Actions outside the bounds are clamped by MuJoCo as it applies them.
+
+    A simulation is unstable when MuJoCo gives a warning (positions, velocities or
+    accelerations that are not finite or above 1e10, or a full contact buffer): MuJoCo then
+    stops advancing it, which ``stable`` tells; what was recorded from there on has no meaning.
+    The same goes if its last state cannot be simulated on from under its last action. MuJoCo's
+    own messages and log file about it are suppressed.
+
+    Args:
+        scenes: the scene, or several of equal topology (random variants of one system).
+        num_threads: threads of the simulation. Default: the cores this process may use.
+        memory: bytes of MuJoCo's output to hold at a time; larger batches are simulated in chunks.
+            Default: 8 MB a thread, at most 256 MB: fastest where measured.
+
+    Raises:
+        ValueError: ``scenes`` is empty or their topology differs, or ``num_threads`` is below one.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_gn.data import sample_start_states, spline_controls
+        >>> from torchrl_gn.scenes import load_scene
+        >>> scene = load_scene("swimmer6")
+        >>> rng = np.random.default_rng(0)
+        >>> physics = sample_start_states(scene, 3, rng)
+        >>> actions = spline_controls(scene, 3, 50, rng)
+        >>> Simulator(scene).rollout(physics, actions)["state"].shape
+        torch.Size([3, 51, 7, 13])
+    """
+
+    def __init__(self, scenes: Scene | Sequence[Scene], num_threads: int | None = None, *, memory: int | None = None):
+        self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
+        _check_topology(self.scenes)
+        self.scene = self.scenes[0]
+        if num_threads is None:
+            num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        if num_threads is None or num_threads < 1:
+            raise ValueError(f"num_threads must be at least 1, got {num_threads}")
+        self.num_threads = num_threads
+        self.memory = min(2**23 * num_threads, 2**28) if memory is None else memory
+        self._pool = Rollout(nthread=num_threads if num_threads > 1 else 0)
+        self._data = [mujoco.MjData(self.scene.model) for _ in range(num_threads)]
+
+    def rollout(
+        self,
+        physics: Tensor | np.ndarray,
+        actions: Tensor | np.ndarray,
+        variant: Tensor | np.ndarray | None = None,
+    ) -> TensorDict:
+        """Simulate action sequences from given states.
+
+        Args:
+            physics: ``[*B, S]`` float64, full MuJoCo states (``mjSTATE_FULLPHYSICS``).
+            actions: ``[*B, T, A]`` floating point, one control per control step.
+            variant: ``[*B]`` integers, which of the scenes each sequence is simulated with.
+                Default: in turn over the flattened batch, so one each if there are as many.
+
+        Returns:
+            TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, 13]`` and ``physics`` ``[*B, T+1, S]``, both
+            float64 and starting with the given states, and ``stable`` ``[*B]`` bool. Quaternion
+            signs are MuJoCo's. Nothing is differentiated.
+
+        Raises:
+            ValueError: a wrong shape, or a value that is not finite (its index is named).
+            TypeError: ``physics`` is not float64 or ``actions`` not floating point.
+        """
+        scene = self.scene
+        start = self._checked_physics(physics)
+        controls = _as_array(actions, "actions")
+        if not np.issubdtype(controls.dtype, np.floating):
+            raise TypeError(f"actions must be floating point, got {controls.dtype}")
+        batch = start.shape[:-1]
+        if controls.ndim < 2 or controls.shape[:-2] != batch or controls.shape[-1] != scene.num_actions:
+            wanted = ", ".join([*map(str, batch), "T", str(scene.num_actions)])
+            raise ValueError(
+                f"actions of {scene.name!r} must be [{wanted}] to fit physics {list(start.shape)}, "
+                f"got {list(controls.shape)}"
+            )
+        _check_finite(controls, "actions")
+        steps, count = controls.shape[-2], int(np.prod(batch, dtype=np.int64))
+        which = self._variants(variant, batch)
+        start = start.reshape(count, scene.physics_size)
+        controls = controls.reshape(count, steps, scene.num_actions).astype(np.float64, copy=False)
+
+        state = np.empty((count, steps + 1, scene.num_nodes, 13))
+        recorded = np.empty((count, steps + 1, scene.physics_size))
+        stable = np.empty(count, dtype=bool)
+        held = scene.substeps
+        for rows in self._chunks(count, steps * held + 1):
+            # Sensor row t is the state before physics step t: one more step shows the last state.
+            repeated = np.repeat(controls[rows], held, axis=1)
+            last = controls[rows, -1:] if steps else np.zeros((len(repeated), 1, scene.num_actions))
+            after, sensors = self._advance(start[rows], np.concatenate([repeated, last], axis=1), which[rows])
+            state[rows] = sensors[:, ::held, scene.sensor_slice].reshape(state[rows].shape)
+            recorded[rows, 0] = start[rows]
+            recorded[rows, 1:] = after[:, held - 1 :: held][:, :steps]
+            stable[rows] = self._is_stable(start[rows], after)
+        result = {
+            "state": torch.from_numpy(state.reshape(*batch, *state.shape[1:])),
+            "physics": torch.from_numpy(recorded.reshape(*batch, *recorded.shape[1:])),
+            "stable": torch.from_numpy(stable.reshape(batch)),
+        }
+        return TensorDict(result, batch_size=batch)
+
+    def observe(self, physics: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None) -> Tensor:
+        """Body states of given physics states, equal to those of :meth:`rollout`.
+
+        Kinematics only: nothing is simulated, so nothing can be unstable.
+
+        Args:
+            physics: ``[*B, S]`` float64, full MuJoCo states.
+            variant: as for :meth:`rollout`.
+
+        Returns:
+            ``[*B, N, 13]`` float64.
+
+        Raises:
+            ValueError: a wrong shape or a value that is not finite.
+            TypeError: ``physics`` is not float64.
+        """
+        start = self._checked_physics(physics)
+        batch = start.shape[:-1]
+        which = self._variants(variant, batch)
+        state = np.empty((len(which), self.scene.num_nodes, 13))
+        data, where = self._data[0], self.scene.sensor_slice
+        for row, values in enumerate(start.reshape(len(which), self.scene.physics_size)):
+            model = self.scenes[which[row]].model
+            mujoco.mj_setState(model, data, values, _PHYSICS)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+            mujoco.mj_sensorPos(model, data)
+            mujoco.mj_sensorVel(model, data)
+            state[row] = data.sensordata[where].reshape(state.shape[1:])
+        return torch.from_numpy(state.reshape(*batch, *state.shape[1:]))
+
+    def settle(self, physics: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """Advance states by physics steps without control; their time is kept.
+
+        Args:
+            physics: ``[n, S]`` float64, full MuJoCo states.
+            steps: number of physics steps, at least 1.
+
+        Returns:
+            States ``[n, S]`` and which of them ``[n]`` are stable.
+        """
+        start = self._checked_physics(physics)
+        which = self._variants(None, start.shape[:-1])
+        settled, stable = np.empty_like(start), np.empty(len(start), dtype=bool)
+        for rows in self._chunks(len(start), steps + 1):
+            controls = np.zeros((len(start[rows]), steps + 1, self.scene.num_actions))
+            after, _ = self._advance(start[rows], controls, which[rows])
+            settled[rows] = after[:, -2]
+            stable[rows] = self._is_stable(start[rows], after)
+        settled[:, 0] = start[:, 0]
+        return settled, stable
+
+    def _advance(self, start: np.ndarray, controls: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Physics after ``[n, t, S]`` and sensors before ``[n, t, nsensordata]`` each physics step."""
+        with _quiet():
+            return self._pool.rollout(
+                [self.scenes[i].model for i in which] if len(self.scenes) > 1 else self.scene.model,
+                self._data,
+                start,
+                controls if self.scene.num_actions else None,
+                nstep=controls.shape[1],
+            )
+
+    def _is_stable(self, start: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """MuJoCo repeats the state of an unstable simulation, after a reset that sets its time back."""
+        time = np.concatenate([start[:, :1], after[:, :, 0]], axis=1)
+        advances = (np.diff(time, axis=1) > 0.5 * self.scene.model.opt.timestep).all(axis=1)
+        # Comparisons with NaN are false.
+        return advances & (np.abs(start) <= _HUGE).all(axis=1) & (np.abs(after) <= _HUGE).all(axis=(1, 2))
+
+    def _chunks(self, count: int, steps: int) -> Iterator[slice]:
+        row = 8 * (self.scene.model.nsensordata + self.scene.physics_size + self.scene.num_actions)
+        size = max(self.num_threads, self.memory // (row * steps))
+        return (slice(first, min(first + size, count)) for first in range(0, count, size))
+
+    def _checked_physics(self, physics: Tensor | np.ndarray) -> np.ndarray:
+        array = _as_array(physics, "physics")
+        if array.dtype != np.float64:
+            raise TypeError(f"physics must be float64 (anything else would round it), got {array.dtype}")
+        if array.ndim < 1 or array.shape[-1] != self.scene.physics_size:
+            raise ValueError(
+                f"physics of {self.scene.name!r} must be [*B, {self.scene.physics_size}], got {list(array.shape)}"
+            )
+        _check_finite(array, "physics")
+        return array
+
+    def _variants(self, variant: Tensor | np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
+        count = int(np.prod(batch, dtype=np.int64))
+        if variant is None:
+            return np.arange(count) % len(self.scenes)
+        which = _as_array(variant, "variant")
+        if which.shape != batch or not np.issubdtype(which.dtype, np.integer):
+            raise ValueError(f"variant must be {list(batch)} integers, got {list(which.shape)} of {which.dtype}")
+        if count and not (which.min() >= 0 and which.max() < len(self.scenes)):
+            raise ValueError(f"variant must lie in [0, {len(self.scenes)}), got {which.min()} to {which.max()}")
+        return which.reshape(count)
+
+
+def _as_array(value: Tensor | np.ndarray, name: str) -> np.ndarray:
+    if isinstance(value, Tensor):
+        return value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        return value
+    raise TypeError(f"{name} must be a tensor or an array, got {type(value).__name__}")
+
+
+def _check_finite(array: np.ndarray, name: str) -> None:
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name} has {array[index]} at index {index}")
+
+
+def _check_topology(scenes: tuple[Scene, ...]) -> None:
+    if not scenes:
+        raise ValueError("A simulator needs at least one scene.")
+    first = scenes[0]
+    for i, scene in enumerate(scenes[1:], start=1):
+        for what in ("node_names", "joint_names", "actuator_names", "substeps", "physics_size"):
+            ours, theirs = getattr(first, what), getattr(scene, what)
+            if ours != theirs:
+                raise ValueError(
+                    f"Scenes simulated together must have equal topology, but {what} of scene 0 "
+                    f"({first.name!r}) is {ours} and of scene {i} ({scene.name!r}) {theirs}."
+                )
+        if not np.array_equal(first.senders, scene.senders) or first.sensor_slice != scene.sensor_slice:
+            raise ValueError(f"Scenes simulated together must have equal topology; scene {i} ({scene.name!r}) differs.")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep MuJoCo from printing its warnings and from writing MUJOCO_LOG.TXT; a user's handler stays."""
+    if mujoco.get_mju_user_warning() is not None:
+        yield
+        return
+    mujoco.set_mju_user_warning(_ignore)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(None)
+
+
+def _ignore(message: str) -> None:
+    pass

@@ -1,0 +1,129 @@
+"""Where simulations start: the suite's reset distributions, vectorised."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.data.errors import UnstableSimulationError
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.scenes.scene import Scene
+
+_ATTEMPTS = 10
+
+
+def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) -> np.ndarray:
+    """Draw start states of a scene.
+
+    The paper's systems start as ``dm_control.suite`` resets them:
+
+    - Cartpole: slider uniform in 0.1 m, hinge in 0.034 rad either side, velocities of
+      standard deviation 0.01 (the suite's balance task).
+    - Cheetah: limited joints uniform in their limits.
+    - Any other scene, ``randomize_limited_and_rotational_joints``: limited hinges and
+      sliders uniform in their limits, unlimited hinges uniform in [-pi, pi], balls and the
+      rotation of free joints uniform (limited balls: a uniform axis, an angle uniform in
+      the limit); unlimited sliders, the position of free joints and velocities as in
+      ``qpos0`` and zero. For JACO, with no counterpart in the suite, that is
+      uniform in its joint limits.
+
+    Then ``scene.settle_steps`` physics steps without control (Cheetah falls to the floor),
+    with the time set back to 0. States that become unstable in it are drawn again.
+
+    Args:
+        scene: the scene.
+        n: number of states.
+        rng: generator or seed; equal seeds give equal states.
+
+    Returns:
+        ``[n, S]`` float64 full MuJoCo states (``mjSTATE_FULLPHYSICS``).
+
+    Raises:
+        UnstableSimulationError: states still fall unstable after ten draws.
+    """
+    return draw_start_states(scene, n, rng)[0]
+
+
+def draw_start_states(
+    scene: Scene, n: int, rng: int | np.random.Generator, simulator: Simulator | None = None
+) -> tuple[np.ndarray, int]:
+    """As :func:`sample_start_states`, with the number of unstable states that were drawn again.
+
+    Args:
+        scene: the scene.
+        n: number of states.
+        rng: generator or seed.
+        simulator: simulator of that scene, to reuse its threads.
+    """
+    if n < 0:
+        raise ValueError(f"n must not be negative, got {n}")
+    rng = np.random.default_rng(rng)
+    states = _draw(scene, n, rng)
+    if n == 0 or scene.settle_steps == 0:
+        return states, 0
+    simulator = simulator or Simulator(scene)
+    pending, rejected = np.arange(n), 0
+    for _ in range(_ATTEMPTS):
+        states[pending], stable = simulator.settle(states[pending], scene.settle_steps)
+        pending = pending[~stable]
+        if not len(pending):
+            return states, rejected
+        rejected += len(pending)
+        states[pending] = _draw(scene, len(pending), rng)
+    raise UnstableSimulationError(
+        f"{len(pending)} of {n} start states of {scene.name!r} became unstable within the "
+        f"{scene.settle_steps} physics steps after a reset, {_ATTEMPTS} times in a row. "
+        "A smaller physics step or softer contacts in the model may help."
+    )
+
+
+def _draw(scene: Scene, n: int, rng: np.random.Generator) -> np.ndarray:
+    model = scene.model
+    data = mujoco.MjData(model)
+    rest = np.empty(scene.physics_size)
+    mujoco.mj_getState(model, data, rest, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    states = np.tile(rest, (n, 1))
+    qpos = states[:, 1 : 1 + model.nq]  # after the time; both are views
+    qvel = states[:, 1 + model.nq : 1 + model.nq + model.nv]
+    system = scene.origin.get("system")
+    if system == "cartpole":
+        qpos[:, 0] = rng.uniform(-0.1, 0.1, n)
+        qpos[:, 1:] = rng.uniform(-0.034, 0.034, (n, model.nq - 1))
+        qvel[:] = 0.01 * rng.standard_normal((n, model.nv))
+    else:
+        _randomize_joints(model, qpos, rng, rotational=system != "cheetah")
+    return states
+
+
+def _randomize_joints(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Generator, *, rotational: bool) -> None:
+    """``dm_control.suite.utils.randomizers.randomize_limited_and_rotational_joints``, in place.
+
+    Free joints get uniform rotations, where the suite draws their quaternions from the
+    positive orthant and calls that a mistake it keeps. ``rotational=False`` leaves out
+    unlimited joints, as Cheetah's reset does.
+    """
+    kind = mujoco.mjtJoint
+    n = len(qpos)
+    for joint in range(model.njnt):
+        first, low, high = model.jnt_qposadr[joint], *model.jnt_range[joint]
+        match model.jnt_type[joint], bool(model.jnt_limited[joint]):
+            case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE), True):
+                qpos[:, first] = rng.uniform(low, high, n)
+            case kind.mjJNT_BALL, True:
+                qpos[:, first : first + 4] = _limited_quaternions(n, high, rng)
+            case kind.mjJNT_HINGE, False if rotational:
+                qpos[:, first] = rng.uniform(-np.pi, np.pi, n)
+            case kind.mjJNT_BALL, False if rotational:
+                qpos[:, first : first + 4] = _unit(rng.standard_normal((n, 4)))
+            case kind.mjJNT_FREE, _ if rotational:
+                qpos[:, first + 3 : first + 7] = _unit(rng.standard_normal((n, 4)))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _limited_quaternions(n: int, limit: float, rng: np.random.Generator) -> np.ndarray:
+    axis = _unit(rng.standard_normal((n, 3)))
+    half = 0.5 * rng.uniform(0.0, limit, (n, 1))
+    return np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
