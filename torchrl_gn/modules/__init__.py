@@ -1,0 +1,16 @@
+"""Graph networks, state maths and forward models."""
+
+from torchrl_gn.modules.bound_forward_model import BoundForwardModel as BoundForwardModel
+from torchrl_gn.modules.bound_forward_model import UnseenFeatureWarning as UnseenFeatureWarning
+from torchrl_gn.modules.core import GNCore as GNCore
+from torchrl_gn.modules.forward_model import FeatureSet as FeatureSet
+from torchrl_gn.modules.forward_model import ForwardModel as ForwardModel
+from torchrl_gn.modules.gn_block import GNBlock as GNBlock
+from torchrl_gn.modules.gn_block import GraphSize as GraphSize
+from torchrl_gn.modules.graph import Graph as Graph
+from torchrl_gn.modules.graph import graph_concat as graph_concat
+from torchrl_gn.modules.graph import graph_split as graph_split
+from torchrl_gn.modules.normalizer import Normalizer as Normalizer
+from torchrl_gn.modules.state_layout import BODY_STATE as BODY_STATE
+from torchrl_gn.modules.state_layout import Component as Component
+from torchrl_gn.modules.state_layout import StateLayout as StateLayout

@@ -1,0 +1,250 @@
+"""A forward model joined to one scene: the TensorDict module that predicts."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_gn.modules.graph import Graph
+
+if TYPE_CHECKING:
+    from torchrl_gn.modules.forward_model import ForwardModel
+    from torchrl_gn.scenes import Scene
+
+
+class UnseenFeatureWarning(UserWarning):
+    """A scene has a static value that the model never saw vary in training."""
+
+
+class BoundForwardModel(TensorDictModuleBase):
+    """Predict the next state of one scene with a forward model's shared weights.
+
+    Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes
+    ``("next", "state")`` ``[*B, N, 13]`` in the dtype of ``state``. The network
+    sees recentred, normalised values in its own dtype, so float64 states keep
+    their precision with a float32 network. Differentiable in states, actions and
+    weights. Made by :meth:`ForwardModel.bind`.
+
+    Args:
+        model: the shared weights.
+        scene: the scene to predict.
+        strict: raise, instead of warning, on features that training never saw vary.
+        state_key: where to read the state.
+        action_key: where to read the action.
+
+    Raises:
+        ValueError: if the scene lacks features that the model reads, or with ``strict``.
+    """
+
+    model: ForwardModel
+    edge_index: Tensor
+    edge_action: Tensor
+    live: Tensor
+    predicted: Tensor
+    predicted_nodes: Tensor
+    shifted: Tensor
+
+    def __init__(
+        self,
+        model: ForwardModel,
+        scene: Scene,
+        *,
+        strict: bool = False,
+        state_key: NestedKey = "state",
+        action_key: NestedKey = "action",
+    ) -> None:
+        super().__init__()
+        self.in_keys: list[NestedKey] = [state_key, action_key]
+        next_key = ("next", state_key) if isinstance(state_key, str) else ("next", *state_key)
+        self.out_keys: list[NestedKey] = [next_key]
+        self.model, self.scene, self.layout = model, scene, model.layout
+        self.timestep = float(scene.timestep)
+
+        ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
+        self._register("edge_index", torch.stack(ends).long())
+        edge_action = torch.as_tensor(scene.edge_action).long()
+        # A column of zeros behind the actions stands for joints without motor.
+        self._register("edge_action", torch.where(edge_action < 0, scene.num_actions, edge_action))
+        self._register("live", torch.as_tensor(scene.live, dtype=torch.bool))
+        predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
+        invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
+        self._register("predicted", predicted)
+        self._register("predicted_nodes", predicted.nonzero().flatten())
+        self.recenters = bool(model.recenter and invariant.any() and predicted.any())
+        # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
+        self._register("shifted", predicted[:, None] * invariant)
+        for part, column_names in (
+            ("nodes", "node_names"),
+            ("edges", "edge_names"),
+            ("globals_", "global_names"),
+        ):
+            values = self._select(part, getattr(scene.static, part), getattr(scene.static, column_names))
+            self._register(f"static_{part}", values)
+        self._check_unseen(strict)
+
+    def _register(self, name: str, value: Tensor) -> None:
+        self.register_buffer(name, value, persistent=False)
+
+    def _select(self, part: str, values, names) -> Tensor:
+        wanted = getattr(self.model.features, part)
+        missing = [name for name in wanted if name not in names]
+        if missing:
+            raise ValueError(f"Scene {self.scene.name!r} lacks the static features {missing} that the model reads.")
+        columns = [names.index(name) for name in wanted]
+        return torch.as_tensor(values, dtype=torch.float64)[..., columns]
+
+    def _apply(self, fn, recurse: bool = True):
+        # Masks and static values keep their dtype (float64) when the network is cast; only the device follows.
+        kept = dict(self._buffers)
+        super()._apply(fn, recurse)
+        for name, buffer in kept.items():
+            applied = self._buffers[name]
+            if buffer is not None and applied is not None and applied.dtype != buffer.dtype:
+                self._buffers[name] = buffer.to(applied.device)
+        return self
+
+    def _check_unseen(self, strict: bool) -> None:
+        unseen = []
+        for part, normalizer in self._static_normalizers():
+            values = getattr(self, f"static_{part}")
+            if values.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
+                continue
+            seen = normalizer.mean
+            # 1e-6: the same model compiled on another machine may differ in the last digits.
+            differs = ((values - seen).abs() > 1e-6 * seen.abs().clamp(min=1e-12)).reshape(-1, values.shape[-1]).any(0)
+            for index in (normalizer.constant & differs).nonzero().flatten().tolist():
+                unseen.append(getattr(self.model.features, part)[index])
+        residual = self.model.residual_normalizer
+        if bool((residual.count > 0).any()):
+            dead = (self.live & residual.constant).any(0).nonzero().flatten().tolist()
+            unseen += [f"state change {index}" for index in dead]
+        if not unseen:
+            return
+        message = (
+            f"Scene {self.scene.name!r} has values that the model never saw, in features that never varied in its"
+            f" training: {', '.join(unseen)}. They are ignored and predictions may be wrong."
+        )
+        if strict:
+            raise ValueError(message)
+        warnings.warn(message, UnseenFeatureWarning, stacklevel=4)
+
+    def _static_normalizers(self):
+        model = self.model
+        return (
+            ("nodes", model.static_node_normalizer),
+            ("edges", model.static_edge_normalizer),
+            ("globals_", model.static_global_normalizer),
+        )
+
+    @property
+    def network_dtype(self) -> torch.dtype:
+        """Dtype that the network computes in."""
+        return next(self.model.core.parameters()).dtype
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the predicted next state into ``tensordict`` and return it."""
+        state, action = (tensordict[key] for key in self.in_keys)
+        tensordict.set(self.out_keys[0], self.step(state, action))
+        return tensordict
+
+    def step(self, state: Tensor, action: Tensor) -> Tensor:
+        """Next state.
+
+        Args:
+            state: ``[*B, N, 13]``.
+            action: ``[*B, A]``.
+
+        Returns:
+            ``[*B, N, 13]``.
+
+        Raises:
+            ValueError: if a shape does not fit the scene.
+        """
+        return self.layout.apply(state, self.delta(state, action))
+
+    def delta(self, state: Tensor, action: Tensor) -> Tensor:
+        """Predicted change of the state ``[*B, N, 12]``, exactly zero in dead components."""
+        dynamic, static = self.graphs(state, action)
+        residual = self.model(dynamic, static, self.predicted_nodes).to(state.dtype)
+        if self.model.integrate:
+            residual = self.layout.integrate(state, residual, self.timestep)
+        return residual * self.live
+
+    def graphs(self, state: Tensor, action: Tensor) -> tuple[Graph, Graph]:
+        """Normalised dynamic graph ``[*B, ...]`` and static graph (no batch), in the network's dtype."""
+        self._check_shapes(state, action)
+        dtype, model = self.network_dtype, self.model
+        encoded, controls = self._encode(state, action)
+        dynamic = Graph(
+            model.node_normalizer(encoded, dtype),
+            model.action_normalizer(controls, dtype),
+            encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype),
+            self.edge_index,
+        )
+        nodes, edges, globals_ = (
+            normalizer(getattr(self, f"static_{part}"), dtype) for part, normalizer in self._static_normalizers()
+        )
+        return dynamic, Graph(nodes, edges, globals_, self.edge_index)
+
+    def recentered(self, state: Tensor) -> Tensor:
+        """State ``[*B, N, 13]`` with the bodies' mean position moved to 0 along invariant axes.
+
+        The world stays at 0, so that it does not give the absolute position away
+        (paper, SM "System invariance").
+        """
+        if not self.recenters:
+            return state
+        position = self.layout.slices["position"]
+        weight = (self.predicted / self.predicted.sum()).to(state.dtype)
+        center = (state[..., position] * weight[:, None]).sum(-2, keepdim=True)
+        moved = state[..., position] - center * self.shifted.to(state.dtype)
+        return torch.cat((state[..., : position.start], moved, state[..., position.stop :]), dim=-1)
+
+    def _encode(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
+        encoded = self.layout.encode(self.recentered(state), self.model.encoding)
+        return encoded, padded[..., self.edge_action].unsqueeze(-1)
+
+    def _check_shapes(self, state: Tensor, action: Tensor) -> None:
+        item = (self.scene.num_nodes, self.layout.size)
+        if tuple(state.shape[-2:]) != item:
+            raise ValueError(
+                f"State of scene {self.scene.name!r} must be [*B, {item[0]}, {item[1]}], got {list(state.shape)}."
+            )
+        if action.shape != (*state.shape[:-2], self.scene.num_actions):
+            raise ValueError(
+                f"Action of scene {self.scene.name!r} must be {[*state.shape[:-2], self.scene.num_actions]} to go with"
+                f" a state {list(state.shape)}, got {list(action.shape)}."
+            )
+
+    def update_static_normalizers(self) -> None:
+        """Take this scene's static graph into the model's statistics: once a scene, before training."""
+        for part, normalizer in self._static_normalizers():
+            normalizer.update(getattr(self, f"static_{part}"))
+
+    def update_dynamic_normalizers(self, state: Tensor, action: Tensor, next_state: Tensor) -> None:
+        """Take transitions into the model's statistics (paper, "One step of the training algorithm").
+
+        Args:
+            state: ``[*B, N, 13]``, with the input noise that training adds.
+            action: ``[*B, A]``.
+            next_state: ``[*B, N, 13]``, clean.
+        """
+        self._check_shapes(state, action)
+        encoded, controls = self._encode(state, action)
+        self.model.node_normalizer.update(encoded)
+        self.model.action_normalizer.update(controls)
+        delta = self.layout.delta(state, next_state)
+        self.model.delta_normalizer.update(delta, self.live)
+        residual = self.layout.residual(state, delta, self.timestep) if self.model.integrate else delta
+        self.model.residual_normalizer.update(residual, self.live)
+
+    def extra_repr(self) -> str:
+        return f"scene={self.scene.name!r}"

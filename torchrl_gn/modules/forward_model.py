@@ -1,0 +1,164 @@
+"""Forward model: one set of weights that predicts a control step of any scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+from torch import Tensor, nn
+
+from torchrl_gn.modules.core import GNCore
+from torchrl_gn.modules.factorized_core import factorized_core
+from torchrl_gn.modules.gn_block import GraphSize
+from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.normalizer import Normalizer
+from torchrl_gn.modules.state_layout import BODY_STATE, Component, Encoding, StateLayout
+
+if TYPE_CHECKING:
+    from torchrl_gn.modules.bound_forward_model import BoundForwardModel
+    from torchrl_gn.scenes import Scene
+
+Static = Literal["none", "scene"]
+
+# Spreads below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
+_DYNAMIC_FLOOR = 1e-9
+
+
+@dataclass(frozen=True)
+class FeatureSet:
+    """Names of the static features that a model reads, column by column.
+
+    Attributes:
+        nodes: names of the static node features.
+        edges: names of the static edge features.
+        globals_: names of the static global features.
+    """
+
+    nodes: tuple[str, ...] = ()
+    edges: tuple[str, ...] = ()
+    globals_: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, scene: Scene) -> FeatureSet:
+        """The static features that a scene has."""
+        static = scene.static
+        return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
+
+
+class ForwardModel(nn.Module):
+    """Graph-network forward model (paper, "Forward models", SM "Forward prediction algorithm").
+
+    Holds everything that is learned: the core's weights and the normalisers. It
+    knows no scene; :meth:`bind` joins it to one and gives the TensorDict module
+    that predicts. Any number of scenes can be bound to the same weights.
+
+    Args:
+        features: static features that the model reads, see :meth:`FeatureSet.of`.
+        static: ``"scene"`` reads the true static parameters, ``"none"`` none of them.
+        layout: what the state's channels mean.
+        encoding: how the network sees an orientation: as the entries of its rotation
+            ``"matrix"`` or (paper) as the ``"quaternion"``.
+        integrate: predict position and orientation as what their rates do not explain
+            (trapezoidal rule); the paper predicts the whole change.
+        recenter: make the prediction independent of where a translation-invariant scene
+            is (paper: on for single systems, off when several train together).
+        latent: features of the graph between the two GN blocks.
+        edge_hidden: hidden sizes of the edge MLPs.
+        node_hidden: hidden sizes of the node MLPs.
+        global_hidden: hidden sizes of the global MLP.
+
+    Raises:
+        ValueError: if ``static`` or ``encoding`` is none of the choices.
+    """
+
+    def __init__(
+        self,
+        features: FeatureSet,
+        *,
+        static: Static = "scene",
+        layout: StateLayout = BODY_STATE,
+        encoding: Encoding = "matrix",
+        integrate: bool = True,
+        recenter: bool = True,
+        latent: int = 128,
+        edge_hidden: Sequence[int] = (128, 128),
+        node_hidden: Sequence[int] = (128, 128),
+        global_hidden: Sequence[int] = (128, 128),
+    ) -> None:
+        super().__init__()
+        for name, value, choices in (("static", static, Static), ("encoding", encoding, Encoding)):
+            if value not in get_args(choices):
+                raise ValueError(f"{name}={value!r} is not known; use one of {list(get_args(choices))}.")
+        self.features = features if static == "scene" else FeatureSet()
+        self.static, self.layout = static, layout
+        self.encoding: Encoding = encoding
+        self.integrate, self.recenter = integrate, recenter
+        self.options = {
+            "static": static,
+            "encoding": encoding,
+            "integrate": integrate,
+            "recenter": recenter,
+            "latent": latent,
+            "edge_hidden": list(edge_hidden),
+            "node_hidden": list(node_hidden),
+            "global_hidden": list(global_hidden),
+        }
+
+        encoded = layout.encoded_size(encoding)
+        static_size = GraphSize(len(self.features.nodes), len(self.features.edges), len(self.features.globals_))
+        self.node_normalizer = Normalizer(encoded, floor=_DYNAMIC_FLOOR)
+        self.action_normalizer = Normalizer(1)
+        self.static_node_normalizer = Normalizer(static_size.nodes)
+        self.static_edge_normalizer = Normalizer(static_size.edges)
+        self.static_global_normalizer = Normalizer(static_size.globals_)
+        # The network's output has the residual's scale; errors are weighed by the whole change's.
+        self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
+        self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
+        self.core = GNCore(
+            GraphSize(encoded, 1, 0) + static_size,
+            layout.delta_size,
+            latent=latent,
+            edge_hidden=edge_hidden,
+            node_hidden=node_hidden,
+            global_hidden=global_hidden,
+        )
+
+    def bind(self, scene: Scene, *, strict: bool = False) -> BoundForwardModel:
+        """Join these weights to a scene.
+
+        Args:
+            scene: any scene with the features the model reads.
+            strict: refuse, instead of warning, a scene with a value that training never saw
+                in a feature that never varied.
+
+        Returns:
+            TensorDict module ``state, action -> ("next", "state")`` that shares these weights.
+        """
+        from torchrl_gn.modules.bound_forward_model import BoundForwardModel
+
+        return BoundForwardModel(self, scene, strict=strict)
+
+    def forward(self, dynamic: Graph, static: Graph, predicted: Tensor) -> Tensor:
+        """Predicted residual change, in SI units.
+
+        Args:
+            dynamic: normalised dynamic graph ``[*B, ...]``.
+            static: normalised static graph without batch.
+            predicted: ``[P]`` indices of the nodes that move.
+
+        Returns:
+            ``[*B, N, delta_size]``, for predicted nodes.
+        """
+        return self.residual_normalizer.inverse(factorized_core(self.core, dynamic, static, predicted))
+
+    def description(self) -> dict:
+        """Everything needed to build this model again, as plain JSON-able values."""
+        return {"features": asdict(self.features), "layout": asdict(self.layout), "options": self.options}
+
+    @classmethod
+    def from_description(cls, description: dict) -> ForwardModel:
+        """Build the model that :meth:`description` described, with fresh weights."""
+        features = FeatureSet(**{key: tuple(names) for key, names in description["features"].items()})
+        layout = StateLayout(tuple(Component(**component) for component in description["layout"]["components"]))
+        return cls(features, layout=layout, **description["options"])

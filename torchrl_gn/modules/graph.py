@@ -1,0 +1,71 @@
+"""A batch of graphs of one topology, as plain tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Graphs ``G = (g, {n_i}, {e_j, s_j, r_j})`` that share one topology (paper, "Model").
+
+    Attributes:
+        nodes: ``[*B, N, F_n]``.
+        edges: ``[*B, E, F_e]``.
+        globals_: ``[*B, F_g]``.
+        edge_index: ``[2, E]`` int64, senders above receivers, as in PyG.
+    """
+
+    nodes: Tensor
+    edges: Tensor
+    globals_: Tensor
+    edge_index: Tensor
+
+
+def graph_concat(first: Graph, second: Graph) -> Graph:
+    """Concatenate edge, node and global features of two graphs of one topology.
+
+    The batch shapes are broadcast, so a graph without batch (a scene's static
+    graph) joins any batch. Paper: "graph-concatenation".
+    """
+    return Graph(
+        nodes=_concat(first.nodes, second.nodes, 2),
+        edges=_concat(first.edges, second.edges, 2),
+        globals_=_concat(first.globals_, second.globals_, 1),
+        edge_index=first.edge_index,
+    )
+
+
+def graph_split(graph: Graph, sizes: Sequence[int]) -> tuple[Graph, Graph]:
+    """Split edge, node and global features into two graphs. Paper: "graph-splitting".
+
+    Args:
+        graph: the graph to split.
+        sizes: ``(F_n, F_e, F_g)`` of the first graph; the second gets the rest.
+    """
+    nodes, edges, globals_ = sizes
+    return (
+        Graph(
+            graph.nodes[..., :nodes],
+            graph.edges[..., :edges],
+            graph.globals_[..., :globals_],
+            graph.edge_index,
+        ),
+        Graph(
+            graph.nodes[..., nodes:],
+            graph.edges[..., edges:],
+            graph.globals_[..., globals_:],
+            graph.edge_index,
+        ),
+    )
+
+
+def _concat(first: Tensor, second: Tensor, trailing: int) -> Tensor:
+    batch = torch.broadcast_shapes(first.shape[:-trailing], second.shape[:-trailing])
+    first = first.expand(*batch, *first.shape[-trailing:])
+    second = second.expand(*batch, *second.shape[-trailing:])
+    return torch.cat((first, second), dim=-1)
