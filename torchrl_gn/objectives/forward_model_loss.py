@@ -1,0 +1,194 @@
+"""Loss of a forward model: one step, or several steps unrolled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_gn.modules import BoundForwardModel, Normalizer, quaternion
+
+
+class ForwardModelLoss(LossModule):
+    r"""Squared error of predicted state changes (paper, SM "Training algorithms" and "Loss").
+
+    Noise is added to the input state and the target is the change from the *noisy*
+    input to the clean next state, so the model also learns to put slightly
+    dislocated bodies back together. With windows of several steps the model is
+    fed its own predictions and each step's target is the change from what it was
+    fed to the true next state; gradients flow through the whole window.
+
+    Each component's error is divided by the variance of its change and averaged over
+    live channels, nodes and samples; the loss is the mean of the components.
+
+    Orientation: the paper prints :math:`1 - \cos^2(q_e \cdot q_p)`, which is not zero for
+    equal rotations; with :math:`\cos = q_e \cdot q_p` it is :math:`1 - (q_e \cdot q_p)^2`,
+    which keeps no digits for the small rotations of one step. It equals the squared
+    vector part of :math:`\bar q_e q_p`, computed here from the *change* quaternions.
+
+    Differentiated: the model's weights, through predictions (and through predicted
+    states over windows). The input TensorDict is never changed.
+
+    Args:
+        model: forward model bound to the scene of the samples.
+        noise: standard deviation of the input noise, in units of each state channel's own
+            standard deviation (radians for orientations). None on dead channels.
+        generator: source of the noise; the global one if None (a run then cannot resume bit for bit).
+
+    Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` steps in a row,
+    ``action`` ``[B, (H,) A]``, ``("next", "state")`` like ``state``.
+
+    Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that :meth:`set_keys` can change.
+
+        Attributes:
+            state: read here and under ``"next"``.
+            action: the control.
+        """
+
+        state: NestedKey = "state"
+        action: NestedKey = "action"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    model: BoundForwardModel
+    noise_scale: Tensor
+
+    def __init__(
+        self, model: BoundForwardModel, *, noise: float = 0.0, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        if noise < 0:
+            raise ValueError(f"noise={noise} must not be negative.")
+        self.model = model
+        self.noise = noise
+        self.generator = generator
+        self.register_buffer("noise_scale", torch.zeros(model.layout.delta_size, dtype=torch.float64))
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        pass
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that the loss reads."""
+        state, action = self.tensor_keys.state, self.tensor_keys.action
+        return [state, action, _next(state)]
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Keys that the loss writes."""
+        return ["loss_forward_model", *(f"error_{name}" for name in self.model.layout.names)]
+
+    @torch.no_grad()
+    def fit_normalizers(self, tensordict: TensorDictBase) -> None:
+        """Set the model's normalisers and the noise scale from transitions, once before training.
+
+        Args:
+            tensordict: ``[B]`` clean transitions, some thousands.
+        """
+        model, layout = self.model, self.model.layout
+        state, action, next_state = self._read(tensordict)
+        clean = Normalizer(layout.size, floor=1e-9)
+        clean.update(self.model.recentered(state)[..., model.predicted_nodes, :])
+        scale = torch.ones(layout.delta_size, dtype=torch.float64)
+        for component in layout.components:
+            if component.kind == "add":
+                scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]].cpu()
+        self.noise_scale.copy_(scale)
+        model.update_static_normalizers()
+        model.update_dynamic_normalizers(self._perturb(state), action, next_state)
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Loss of a batch of transitions or windows.
+
+        Raises:
+            KeyError: if the batch lacks an entry.
+            ValueError: if an entry has a wrong shape, or holds NaN or Inf.
+        """
+        state, action, next_state = self._read(tensordict)
+        if state.ndim not in (3, 4):
+            raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
+        if state.ndim == 3:
+            state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
+        layout, steps = self.model.layout, state.shape[1]
+        current = self._perturb(state[:, 0])
+        errors = state.new_zeros(len(layout.components))
+        for step in range(steps):
+            target = layout.delta(current, next_state[:, step])
+            delta = self.model.delta(current, action[:, step])
+            errors = errors + self._component_errors(delta, target)
+            if step + 1 < steps:
+                current = layout.apply(current, delta)
+        errors = errors / steps
+        live = self._live_components()
+        loss = errors.sum() / live.sum().clamp(min=1)
+        out: dict[str, Tensor] = {
+            f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)
+        }
+        return TensorDict({"loss_forward_model": loss, **out}, [])
+
+    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        state, action, next_state = (tensordict.get(key) for key in self.in_keys)
+        for key, value in zip(self.in_keys, (state, action, next_state), strict=True):
+            if value is None:
+                raise KeyError(
+                    f"ForwardModelLoss needs {key!r}, the batch has {sorted(map(str, tensordict.keys(True)))}."
+                )
+            if not bool(torch.isfinite(value).all()):
+                bad = (~torch.isfinite(value)).nonzero()[0].tolist()
+                raise ValueError(f"NaN or Inf in {key!r} at index {bad} of the batch.")
+        if next_state.shape != state.shape:
+            raise ValueError(
+                f"{self.in_keys[2]!r} must be {list(state.shape)} as {self.in_keys[0]!r}, got {list(next_state.shape)}."
+            )
+        return state, action, next_state
+
+    def _perturb(self, state: Tensor) -> Tensor:
+        if self.noise == 0:
+            return state
+        shape = (*state.shape[:-1], self.model.layout.delta_size)
+        # A generator draws on its own device only, so that a seed gives the same noise on any.
+        device = state.device if self.generator is None else self.generator.device
+        noise = torch.randn(shape, generator=self.generator, dtype=state.dtype, device=device).to(state.device)
+        scale = (self.noise * self.noise_scale).to(state.dtype) * self.model.live
+        return self.model.layout.apply(state, noise * scale)
+
+    def _scale(self, like: Tensor) -> Tensor:
+        """``[N, 12]`` weights: one over the spread of each live channel, 0 for dead ones."""
+        return (self.model.model.delta_normalizer.inverse_std * self.model.live).to(like.dtype)
+
+    def _live_components(self) -> Tensor:
+        layout = self.model.layout
+        scale = self._scale(self.noise_scale)
+        return torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
+
+    def _component_errors(self, delta: Tensor, target: Tensor) -> Tensor:
+        layout, scale = self.model.layout, self._scale(delta)
+        errors = []
+        for component in layout.components:
+            where = layout.delta_slices[component.name]
+            if component.kind == "rotation":
+                expected, predicted = quaternion.exp(target[..., where]), quaternion.exp(delta[..., where])
+                # Twice the vector part: the rotation vector between the two, to third order.
+                difference = 2 * quaternion.product(quaternion.conjugate(expected), predicted)[..., 1:]
+            else:
+                difference = delta[..., where] - target[..., where]
+            weight = scale[:, where]
+            count = (weight > 0).sum().clamp(min=1) * delta.shape[0]
+            errors.append((difference * weight).square().sum() / count)
+        return torch.stack(errors)
+
+
+def _next(key: NestedKey) -> NestedKey:
+    return ("next", key) if isinstance(key, str) else ("next", *key)
