@@ -1,0 +1,142 @@
+"""ModelEnv: gradients, and what it shares with the true environment."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.modules import ForwardModel
+from torchrl_gn.modules.forward_model import FeatureSet
+
+
+def rollout(env: ModelEnv, start: TensorDict, actions: torch.Tensor) -> TensorDict:
+    """Steps with given actions ``[*B, T, A]``."""
+    moves = iter(actions.unbind(-2))
+    return env.rollout(
+        actions.shape[-2],
+        lambda td: td.set("action", next(moves)),
+        tensordict=start,
+        auto_reset=False,
+        break_when_any_done=False,
+    )
+
+
+def test_specs_are_those_of_the_true_environment(scene_env, model_env):
+    for name in ("action_spec", "reward_spec", "done_spec"):
+        assert getattr(model_env, name) == getattr(scene_env, name)
+    assert model_env.observation_spec["state"] == scene_env.observation_spec["state"]
+    assert model_env.batch_size == scene_env.batch_size == torch.Size([])
+    assert not model_env.batch_locked
+
+
+def test_steps_are_the_models(model_env):
+    start = model_env.rand_action(model_env.reset(TensorDict(batch_size=[2, 3])))
+    before = start.clone()
+    stepped = model_env.step(start)
+    expected = model_env.world_model(before.clone())["next", "state"]
+    assert torch.equal(stepped["next", "state"], expected)
+    assert (stepped.exclude("next") == before).all()
+
+
+def test_gradient_of_the_return_is_the_finite_difference(model_env):
+    start = model_env.reset(TensorDict(batch_size=[2]))
+    # The state's own sum, in float64: rewards are float32.
+    weights = torch.randn(2, 4, model_env.scene.num_nodes, 13, dtype=torch.float64)
+
+    def total(actions: torch.Tensor) -> torch.Tensor:
+        return (weights * rollout(model_env.double(), start.clone(), actions)["next", "state"]).sum()
+
+    actions = torch.randn(2, 4, 1, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(total, (actions,))
+
+
+def test_reward_gradients_reach_actions_states_and_weights(model_env):
+    start = model_env.reset(TensorDict(batch_size=[2]))
+    start["state"].requires_grad_()
+    actions = torch.full((2, 3, 1), 0.1, requires_grad=True)
+    state = start["state"]
+    rollout(model_env, start, actions)["next", "reward"].square().sum().backward()
+    for gradient in (actions.grad, state.grad, model_env.world_model.gain.grad):
+        assert gradient.isfinite().all()
+        assert (gradient != 0).any()
+
+
+def test_starts_are_true_starts_observed(pendulum, model_env):
+    true = SceneEnv(pendulum, seed=5).reset(TensorDict(batch_size=[4]))
+    model_env.set_seed(5)
+    assert torch.equal(model_env.reset(TensorDict(batch_size=[4]))["state"], true["state"])
+
+
+def test_reset_starts_from_a_given_state_when_asked(scene_env, model_env):
+    true = scene_env.reset(TensorDict(batch_size=[4]))
+    kept = model_env.reset(true.clone(), set_state=True)
+    assert torch.equal(kept["state"], true["state"])
+    model_env.set_seed(1)
+    drawn = model_env.reset(true.clone(), set_state=False)
+    assert not torch.equal(drawn["state"], true["state"])
+
+
+def test_a_prediction_that_is_not_finite_is_flagged_and_held(model_env):
+    start = model_env.reset(TensorDict(batch_size=[3]))
+    start["action"] = torch.tensor([[0.5], [torch.nan], [0.5]])
+    after = model_env.step(start)["next"]
+    assert after["terminated"].flatten().tolist() == [False, True, False]
+    assert torch.equal(after["done"], after["terminated"])
+    assert torch.equal(after["state"][1], start["state"][1])
+    assert after["reward"][1].item() == -1e6
+    assert after["state"].isfinite().all()
+
+
+def test_the_weights_are_the_environments_and_follow_it(model_env):
+    assert {name for name, _ in model_env.named_parameters()} == {"world_model.gain", "world_model.drift"}
+    assert {p.dtype for p in model_env.double().parameters()} == {torch.float64}
+
+
+def test_refuses_models_that_do_not_fit(pendulum):
+    identity = TensorDictModule(nn.Identity(), in_keys=["state"], out_keys=["state"])
+    with pytest.raises(TypeError, match=r"must read 'state' and 'action' .* has in_keys \['state'\]"):
+        ModelEnv(identity)
+    unbound = TensorDictModule(lambda s, a: s, in_keys=["state", "action"], out_keys=[("next", "state")])
+    with pytest.raises(TypeError, match="no attribute 'scene'"):
+        ModelEnv(unbound)
+
+
+def test_bad_inputs_are_named(model_env):
+    start = model_env.rand_action(model_env.reset(TensorDict(batch_size=[2])))
+    with pytest.raises(KeyError, match=r"ModelEnv\('pendulum'\) needs an entry 'state'"):
+        model_env.step(start.select("action"))
+    with pytest.raises(ValueError, match=r"'action' must be \[2, 1\], got \[2, 3\]"):
+        model_env.step(start.set("action", torch.zeros(2, 3)))
+
+
+def test_steps_a_true_environments_tensordict(scene_env, model_env):
+    true = scene_env.reset(TensorDict(batch_size=[2]))
+    played = model_env.rollout(3, tensordict=true, auto_reset=False)
+    assert played["next", "reward"].shape == (2, 3, 1)
+
+
+def test_runs_a_bound_forward_model(swimmer):
+    torch.manual_seed(0)
+    small = {"latent": 8, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+    model = ForwardModel(FeatureSet.of(swimmer), **small)
+    env = ModelEnv(model.bind(swimmer), seed=0)
+    check_env_specs(env)
+    true = SceneEnv(swimmer, seed=0).rollout(4, tensordict=TensorDict(batch_size=[3]))
+    env.world_model.update_static_normalizers()
+    env.world_model.update_dynamic_normalizers(true["state"], true["action"], true["next", "state"])
+    actions = true["action"].clone().requires_grad_()
+    played = rollout(env, true[:, 0].select("state"), actions)
+    played["next", "state"].square().sum().backward()
+    assert played["next", "state"].isfinite().all()
+    assert (actions.grad != 0).any()
+
+
+def test_a_given_start_must_be_given(scene_env, model_env):
+    for env, entry in ((scene_env, "physics"), (model_env, "state")):
+        with pytest.raises(KeyError, match=f"needs an entry '{entry}'"):
+            env.reset(TensorDict(batch_size=[2]), set_state=True)

@@ -1,0 +1,219 @@
+"""SceneEnv: the physics it steps and the promises it makes about it."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.envs import SceneEnv
+from torchrl_gn.rewards import make_reward
+from torchrl_gn.scenes import load_scene
+
+# Forces of 1e12 N: NaN in MuJoCo's accelerations within a few steps.
+EXPLOSIVE = """
+<mujoco model="explosive">
+  <option timestep="0.05"/>
+  <worldbody>
+    <body name="ball" pos="0 0 1">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <geom type="sphere" size=".1" mass="1e-3"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="x" gear="1e12" ctrlrange="-1 1" ctrllimited="true"/></actuator>
+</mujoco>
+"""
+
+PASSIVE = """
+<mujoco model="passive">
+  <option timestep="0.01"/>
+  <worldbody>
+    <body name="pole" pos="0 0 1">
+      <joint name="hinge" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .5" size=".02"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def batch(*size: int) -> TensorDict:
+    return TensorDict(batch_size=size)
+
+
+def test_a_batch_steps_as_its_members_do(swimmer):
+    env = SceneEnv(swimmer, seed=0)
+    start = env.rand_action(env.reset(batch(2, 3)))
+    together = env.step(start.clone())["next"]
+    for index in np.ndindex(2, 3):
+        alone = env.step(start[index].clone())["next"]
+        assert (together[index] == alone).all()
+
+
+def test_a_recorded_rollout_replays_bit_for_bit(swimmer):
+    env = SceneEnv(swimmer, seed=0)
+    env.set_seed(3)
+    played = env.rollout(10, tensordict=batch(4))
+    replayed = SceneEnv(swimmer, num_threads=1).step(played.select("physics", "action"))["next"]
+    for key in ("state", "physics"):
+        assert torch.equal(replayed[key], played["next", key])
+        assert torch.equal(played[key][:, 1:], played["next", key][:, :-1])
+
+
+def test_a_step_leaves_its_input_alone(scene_env):
+    start = scene_env.rand_action(scene_env.reset(batch(3)))
+    before = start.clone()
+    scene_env.step(start)
+    assert (start.exclude("next") == before).all()
+
+
+def test_the_pendulum_obeys_its_equation_of_motion(scene_env):
+    # Semi-implicit Euler on I w' = m g l sin(q) - d w + u, the suite's pendulum, damping implicit.
+    mass, length, damping, step = 1.0, 0.5, 0.1, 0.02
+    inertia = mass * length**2 + 2 / 5 * mass * 0.05**2
+    played = scene_env.rollout(20, tensordict=batch(5))
+    angle, speed = played["physics"][..., 1], played["physics"][..., 2]
+    torque = mass * 9.81 * length * angle.sin() - damping * speed + played["action"][..., 0].double()
+    next_speed = speed + step * torque / (inertia + step * damping)
+    torch.testing.assert_close(played["next", "physics"][..., 2], next_speed, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(played["next", "physics"][..., 1], angle + step * next_speed, rtol=1e-9, atol=1e-9)
+
+
+def test_the_reward_is_the_angle_from_upright(scene_env):
+    played = scene_env.rollout(20, tensordict=batch(5))
+    angle = played["next", "physics"][..., 1]
+    wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+    expected = -wrapped.abs().unsqueeze(-1).float()
+    torch.testing.assert_close(played["next", "reward"], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_takes_actions_of_either_precision(scene_env):
+    start = scene_env.rand_action(scene_env.reset(batch(3)))
+    wide = start.clone().set("action", start["action"].double())
+    assert (scene_env.step(start.clone())["next"] == scene_env.step(wide)["next"]).all()
+
+
+def test_without_reward_it_is_zero(pendulum):
+    assert (SceneEnv(pendulum, seed=0).rollout(3)["next", "reward"] == 0).all()
+
+
+def test_same_seed_same_starts(pendulum, scene_env):
+    first = scene_env.reset(batch(6))["physics"]
+    assert torch.equal(SceneEnv(pendulum, seed=0).reset(batch(6))["physics"], first)
+    assert not torch.equal(scene_env.reset(batch(6))["physics"], first)
+    scene_env.set_seed(0)
+    assert torch.equal(scene_env.reset(batch(6))["physics"], first)
+    torch.manual_seed(1)
+    unseeded = SceneEnv(pendulum).reset()["physics"]
+    torch.manual_seed(1)
+    assert torch.equal(SceneEnv(pendulum).reset()["physics"], unseeded)
+
+
+def test_reset_starts_from_given_physics_only_when_asked(scene_env):
+    start = scene_env.reset(batch(4))
+    kept = scene_env.reset(start.clone(), set_state=True)
+    assert (kept.select("physics", "state") == start.select("physics", "state")).all()
+    drawn = scene_env.reset(start.clone(), set_state=False)
+    assert (drawn["physics"] != start["physics"]).any(-1).all()
+    played = scene_env.rollout(2, tensordict=start.clone(), set_state=True)
+    assert torch.equal(played["physics"][:, 0], start["physics"])
+
+
+def test_a_partial_reset_moves_the_masked_only(scene_env):
+    start = scene_env.reset(batch(4))
+    mask = torch.tensor([True, False, True, False]).unsqueeze(-1)
+    again = scene_env.reset(start.clone().set("_reset", mask), select_reset_only=True)
+    moved = (again["physics"] != start["physics"]).any(-1)
+    assert torch.equal(moved, mask.squeeze(-1))
+    assert torch.equal((again["state"] != start["state"]).flatten(1).any(-1), mask.squeeze(-1))
+
+
+def test_starts_from_a_table_or_a_function(pendulum):
+    table = torch.zeros(3, pendulum.physics_size, dtype=torch.float64)
+    table[:, 1] = torch.tensor([0.1, 0.2, 0.3])
+    drawn = SceneEnv(pendulum, start_states=table, seed=0).reset(batch(50))["physics"]
+    assert set(drawn[:, 1].tolist()) == set(table[:, 1].tolist())
+    shown = SceneEnv(pendulum, start_states=lambda n, rng: table[:1].numpy().repeat(n, 0)).reset(batch(2))
+    assert torch.equal(shown["physics"], table[[0, 0]])
+
+
+@pytest.mark.parametrize("bad", [torch.zeros(3), torch.zeros(0, 3), torch.zeros(2, 7)])
+def test_refuses_start_states_of_a_wrong_shape(pendulum, bad):
+    with pytest.raises(ValueError, match="start states of 'pendulum' must be"):
+        SceneEnv(pendulum, start_states=bad)
+
+
+def test_refuses_start_states_that_are_not_finite(pendulum):
+    table = torch.zeros(3, pendulum.physics_size)
+    table[1, 2] = torch.inf
+    with pytest.raises(ValueError, match="start state 1 of 'pendulum' is not finite"):
+        SceneEnv(pendulum, start_states=table)
+
+
+def test_bad_steps_are_named(scene_env):
+    start = scene_env.rand_action(scene_env.reset(batch(4)))
+    broken = start.clone()
+    broken["action"][2, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"SceneEnv\('pendulum'\): 'action' is nan at index \(2, 0\)"):
+        scene_env.step(broken)
+    with pytest.raises(ValueError, match=r"'action' must be \[4, 1\], got \[4, 2\]"):
+        scene_env.step(start.clone().set("action", torch.zeros(4, 2)))
+    with pytest.raises(KeyError, match="needs an entry 'physics'"):
+        scene_env.step(start.select("state", "action"))
+
+
+def test_an_unstable_step_ends_the_episode_and_keeps_the_last_good_state(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    env = SceneEnv(load_scene(EXPLOSIVE), seed=0)
+    start = env.reset(batch(2))
+    start["action"] = torch.tensor([[1.0], [0.0]])
+    after = env.step(start)["next"]
+    assert after["terminated"].flatten().tolist() == [True, False]
+    assert torch.equal(after["done"], after["terminated"])
+    assert after["reward"].flatten().tolist() == [-1e6, 0]
+    assert torch.equal(after["physics"][0], start["physics"][0])
+    assert torch.equal(after["state"][0], start["state"][0])
+    assert after["physics"].isfinite().all()
+    assert not list(tmp_path.iterdir())  # MuJoCo's log file
+
+
+def test_a_scene_without_motors_steps(capfd):
+    env = SceneEnv(load_scene(PASSIVE), seed=0)
+    played = env.rollout(5, tensordict=batch(2))
+    assert played["action"].shape == (2, 5, 0)
+    assert not played["next", "done"].any()
+    assert "".join(capfd.readouterr()) == ""
+
+
+def test_copies_and_pickles(scene_env):
+    start = scene_env.rand_action(scene_env.reset(batch(2)))
+    expected = scene_env.step(start.clone())["next"]
+    for twin in (copy.deepcopy(scene_env), pickle.loads(pickle.dumps(scene_env))):
+        assert (twin.step(start.clone())["next"] == expected).all()
+        assert torch.equal(twin.reset(batch(3))["physics"], copy.deepcopy(scene_env).reset(batch(3))["physics"])
+
+
+def test_a_task_entry_reaches_the_reward(pendulum):
+    env = SceneEnv(pendulum, lambda state, action, next_state, task: task, seed=0)
+    start = env.reset(batch(3)).set("task", torch.arange(3.0).unsqueeze(-1))
+    played = env.rollout(4, tensordict=start, auto_reset=False)
+    assert torch.equal(played["next", "reward"], torch.arange(3.0).reshape(3, 1, 1).expand(3, 4, 1))
+
+
+def test_a_reward_of_a_wrong_shape_is_named(pendulum):
+    env = SceneEnv(pendulum, lambda state, action, next_state, task: state[..., 0, 0], seed=0)
+    with pytest.raises(ValueError, match=r"the reward must be \[3, 1\]"):
+        env.rollout(1, tensordict=batch(3))
+
+
+def test_no_gradient_passes(pendulum):
+    env = SceneEnv(pendulum, make_reward("balance", pendulum), seed=0)
+    start = env.reset(batch(3))
+    start["action"] = torch.zeros(3, 1, requires_grad=True)
+    after = env.step(start)["next"]
+    assert not any(value.requires_grad for value in after.values())

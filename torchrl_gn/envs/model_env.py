@@ -1,0 +1,129 @@
+"""A learned model as a TorchRL environment."""
+
+from __future__ import annotations
+
+import itertools
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import nn
+from torchrl.envs.model_based import ModelBasedEnvBase
+
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.envs.specs import RewardFunction, read, set_specs, step_reward
+from torchrl_gn.envs.starts import StartSampler, StartStates
+from torchrl_gn.scenes.scene import Scene
+
+
+class ModelEnv(ModelBasedEnvBase):
+    """Imagined steps of a learned model, with the specs of :class:`~torchrl_gn.envs.SceneEnv`.
+
+    Stateless and batched over any leading batch, as ``SceneEnv``, but without its
+    ``physics`` entry: TensorDicts of the true environment can be stepped here, and so a
+    planner on the model acts in the true environment. A step is differentiable in
+    ``state``, ``action`` and the model's weights; nothing is detached and whoever wants
+    gradients keeps autograd on (freeze the weights to plan).
+
+    A prediction that is not finite does not raise: the step keeps the last good
+    state, sets ``done`` and ``terminated`` and gives ``unstable_reward``. (Gradients through
+    such a step may be NaN.) It is not looked for between steps, so that a GPU never waits:
+    imagined rollouts run their full length and do not reset themselves
+    (:meth:`any_done` is False); ``TransformedEnv`` around it does both.
+
+    The model is the submodule ``world_model``: it follows ``to()`` and its weights are among
+    the environment's parameters. A loss that must not train them keeps the environment
+    out of its submodules.
+
+    ``reset()`` draws true start states and observes them; ``reset(tensordict,
+    set_state=True)`` starts from the TensorDict's ``state``.
+
+    Args:
+        model: module with ``in_keys`` holding ``"state"`` and ``"action"``, ``out_keys`` holding
+            ``("next", "state")`` and an attribute ``scene``, as
+            :class:`~torchrl_gn.modules.BoundForwardModel`.
+        reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
+        start_states: ``[M, S]`` full MuJoCo states to start from, or a function
+            ``(n, generator) -> [n, S]``. Default: the system's reset distribution.
+        unstable_reward: reward of a step whose prediction is not finite.
+        seed: seed of the start states. Default: drawn from torch's global generator.
+        device: where everything lives. Default: the model's device.
+
+    Raises:
+        TypeError: the model lacks these keys or the scene.
+        ValueError: start states, or when stepping ``state`` or ``action``, of a wrong shape.
+        KeyError: when stepping, no ``state`` or ``action``.
+    """
+
+    _supports_set_state = True
+    scene: Scene
+
+    def __init__(
+        self,
+        model: TensorDictModuleBase,
+        reward: RewardFunction | None = None,
+        *,
+        start_states: StartStates | None = None,
+        unstable_reward: float = -1e6,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+    ):
+        inputs, outputs = getattr(model, "in_keys", ()), getattr(model, "out_keys", ())
+        if not {"state", "action"} <= set(inputs) or ("next", "state") not in outputs:
+            raise TypeError(
+                "the model must read 'state' and 'action' and write ('next', 'state'); "
+                f"{type(model).__name__} has in_keys {list(inputs)} and out_keys {list(outputs)}"
+            )
+        if not hasattr(model, "scene"):
+            raise TypeError(f"the model has no attribute 'scene'; bind {type(model).__name__} to a scene first")
+        if device is None:
+            weight = next(itertools.chain(model.parameters(), model.buffers()), None)
+            device = torch.device("cpu") if weight is None else weight.device
+        super().__init__(cast(TensorDictModule, model), device=device, allow_done_after_reset=True)
+        self.scene = cast(Scene, model.scene)
+        self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
+        self.unstable_reward = float(unstable_reward)
+        self.starts = StartSampler(self.scene, start_states, seed)
+        set_specs(self, self.scene, physics=False)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDict:
+        if tensordict is None:
+            tensordict = TensorDict(batch_size=self.batch_size)
+        shape = tensordict.shape
+        if set_state:
+            state = read(tensordict, "state", (self.scene.num_nodes, 13), self).to(torch.float64, copy=True)
+        else:
+            physics = self.starts.draw(shape, tensordict.get("_reset", None))
+            state = Simulator(self.scene, num_threads=1).observe(physics)
+        return TensorDict({"state": state}, batch_size=shape).to(self.device)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        state = read(tensordict, "state", (self.scene.num_nodes, 13), self)
+        action = read(tensordict, "action", (self.scene.num_actions,), self)
+        # The model writes into its input: give it a shallow copy.
+        prediction = self.world_model(tensordict.select(*self.world_model.in_keys))["next", "state"]
+        stable = prediction.isfinite().flatten(-2).all(-1, keepdim=True)
+        next_state = torch.where(stable.unsqueeze(-1), prediction, state)
+        reward = step_reward(self.reward, state, action, next_state, tensordict.get("task", None))
+        entries = {
+            "state": next_state,
+            "reward": torch.where(stable, reward, self.unstable_reward),
+            "done": ~stable,
+            "terminated": ~stable,
+        }
+        return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
+
+    def any_done(self, tensordict: TensorDictBase) -> bool:
+        """False: imagined rollouts run their full length (no wait for the GPU)."""
+        return False
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The input: imagined rollouts do not reset themselves."""
+        return tensordict
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.starts.seed(seed)
+
+    def __repr__(self) -> str:
+        return f"ModelEnv({self.scene.name!r})"

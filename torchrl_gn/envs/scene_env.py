@@ -1,0 +1,152 @@
+"""The true physics of a scene as a TorchRL environment."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.envs.specs import RewardFunction, read, set_specs, step_reward
+from torchrl_gn.envs.starts import StartSampler, StartStates
+from torchrl_gn.scenes.scene import Scene
+
+
+class SceneEnv(EnvBase):
+    """MuJoCo simulation of a scene, stateless and batched over any leading batch.
+
+    Everything that a step depends on is in the TensorDict: a step is a function of
+    (``physics``, ``action``) alone, so the same environment steps one state or many,
+    TorchRL's planners branch from any TensorDict, and a recorded step replays bit
+    for bit. Whole batches go to MuJoCo's threads in one call. Not differentiable:
+    gradients stop here (see :class:`~torchrl_gn.envs.ModelEnv`).
+
+    Entries:
+        - ``state`` ``[*B, N, 13]`` float64: position 3, w-first quaternion 4, linear velocity 3,
+          angular velocity 3 of each node; SI, world frame.
+        - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which body
+          states cannot give back.
+        - ``action`` ``[*B, A]``: float32 in the spec, float64 accepted. MuJoCo clamps limited controls.
+        - ``reward`` ``[*B, 1]`` float32; zero without ``reward``.
+        - ``done``, ``terminated`` ``[*B, 1]``: true only where the simulation became unstable.
+          Add TorchRL's ``StepCounter`` for a time limit.
+
+    Unstable simulations do not raise, so that one bad candidate cannot end a
+    planner's search: the step keeps the last good state, sets ``terminated`` and
+    gives ``unstable_reward``.
+
+    ``reset()`` draws start states for the batch of the TensorDict it gets. To start from
+    given ones pass ``physics`` and ask for it: ``reset(tensordict, set_state=True)``
+    (``set_state=False`` ignores the entry; TorchRL 0.14 warns when neither is said).
+
+    For a fixed number of environments in a collector, wrap it:
+    ``TransformedEnv(SceneEnv(scene), BatchSizeTransform(batch_size=[16]))``.
+
+    Args:
+        scene: the scene.
+        reward: function ``(state, action, next_state, task) -> [*B, 1]``, for example
+            from :func:`~torchrl_gn.rewards.make_reward`; ``task`` is the TensorDict's ``task``
+            entry or None.
+        start_states: ``[M, S]`` full MuJoCo states to start from, or a function
+            ``(n, generator) -> [n, S]``. Default: the system's reset distribution.
+        num_threads: threads of the simulation. Default: all cores.
+        unstable_reward: reward of a step whose simulation became unstable.
+        seed: seed of the start states. Default: drawn from torch's global generator.
+        device: where TensorDicts live; the simulation runs on the CPU.
+
+    Raises:
+        ValueError: start states of a wrong shape; when stepping, an action or physics that
+            is not finite or of a wrong shape.
+        KeyError: when stepping, no ``physics`` or ``action``.
+
+    Example:
+        >>> from torchrl_gn.rewards import make_reward
+        >>> from torchrl_gn.scenes import load_scene
+        >>> scene = load_scene("pendulum")
+        >>> env = SceneEnv(scene, make_reward("balance", scene), seed=0)
+        >>> start = env.reset(TensorDict(batch_size=[5]))
+        >>> env.rollout(20, tensordict=start, auto_reset=False)["next", "reward"].shape
+        torch.Size([5, 20, 1])
+    """
+
+    _supports_set_state = True
+
+    def __new__(cls, *args, **kwargs):
+        return super().__new__(cls, *args, _batch_locked=False, **kwargs)
+
+    def __init__(
+        self,
+        scene: Scene,
+        reward: RewardFunction | None = None,
+        *,
+        start_states: StartStates | None = None,
+        num_threads: int | None = None,
+        unstable_reward: float = -1e6,
+        seed: int | None = None,
+        device: torch.device | str = "cpu",
+    ):
+        super().__init__(device=device)
+        self.scene = scene
+        self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
+        self.num_threads = num_threads
+        self.unstable_reward = float(unstable_reward)
+        self.starts = StartSampler(scene, start_states, seed)
+        self._simulator: Simulator | None = None
+        set_specs(self, scene, physics=True)
+
+    @property
+    def simulator(self) -> Simulator:
+        """The batched simulation, started when it is first needed."""
+        if self._simulator is None:
+            self._simulator = Simulator(self.scene, num_threads=self.num_threads)
+        return self._simulator
+
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDict:
+        if tensordict is None:
+            tensordict = TensorDict(batch_size=self.batch_size)
+        shape = tensordict.shape
+        if set_state:
+            physics = read(tensordict, "physics", (self.scene.physics_size,), self)
+            physics = self._finite(physics, "physics").cpu().to(torch.float64, copy=True)
+        else:
+            physics = self.starts.draw(shape, tensordict.get("_reset", None))
+        entries = {"state": self.simulator.observe(physics), "physics": physics}
+        return TensorDict(entries, batch_size=shape).to(self.device)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        physics = self._finite(read(tensordict, "physics", (self.scene.physics_size,), self), "physics")
+        action = self._finite(read(tensordict, "action", (self.scene.num_actions,), self), "action")
+        action = action.detach()
+        controls = action.unsqueeze(-2).cpu().to(torch.float64)
+        simulated = self.simulator.rollout(physics.detach().cpu(), controls)
+        # Entry by entry: TensorDict.to costs as much as a small simulation.
+        stable = simulated["stable"].to(self.device).unsqueeze(-1)
+        state, next_state = simulated["state"].to(self.device).unbind(-3)
+        next_state = torch.where(stable.unsqueeze(-1), next_state, state)
+        next_physics = torch.where(stable, simulated["physics"][..., 1, :].to(self.device), physics.detach())
+        reward = step_reward(self.reward, state, action, next_state, tensordict.get("task", None))
+        entries = {
+            "state": next_state,
+            "physics": next_physics,
+            "reward": torch.where(stable, reward, self.unstable_reward),
+            "done": ~stable,
+            "terminated": ~stable,
+        }
+        return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
+
+    def _finite(self, value: Tensor, name: str) -> Tensor:
+        if not bool(value.isfinite().all()):
+            where = tuple((~value.isfinite()).nonzero()[0].tolist())
+            raise ValueError(f"{self}: {name!r} is {value[where].item()} at index {where}")
+        return value
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.starts.seed(seed)
+
+    def __repr__(self) -> str:
+        return f"SceneEnv({self.scene.name!r})"
+
+    def __getstate__(self) -> dict:
+        # Copies and worker processes start threads and MuJoCo data of their own.
+        return {**super().__getstate__(), "_simulator": None}

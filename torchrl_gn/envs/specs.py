@@ -1,0 +1,91 @@
+"""What the two environments of a scene have in common: specs and the reward entry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_gn.scenes.scene import Scene
+
+RewardFunction = Callable[..., Tensor]
+
+
+def set_specs(env: EnvBase, scene: Scene, *, physics: bool) -> None:
+    """Give an environment the specs of a scene.
+
+    Observations are float64, as simulated. Actions and rewards are float32, the
+    dtype of TorchRL's policies, value networks and planners; environments also
+    take float64 actions.
+
+    Args:
+        env: environment to set up, with its device already known.
+        scene: the scene.
+        physics: whether the full MuJoCo state is an entry of its own.
+    """
+    device = env.device
+
+    def unbounded(*shape: int) -> Unbounded:
+        return Unbounded(shape=torch.Size(shape), dtype=torch.float64, device=device)
+
+    observation = {"state": unbounded(scene.num_nodes, 13)}
+    if physics:
+        observation["physics"] = unbounded(scene.physics_size)
+    env.observation_spec = Composite(observation, device=device)
+    # What a step reads besides the action: the physics, or the state where that is all there is.
+    carried = "physics" if physics else "state"
+    env.state_spec = Composite({carried: observation[carried].clone()}, device=device)
+    env.action_spec = Bounded(
+        low=torch.as_tensor(scene.action_low, dtype=torch.float32),
+        high=torch.as_tensor(scene.action_high, dtype=torch.float32),
+        shape=torch.Size((scene.num_actions,)),
+        dtype=torch.float32,
+        device=device,
+    )
+    env.reward_spec = Unbounded(shape=torch.Size((1,)), dtype=torch.float32, device=device)
+
+
+def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvBase) -> Tensor:
+    """Entry of a step's input, checked.
+
+    Args:
+        tensordict: the step's input, batch ``[*B]``.
+        key: name of the entry.
+        shape: its shape behind the batch.
+        env: the environment, named in errors.
+
+    Returns:
+        ``[*B, *shape]``.
+
+    Raises:
+        KeyError: the entry is missing.
+        ValueError: the entry has another shape.
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        raise KeyError(f"{env} needs an entry {key!r} in its input; reset() writes the state, a policy the action")
+    if value.shape != (*tensordict.shape, *shape):
+        expected = [*tensordict.shape, *shape]
+        raise ValueError(f"{env}: {key!r} must be {expected}, got {list(value.shape)}")
+    return value
+
+
+def step_reward(
+    reward: RewardFunction | None, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None
+) -> Tensor:
+    """Reward ``[*B, 1]`` of a step in float32, zero without a reward function.
+
+    Raises:
+        ValueError: the reward function returned another shape.
+    """
+    shape = (*next_state.shape[:-2], 1)
+    if reward is None:
+        return next_state.new_zeros(shape, dtype=torch.float32)
+    value = reward(state, action, next_state, task)
+    if value.shape != shape:
+        raise ValueError(f"the reward must be {list(shape)}, {reward} returned {list(value.shape)}")
+    return value.to(torch.float32)

@@ -1,0 +1,88 @@
+"""Where episodes start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.data.start_states import sample_start_states
+from torchrl_gn.scenes.scene import Scene
+
+StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndarray]
+
+
+class StartSampler:
+    """Draw start states of a scene, reproducibly.
+
+    Args:
+        scene: the scene.
+        start_states: ``[M, S]`` full MuJoCo states to choose from, each equally likely,
+            or a function ``(n, generator) -> [n, S]``. Default: the system's own
+            reset distribution.
+        seed: seed of the draws. Default: one drawn from torch's global generator, so
+            that ``torch.manual_seed`` makes runs repeat.
+
+    Raises:
+        ValueError: the start states are not ``[M, S]`` of finite numbers.
+    """
+
+    def __init__(self, scene: Scene, start_states: StartStates | None = None, seed: int | None = None):
+        self.scene = scene
+        self._function: Callable[[int, np.random.Generator], np.ndarray] | None = None
+        self._table: np.ndarray | None = None
+        if isinstance(start_states, (Tensor, np.ndarray)):
+            self._table = self._checked(start_states, None)
+        else:
+            self._function = start_states
+        self.seed(seed)
+
+    def seed(self, seed: int | None) -> None:
+        """Start the draws afresh."""
+        if seed is None:
+            seed = int(torch.randint(2**31, ()).item())
+        self._rng = np.random.default_rng(seed)
+
+    def draw(self, shape: torch.Size, reset: Tensor | None = None) -> Tensor:
+        """Start states for a batch.
+
+        Args:
+            shape: the batch ``*B``.
+            reset: ``[*B]`` or ``[*B, 1]`` bool, which of them start anew (default all). The
+                others get a copy of one that does, to be overwritten by TorchRL.
+
+        Returns:
+            ``[*B, S]`` float64 full MuJoCo states, on the CPU.
+        """
+        size = shape.numel()
+        mask = np.ones(size, dtype=bool) if reset is None else reset.reshape(size).cpu().numpy()
+        states = np.zeros((size, self.scene.physics_size))
+        count = int(mask.sum())
+        if count:
+            drawn = self._sample(count)
+            states[:] = drawn[0]
+            states[mask] = drawn
+        return torch.from_numpy(states).reshape(*shape, -1)
+
+    def _sample(self, count: int) -> np.ndarray:
+        if self._table is not None:
+            return self._table[self._rng.integers(len(self._table), size=count)]
+        if self._function is not None:
+            return self._checked(self._function(count, self._rng), count)
+        return sample_start_states(self.scene, count, self._rng)
+
+    def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:
+        if isinstance(states, Tensor):
+            states = states.detach().cpu().numpy()
+        states = np.array(states, dtype=np.float64)
+        rows = "M" if count is None else count
+        right = states.ndim == 2 and states.shape[1] == self.scene.physics_size and len(states) > 0
+        if not right or (count is not None and len(states) != count):
+            wanted = f"[{rows}, {self.scene.physics_size}]"
+            raise ValueError(f"start states of {self.scene.name!r} must be {wanted}, got {list(states.shape)}")
+        if not np.isfinite(states).all():
+            bad = int(np.flatnonzero(~np.isfinite(states).all(axis=1))[0])
+            raise ValueError(f"start state {bad} of {self.scene.name!r} is not finite")
+        return states

@@ -1,0 +1,79 @@
+"""Keep bodies upright."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.modules import quaternion
+from torchrl_gn.rewards.bodies import find_body
+from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.scenes.scene import Scene
+
+
+class Balance(Reward):
+    r"""Negative angle between bodies and their balanced orientation.
+
+    .. math:: r = -\sum_i \angle(q_i', \hat q_i)
+
+    with :math:`q_i'` the orientation of body :math:`i` after the step and
+    :math:`\hat q_i` the balanced one: 0 when every body is balanced, :math:`-\pi` a
+    body hanging upside down (paper, SM "Planning configuration", Pendulum Balance).
+    The gradient is finite everywhere and zero exactly at both ends.
+
+    Args:
+        scene: scene whose states are judged.
+        bodies: names of the bodies, summed over.
+        target: ``[4]`` or ``[len(bodies), 4]`` balanced orientation, w-first, world
+            frame; any non-zero norm. Default: the identity, which is upright for bodies
+            that the model file draws standing, as the suite's poles.
+
+    Raises:
+        ValueError: the scene has no such body, or ``target`` has another shape or a
+            quaternion of norm zero.
+
+    Example:
+        >>> from torchrl_gn.scenes import load_scene
+        >>> import torch
+        >>> reward = Balance(load_scene("pendulum"), ["pole"])
+        >>> state = torch.zeros(2, 13, dtype=torch.float64)
+        >>> state[:, 3] = 1  # no rotation: the pole stands
+        >>> reward(state, torch.zeros(1), state).item() == 0
+        True
+    """
+
+    node: Tensor
+    offset: Tensor
+    target: Tensor
+
+    def __init__(self, scene: Scene, bodies: Sequence[str], *, target: np.ndarray | Tensor | None = None):
+        super().__init__()
+        if isinstance(bodies, str) or not bodies:
+            raise ValueError(f"bodies must be a list of body names, got {bodies!r}")
+        found = [find_body(scene, name) for name in bodies]
+        self.bodies = tuple(bodies)
+        self.scene_name = scene.name
+        identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+        wanted = identity if target is None else torch.as_tensor(target, dtype=torch.float64)
+        if wanted.shape not in {(4,), (len(found), 4)}:
+            raise ValueError(f"target must be [4] or [{len(found)}, 4], got {list(wanted.shape)}")
+        norm = wanted.norm(dim=-1, keepdim=True)
+        if not bool((norm > 0).all() and wanted.isfinite().all()):
+            raise ValueError(f"target must hold finite quaternions of non-zero norm, got {wanted.tolist()}")
+        # Float64 buffers are cast to the states' dtype in `forward`: exact for either.
+        self.register_buffer("node", torch.tensor([body.node for body in found]))
+        self.register_buffer("offset", torch.stack([torch.as_tensor(b.quat, dtype=torch.float64) for b in found]))
+        self.register_buffer("target", (wanted / norm).expand(len(found), 4).clone())
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        """Reward ``[*B, 1]``, radians; see :class:`Reward`. Only ``next_state`` is read."""
+        orientation = next_state.index_select(-2, self.node)[..., 3:7]
+        orientation = quaternion.product(orientation, self.offset.to(next_state.dtype))
+        angle = quaternion.angle(orientation, self.target.to(next_state.dtype))
+        return -angle.sum(-1, keepdim=True)
+
+    def extra_repr(self) -> str:
+        return f"scene={self.scene_name!r}, bodies={self.bodies}"
