@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from torchrl_gn.modules import quaternion
+from torchrl_gn.scenes import load_scene
+
+SYSTEMS = ("pendulum", "swimmer6", "cheetah")
+
+
+@pytest.fixture(scope="session")
+def scenes():
+    return {name: load_scene(name) for name in SYSTEMS}
+
+
+def random_states(scene, *shape: int, seed: int = 0) -> torch.Tensor:
+    """``[*shape, N, 13]`` states that differ in live components only; fixed nodes stay at the origin."""
+    generator = torch.Generator().manual_seed(seed)
+    live = torch.as_tensor(scene.live, dtype=torch.float64)
+    noise = torch.randn(*shape, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * live
+    turn = quaternion.exp(noise[..., 3:6])
+    return torch.cat((noise[..., :3], turn, noise[..., 6:]), dim=-1)
+
+
+def random_trajectories(scene, number: int, steps: int, seed: int = 0):
+    from tensordict import TensorDict
+
+    action = torch.randn(number, steps, scene.num_actions, dtype=torch.float64)
+    state = random_states(scene, number, steps + 1, seed=seed)
+    return TensorDict({"state": state, "action": action}, batch_size=[number])
+
+
+def as_model(function, scene) -> TensorDictModule:
+    """A bound model out of a function ``(state, action) -> next state``."""
+    model = TensorDictModule(function, in_keys=["state", "action"], out_keys=[("next", "state")])
+    model.scene = scene
+    return model
+
+
+def moving_states(scene, steps: int) -> torch.Tensor:
+    """``[steps + 1, N, 13]`` a smooth made-up motion."""
+    time = torch.linspace(0, 1, steps + 1, dtype=torch.float64)[:, None, None]
+    live = torch.as_tensor(scene.live, dtype=torch.float64)
+    position = live[:, :3] * torch.cat((time, 0.1 * time, 0.5 + 0 * time), dim=-1)
+    position = position + live[:, :3] * 0.2 * torch.arange(scene.num_nodes, dtype=torch.float64)[:, None]
+    turn = quaternion.exp(live[:, 3:6] * torch.sin(2 * math.pi * time))
+    return torch.cat((position, turn, live[:, 6:] * time), dim=-1)

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.evaluation import (
+    ErrorTable,
+    PredictionError,
+    plot_body_trajectory,
+    plot_errors,
+    plot_training_curve,
+)
+from torchrl_gn.evaluation.figures import _align_signs, _node_index
+
+from .conftest import moving_states
+
+NAMES = ["position", "orientation", "linear_velocity", "angular_velocity"]
+
+
+@pytest.fixture(autouse=True)
+def silent(capfd):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+    captured = capfd.readouterr()
+    assert captured.out == captured.err == ""
+
+
+def error(name: str, value: float, left_out: tuple[str, ...] = ()) -> PredictionError:
+    components = {key: value for key in NAMES if key not in left_out}
+    return PredictionError(
+        name,
+        components,
+        dict.fromkeys(NAMES, 1.0),
+        dict.fromkeys(NAMES, 1.0),
+        left_out,
+        10,
+        math.isinf(value),
+    )
+
+
+def table(*values: float) -> ErrorTable:
+    errors = [error(name, value) for name, value in zip(("one_step_error", "rollout_error_100"), values, strict=True)]
+    return ErrorTable({e.name: e for e in errors}, torch.zeros(0))
+
+
+def is_picture(path) -> bool:
+    with Image.open(path) as picture:
+        return picture.format == "PNG" and np.asarray(picture).std() > 5
+
+
+@pytest.mark.parametrize("name", ["pendulum", "swimmer6"])
+def test_body_trajectory(scenes, tmp_path, name):
+    truth = moving_states(scenes[name], 20)
+    prediction = truth * 1.1
+    prediction[15:] = math.nan
+    path = plot_body_trajectory(truth, prediction, scenes[name], tmp_path / "new" / "body.png")
+    assert path == tmp_path / "new" / "body.png" and is_picture(path)
+    assert [p.name for p in path.parent.iterdir()] == ["body.png"]
+    pdf = plot_body_trajectory(truth, prediction, scenes[name], tmp_path / "body.pdf", node=1)
+    assert pdf.read_bytes().startswith(b"%PDF")
+
+
+def test_default_body_is_link_3_of_swimmer6(scenes):
+    assert _node_index(scenes["swimmer6"], None) == 3
+    assert _node_index(scenes["swimmer6"], "head") == 1
+    with pytest.raises(ValueError, match="no node 'tail'"):
+        _node_index(scenes["swimmer6"], "tail")
+    with pytest.raises(ValueError, match="nodes 0 to 6"):
+        _node_index(scenes["swimmer6"], 9)
+
+
+def test_quaternions_are_shown_without_jumps():
+    angle = np.linspace(0, 3, 50)
+    smooth = np.zeros((50, 13))
+    smooth[:, 3], smooth[:, 6] = np.cos(angle), np.sin(angle)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], 50)
+    jumping, other = smooth.copy(), smooth.copy()
+    jumping[1:, 3:7] *= signs[1:, None]
+    other[:, 3:7] *= -signs[:, None]
+    true, predicted = _align_signs(jumping, other, slice(3, 7))
+    np.testing.assert_allclose(true, smooth)
+    np.testing.assert_allclose(predicted, smooth)
+
+
+def test_training_curve_and_errors(tmp_path):
+    curves = {"loss": ([1, 2, 3], [1.0, 0.1, math.nan]), "empty": ([], [])}
+    assert is_picture(plot_training_curve(curves, tmp_path / "curve.png"))
+    tables = {"a": table(0.01, 0.2), "b": table(3.0, math.inf), "c": table(0.0, 1.0)}
+    assert is_picture(plot_errors(tables, tmp_path / "errors.png"))
+    assert is_picture(plot_errors(tables, tmp_path / "one.png", errors=["one_step_error"]))
+
+
+def test_bad_input_is_named(scenes, tmp_path):
+    truth = moving_states(scenes["swimmer6"], 3)
+    with pytest.raises(ValueError, match="swimmer6"):
+        plot_body_trajectory(truth, truth[1:], scenes["swimmer6"], tmp_path / "x.png")
+    with pytest.raises(ValueError, match="above zero"):
+        plot_training_curve({"loss": ([1], [math.nan])}, tmp_path / "x.png")
+    with pytest.raises(ValueError, match="2 times and 1 values"):
+        plot_training_curve({"loss": ([1, 2], [1])}, tmp_path / "x.png")
+    with pytest.raises(ValueError, match="rollout_error_7"):
+        plot_errors({"a": table(1.0, 1.0)}, tmp_path / "x.png", errors=["rollout_error_7"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "figure.png"
+    path.write_text("old")
+    with pytest.raises(RuntimeError, match="halfway"), atomic_path(path) as temporary:
+        temporary.write_text("new")
+        raise RuntimeError("halfway")
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]

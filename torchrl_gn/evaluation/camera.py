@@ -1,0 +1,63 @@
+"""From where a scene is looked at: the plane it moves in, or an oblique view of three dimensions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes import Scene
+
+_AZIMUTH, _ELEVATION = np.radians(-55.0), np.radians(18.0)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A parallel projection.
+
+    Attributes:
+        right: ``[3]`` unit vector that points right in the picture.
+        up: ``[3]`` unit vector that points up.
+        toward: ``[3]`` unit vector towards the viewer.
+        planar: whether everything moves in the plane of the picture.
+    """
+
+    right: np.ndarray
+    up: np.ndarray
+    toward: np.ndarray
+    planar: bool
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """World points ``[..., 3]`` to picture coordinates ``[..., 2]``, metres."""
+        return points @ np.stack((self.right, self.up), axis=-1)
+
+
+def choose_view(scene: Scene) -> View:
+    """Look straight at the plane that the scene moves in, or from the side and above.
+
+    A scene is planar if no node moves along an axis or turns about the other two.
+    """
+    live = np.asarray(scene.live.any(axis=0))
+    x, y, z = np.eye(3)
+    # Looking from above for z; from the front, with z up, for the others.
+    for normal, (right, up) in ((1, (x, z)), (2, (x, y)), (0, (y, z))):
+        others = [axis for axis in range(3) if axis != normal]
+        if not live[normal] and not live[[3 + axis for axis in others]].any():
+            return View(right, up, np.cross(right, up), True)
+    flat = np.array([np.cos(_AZIMUTH), np.sin(_AZIMUTH), 0.0])
+    toward = np.cos(_ELEVATION) * flat + np.sin(_ELEVATION) * z
+    right = np.cross(z, flat)
+    return View(right, np.cross(toward, right), toward, False)
+
+
+def follow(scene: Scene, states: np.ndarray) -> np.ndarray:
+    """Point ``[T, 3]`` that the camera follows: the moving nodes' mean, along axes of translation invariance.
+
+    Args:
+        scene: the scene.
+        states: ``[T, N, 13]`` true states.
+    """
+    center = states[:, scene.predicted, :3].mean(axis=1)
+    return np.where(scene.translation_invariant, center, 0.0)

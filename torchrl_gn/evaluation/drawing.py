@@ -1,0 +1,218 @@
+"""Draw a scene's shapes as flat outlines, without OpenGL: quick, and works on any machine."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image, ImageColor, ImageDraw, ImageFont
+
+from torchrl_gn.evaluation import palette
+from torchrl_gn.evaluation.camera import View, choose_view, follow
+from torchrl_gn.evaluation.geometry import SceneGeometry
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes import Scene
+
+_OUTLINE = np.linspace(0, 2 * np.pi, 56, endpoint=False)
+_FAN = np.stack((np.cos(_OUTLINE), np.sin(_OUTLINE)), axis=-1)  # [K, 2] directions of the outline's corners
+_SMOOTH = 2  # pictures are drawn this much larger and reduced
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Outlines of one state sequence, in metres of the picture plane.
+
+    Attributes:
+        outlines: for each shape ``[T, K, 2]``.
+        order: ``[T, shapes]`` drawing order, far shapes first.
+        shadows: for each shape ``[T, K, 2]`` on the floor; empty without a visible floor.
+        joints: ``[T, J, 2]`` joint anchors.
+        valid: ``[T]`` whether the state is finite.
+    """
+
+    outlines: list[np.ndarray]
+    order: np.ndarray
+    shadows: list[np.ndarray]
+    joints: np.ndarray
+    valid: np.ndarray
+
+
+class SceneDrawing:
+    """Draws panels of one scene with one camera, framed for a true state sequence.
+
+    Args:
+        scene: the scene.
+        truth: ``[T, N, 13]`` true states; they set the camera's place and scale, so
+            that predictions that drift away are seen to do so.
+        size: width and height of a panel, pixels.
+    """
+
+    def __init__(self, scene: Scene, truth: np.ndarray, size: int) -> None:
+        self.geometry = SceneGeometry(scene)
+        self.view: View = choose_view(scene)
+        self.size = size
+        self._moving = [bool(scene.predicted[self.geometry.geom_node[s.geom]]) for s in self.geometry.shapes]
+        self._floor = self._find_floor(truth)
+        self._follow = self.view.project(follow(scene, truth))
+        self.truth = self.motion(truth)
+        parts = [o for o, moves in zip(self.truth.outlines, self._moving, strict=True) if moves]
+        if not parts:  # a scene without visible moving geoms still has its frames
+            parts = [self.view.project(truth[:, :, :3])]
+        seen = np.concatenate(parts, axis=1) - self._follow[:, None]
+        low, high = seen.min(axis=(0, 1)), seen.max(axis=(0, 1))
+        self._middle = (low + high) / 2
+        self.extent = float(max((high - low).max(), 1e-6) * 1.16)
+        if self.view.planar and self.view.up[2] and self._floor is not None:
+            self._middle[1] = low[1] + 0.42 * self.extent  # little room below the lowest point
+
+    def _find_floor(self, truth: np.ndarray) -> float | None:
+        """Height of the floor: its plane, or where a fixed base of a spatial scene stands."""
+        if self.geometry.floor is not None or self.view.planar:
+            return self.geometry.floor
+        positions, rotations = self.geometry.poses(truth[:1])
+        fixed = [shape for shape, still in zip(self.geometry.shapes, self.geometry.fixed, strict=True) if still]
+        lowest = [
+            (positions[0, shape.geom, 2] + shape.points @ rotations[0, shape.geom, 2]).min() - shape.radius
+            for shape in fixed
+        ]
+        return float(min(lowest)) if lowest else None
+
+    def motion(self, states: np.ndarray) -> Motion:
+        """Outlines of states ``[T, N, 13]``; states that are not finite are marked and not drawn."""
+        valid = np.asarray(np.isfinite(states).all(axis=(1, 2)))
+        states = np.where(valid[:, None, None], states, 0.0)
+        positions, rotations = self.geometry.poses(states)
+        outlines, shadows, depths = [], [], []
+        floor = self._floor if not self.view.planar else None
+        for shape in self.geometry.shapes:
+            points = positions[:, shape.geom, None] + np.einsum("tij,pj->tpi", rotations[:, shape.geom], shape.points)
+            outlines.append(_outline(self.view.project(points), shape.radius))
+            depths.append(points.mean(axis=1) @ self.view.toward)
+            if floor is not None:
+                flat = _outline(points[..., :2], shape.radius)
+                shadows.append(self.view.project(np.concatenate((flat, np.full((*flat.shape[:-1], 1), floor)), -1)))
+        order = np.argsort(np.stack(depths, axis=-1), axis=-1, kind="stable") if depths else np.zeros((len(states), 0))
+        return Motion(outlines, order.astype(int), shadows, self.view.project(self.geometry.anchors(states)), valid)
+
+    def panel(self, step: int, motion: Motion, color: str, *, ghost: bool = False) -> Image.Image:
+        """One panel at ``_SMOOTH`` times its size; with ``ghost`` the truth stands pale behind the motion."""
+        image = Image.new("RGB", (self.size * _SMOOTH, self.size * _SMOOTH), palette.PAPER)
+        draw = ImageDraw.Draw(image)
+        self._ground(draw, step)
+        if motion.valid[step]:
+            for shadow, moves in zip(motion.shadows, self._moving, strict=False):
+                if moves:
+                    self._polygon(draw, step, shadow[step], _mix(palette.MUTED, palette.PAPER, 0.62), None)
+        self._shapes(draw, step, self.truth, None)
+        if ghost:
+            pale = _mix(palette.TRUTH, palette.PAPER, 0.72)
+            self._shapes(draw, step, self.truth, pale, edge=_mix(palette.TRUTH, palette.PAPER, 0.5))
+        if motion.valid[step]:
+            self._shapes(draw, step, motion, color)
+            self._joint_dots(draw, step, motion)
+        else:
+            middle = self.size * _SMOOTH / 2
+            draw.text(
+                (middle, middle),
+                "prediction diverged",
+                palette.INK,
+                ImageFont.load_default(18 * _SMOOTH),
+                "mm",
+            )
+        return image
+
+    def _pixels(self, step: int, points: np.ndarray) -> np.ndarray:
+        offset = (points - self._follow[step] - self._middle) / self.extent
+        return (offset * [1, -1] + 0.5) * self.size * _SMOOTH
+
+    def _polygon(self, draw: ImageDraw.ImageDraw, step: int, points: np.ndarray, fill, edge, width: int = 0) -> None:
+        pixels = self._pixels(step, points)
+        # Far outside the panel; huge coordinates of a bad prediction would overflow the drawing library.
+        if np.abs(pixels).max() > 20 * self.size * _SMOOTH:
+            return
+        corners = list(map(tuple, pixels.tolist()))
+        draw.polygon(corners, fill=fill)
+        if edge is not None:
+            draw.line([*corners, *corners[:2]], fill=edge, width=width, joint="curve")
+
+    def _shapes(self, draw: ImageDraw.ImageDraw, step: int, motion: Motion, color, edge=None) -> None:
+        """Moving shapes in ``color``; the fixed ones, grey, where ``color`` is None."""
+        for index in motion.order[step]:
+            if self._moving[index] == (color is None):
+                continue
+            node = int(self.geometry.geom_node[self.geometry.shapes[index].geom])
+            if color is None:
+                fill, rim = _mix(palette.MUTED, palette.PAPER, 0.6), _mix(palette.MUTED, palette.PAPER, 0.2)
+            elif edge is not None:
+                fill, rim = color, edge
+            else:
+                # Neighbouring bodies in two tints, so that the joints between them can be seen.
+                fill, rim = _mix(color, "#ffffff", 0.12 + 0.2 * (node % 2)), _mix(color, "#000000", 0.35)
+            self._polygon(draw, step, motion.outlines[index][step], fill, rim, width=round(1.2 * _SMOOTH))
+
+    def _joint_dots(self, draw: ImageDraw.ImageDraw, step: int, motion: Motion) -> None:
+        if not self.view.planar:
+            return  # bodies hide most joints of a spatial scene
+        radius = self.size * _SMOOTH / 180
+        for x, y in self._pixels(step, motion.joints[step]).tolist():
+            if abs(x) + abs(y) < 20 * self.size * _SMOOTH:
+                draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="white", outline=palette.INK)
+
+    def _ground(self, draw: ImageDraw.ImageDraw, step: int) -> None:
+        spacing = _nice(self.extent / 4)
+        center = self._follow[step] + self._middle
+        low, high = center - self.extent / 2, center + self.extent / 2
+        side, line = self.size * _SMOOTH, _SMOOTH
+        grid = palette.GRID
+        if self.view.planar and self.view.up[2] == 0:  # from above: a grid that stays where it is
+            for axis in range(2):
+                for value in _ticks(low[axis], high[axis], spacing):
+                    at = self._pixels(step, np.full(2, value))[axis]
+                    draw.line((at, 0, at, side) if axis == 0 else (0, at, side, at), fill=grid, width=line)
+        elif self.view.planar:  # from the side: the floor, with marks that stay where they are
+            for value in _ticks(low[0], high[0], spacing):
+                at = self._pixels(step, np.full(2, value))[0]
+                draw.line((at, 0, at, side), fill=grid, width=line)
+            if self._floor is not None:
+                at = self._pixels(step, np.array([0.0, self._floor]))[1]
+                if at < side:
+                    draw.rectangle((0, at, side, side), fill=_mix(palette.MUTED, palette.PAPER, 0.75))
+                    draw.line((0, at, side, at), fill=palette.MUTED, width=2 * line)
+        elif self._floor is not None:
+            # The floor point behind the picture's centre, from which a patch of grid spreads.
+            view, height = self.view, self._floor
+            on_plane = center[0] * view.right + center[1] * view.up
+            middle = on_plane + view.toward * (height - on_plane[2]) / view.toward[2]
+            reach = spacing * math.ceil(2.5 * self.extent / spacing)
+            for axis in range(2):
+                for value in _ticks(middle[axis] - reach, middle[axis] + reach, spacing):
+                    ends = np.repeat(middle[None], 2, axis=0)
+                    ends[:, axis] = value
+                    ends[:, 1 - axis] += [-reach, reach]
+                    pixels = self._pixels(step, view.project(ends))
+                    draw.line(tuple(pixels.flatten().tolist()), fill=grid, width=line)
+
+
+def _outline(points: np.ndarray, radius: float) -> np.ndarray:
+    """Corners ``[T, K, 2]`` of the convex outline of points ``[T, P, 2]`` thickened by a radius."""
+    farthest = (points @ _FAN.T).argmax(axis=1)  # [T, K]
+    return np.take_along_axis(points, farthest[..., None], axis=1) + radius * _FAN
+
+
+def _ticks(low: float, high: float, spacing: float) -> np.ndarray:
+    return np.arange(math.ceil(low / spacing), math.floor(high / spacing) + 1) * spacing
+
+
+def _nice(value: float) -> float:
+    """The number of the form 1, 2 or 5 times a power of ten nearest below ``value``."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return power * max(factor for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))
+
+
+def _mix(color: str | tuple[int, int, int], other: str, part: float) -> tuple[int, int, int]:
+    """``part`` of ``other`` in ``color``."""
+    a, b = (ImageColor.getrgb(c) if isinstance(c, str) else c for c in (color, other))
+    return tuple(round((1 - part) * x + part * y) for x, y in zip(a, b, strict=True))  # type: ignore[return-value]

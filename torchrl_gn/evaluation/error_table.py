@@ -1,0 +1,113 @@
+"""Prediction errors of one model on one test set, as numbers and as a table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class PredictionError:
+    """One error (one-step, or rollout over a horizon) and what it is made of.
+
+    Attributes:
+        name: for example ``"rollout_error_100"``.
+        components: squared error of each component relative to the constant prediction,
+            1 for a model that predicts no change; infinite if a prediction diverged.
+        squared: mean squared error of each component, left-out ones included: m^2,
+            rad^2, (m/s)^2, (rad/s)^2.
+        baselines: the same of predicting the initial state unchanged.
+        left_out: components without a relative error because the truth never moves there.
+        sequences: number of sequences that the means are taken over.
+        diverged: number of them in which the model predicted something that is not a state.
+    """
+
+    name: str
+    components: dict[str, float]
+    squared: dict[str, float]
+    baselines: dict[str, float]
+    left_out: tuple[str, ...]
+    sequences: int
+    diverged: int
+
+    @property
+    def total(self) -> float:
+        """Mean of the components' relative errors."""
+        return sum(self.components.values()) / len(self.components)
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorTable:
+    """Prediction errors of one model on one test set (paper, "Prediction performance evaluation").
+
+    Attributes:
+        errors: by name, ``"one_step_error"`` first, then ``"rollout_error_<horizon>"``.
+        rollouts: ``[keep, H + 1, N, 13]`` predicted states of the first ``keep`` sequences
+            over the longest horizon, NaN from where one diverged.
+    """
+
+    errors: dict[str, PredictionError]
+    rollouts: Tensor
+
+    def __getitem__(self, name: str) -> PredictionError:
+        return self.errors[name]
+
+    def to_metrics(self) -> dict[str, float]:
+        """Flat names and plain numbers, ready for a logger or a JSON file.
+
+        For every error ``E``: ``E`` (total), ``E/<component>``, ``E/baseline/<component>`` (mean
+        square of the constant prediction), ``E/diverged`` (sequences), and
+        ``E/left_out/<component>`` = 1 in place of ``E/<component>`` for a component that is left out.
+        """
+        metrics: dict[str, float] = {}
+        for name, error in self.errors.items():
+            metrics[name] = error.total
+            metrics |= {f"{name}/{component}": value for component, value in error.components.items()}
+            metrics |= {f"{name}/baseline/{component}": value for component, value in error.baselines.items()}
+            metrics |= {f"{name}/left_out/{component}": 1.0 for component in error.left_out}
+            metrics[f"{name}/diverged"] = float(error.diverged)
+        return metrics
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """The table's cells as text: a row of titles, the total, every component, the baseline."""
+        titles = (name.replace("_error", "").replace("_", " ") for name in self.errors)
+        rows = [("relative squared error", *titles)]
+        rows.append(("total", *(_number(error.total) for error in self.errors.values())))
+        for component in next(iter(self.errors.values())).baselines:
+            values = (
+                "left out" if component in error.left_out else _number(error.components[component])
+                for error in self.errors.values()
+            )
+            rows.append((component.replace("_", " "), *values))
+        rows.append(("constant prediction", *(_number(1.0) for _ in self.errors)))
+        return rows
+
+    def to_table(self) -> str:
+        """Errors relative to the constant prediction as lines of text, one column an error."""
+        rows = self.rows()
+        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+        lines = [
+            "  ".join(
+                [
+                    row[0].ljust(widths[0]),
+                    *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
+                ]
+            )
+            for row in rows
+        ]
+        lines.insert(1, "-" * len(lines[0]))
+        for error in self.errors.values():
+            if error.diverged:
+                lines.append(f"{error.name}: {error.diverged} of {error.sequences} sequences diverged")
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.to_table()
+
+
+def _number(value: float) -> str:
+    if not math.isfinite(value):
+        return str(value)
+    return f"{value:.3f}" if 0.1 <= value < 1000 or value == 0 else f"{value:.2e}"

@@ -1,0 +1,243 @@
+"""One-step and rollout errors relative to the constant prediction.
+
+Paper, "Prediction performance evaluation": squared errors of position,
+orientation, linear and angular velocity, each divided by that of predicting no
+change, then averaged together. Here each component is a ratio of means over
+predicted nodes, steps and sequences; the orientation error is the squared angle
+of the rotation between prediction and truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
+from torchrl_gn.evaluation.rollout import predict
+from torchrl_gn.modules import quaternion
+from torchrl_gn.modules.state_layout import BODY_STATE, StateLayout
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes import Scene
+
+# Mean squared changes below this are rounding of positions of the order of metres, not motion.
+_ROUNDING = 1e-24
+
+
+def squared_errors(prediction: Tensor, truth: Tensor, layout: StateLayout = BODY_STATE) -> Tensor:
+    """Squared error of every component of a state, in float64.
+
+    Args:
+        prediction: ``[..., 13]`` states; quaternions need not have unit norm, and
+            ``q`` equals ``-q``.
+        truth: ``[..., 13]`` states.
+        layout: what the channels mean; the default is the state of a body.
+
+    Returns:
+        ``[..., C]`` squared distances (m^2, (m/s)^2, (rad/s)^2) and squared angles (rad^2),
+        in the order of ``layout.components``.
+    """
+    prediction, truth = prediction.double(), truth.double()
+    errors = []
+    for component in layout.components:
+        where = layout.slices[component.name]
+        a, b = prediction[..., where], truth[..., where]
+        if component.kind == "add":
+            errors.append((a - b).square().sum(-1))
+        elif component.kind == "rotation":
+            errors.append(quaternion.angle(a, b).square())
+        else:
+            cross = b[..., 0] * a[..., 1] - b[..., 1] * a[..., 0]
+            errors.append(torch.atan2(cross, (a * b).sum(-1)).square())
+    return torch.stack(errors, dim=-1)
+
+
+def evaluate_errors(
+    model: TensorDictModuleBase,
+    trajectories: TensorDictBase,
+    *,
+    horizons: Sequence[int] = (20, 100),
+    batch_size: int = 1000,
+    keep: int = 0,
+    scene: Scene | None = None,
+    device: torch.device | str | None = None,
+) -> ErrorTable:
+    """Errors of a model on test trajectories.
+
+    ``one_step_error`` is over every step of every sequence, against each step's own
+    input state unchanged; ``rollout_error_<H>`` over steps 1 to ``H`` of rollouts from
+    state 0, against state 0 unchanged. Runs in batches, in evaluation mode, without
+    gradients; sums are float64 and memory does not grow with the number of sequences.
+
+    A component that never moves in the truth (Pendulum's position) is left out and
+    named. A sequence diverges where the model predicts something that is not a state
+    (NaN, infinity, a zero quaternion, or errors too large to square): its error counts
+    as infinite, it is counted, and no more time is spent once a whole batch diverged.
+
+    Args:
+        model: bound forward model (``in_keys`` state and action, ``out_keys`` next state).
+        trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]`` and ``"action"``
+            ``[M, T, A]``; may lie on disk (memory-mapped).
+        horizons: lengths of the rollouts to measure, at most ``T``.
+        batch_size: number of states that the model gets in one call.
+        keep: number of predicted rollouts to return in the table.
+        scene: which nodes count and which components are live; default ``model.scene``.
+        device: where to run; default where the trajectories are.
+
+    Returns:
+        Table with ``"one_step_error"`` and one ``"rollout_error_<H>"`` for each horizon.
+
+    Raises:
+        ValueError: if shapes do not fit, trajectories are too short, empty or contain
+            values that are not finite, or nothing moves in them.
+    """
+    if scene is None:
+        scene = cast("Scene", model.scene)
+    layout: StateLayout = getattr(model, "layout", BODY_STATE)
+    horizons = sorted({int(horizon) for horizon in horizons})
+    states, actions = trajectories.get("state"), trajectories.get("action")
+    _check(states, actions, horizons, batch_size, scene, layout)
+    steps, horizon = actions.shape[1], max(horizons, default=0)
+    predicted = torch.as_tensor(scene.predicted, device=device or states.device)
+    one_step = _Sums(1, layout, predicted)
+    rollouts = _Sums(horizon, layout, predicted)
+    kept: list[Tensor] = []
+
+    with torch.no_grad(), _evaluation_mode(model):
+        for state, action in _batches(states, actions, max(1, batch_size // steps), device, layout):
+            flat = state[:, :-1].flatten(0, 1)
+            prediction = predict(model, flat, action.flatten(0, 1))
+            valid = one_step.add(0, prediction, state[:, 1:].flatten(0, 1), flat)
+            one_step.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
+        for state, action in _batches(states, actions, batch_size, device, layout) if horizons else ():
+            wanted = max(0, min(keep - sum(map(len, kept)), len(state)))
+            kept.append(_add_rollouts(model, state, action[:, :horizon], rollouts, wanted))
+
+    dead = _dead_components(scene, layout)
+    errors = {"one_step_error": one_step.error("one_step_error", 1, len(states), steps, dead)}
+    for length in horizons:
+        name = f"rollout_error_{length}"
+        errors[name] = rollouts.error(name, length, len(states), length, dead)
+    return ErrorTable(errors, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])))
+
+
+class _Sums:
+    """Streaming sums of squared errors: of the model and of the constant prediction, step by step."""
+
+    def __init__(self, steps: int, layout: StateLayout, predicted: Tensor) -> None:
+        self.layout, self.predicted = layout, predicted
+        self.model = torch.zeros(steps, len(layout.names), dtype=torch.float64, device=predicted.device)
+        self.constant = torch.zeros_like(self.model)
+        self.diverged = [0] * steps  # sequences that have diverged by this step
+
+    def add(self, step: int, prediction: Tensor, truth: Tensor, initial: Tensor, alive: Tensor | None = None) -> Tensor:
+        """Add ``[B, N, 13]`` states and return ``[B]``, where the prediction is still a state."""
+        truth = truth[:, self.predicted]
+        squared = self._squared(prediction, truth)
+        valid = squared.isfinite().all(-1)
+        if alive is not None:
+            valid &= alive
+        self.model[step] += torch.where(valid[:, None], squared, torch.inf).sum(0)
+        self.constant[step] += self._squared(initial, truth).sum(0)
+        return valid
+
+    def _squared(self, prediction: Tensor, truth: Tensor) -> Tensor:
+        prediction = prediction[:, self.predicted]
+        squared = squared_errors(prediction, truth, self.layout).mean(1)
+        # A zero quaternion has no angle, but atan2(0, 0) would call it perfect.
+        no_state = _without_angle(prediction, self.layout).any(-1, keepdim=True)
+        return torch.where(no_state, torch.inf, squared)
+
+    def error(self, name: str, steps: int, sequences: int, count: int, dead: set[str]) -> PredictionError:
+        """Error over the first ``steps`` rows, which hold ``sequences * count`` terms in all."""
+        number = sequences * count
+        model, constant = ((sums[:steps].sum(0) / number).tolist() for sums in (self.model, self.constant))
+        names = self.layout.names
+        baselines = dict(zip(names, constant, strict=True))
+        left_out = tuple(n for n in names if n in dead or baselines[n] <= _ROUNDING)
+        components = {n: value / baselines[n] for n, value in zip(names, model, strict=True) if n not in left_out}
+        if not components:
+            raise ValueError(f"Nothing moves in the trajectories, so {name} relative to no change has no meaning.")
+        squared = dict(zip(names, model, strict=True))
+        return PredictionError(name, components, squared, baselines, left_out, sequences, self.diverged[steps - 1])
+
+
+def _add_rollouts(model: TensorDictModuleBase, state: Tensor, action: Tensor, sums: _Sums, keep: int) -> Tensor:
+    """Roll out from state 0, add the errors to ``sums``, return the first ``keep`` predictions."""
+    initial = current = state[:, 0]
+    alive = torch.ones(len(state), dtype=torch.bool, device=state.device)
+    kept = [initial[:keep]]
+    for step in range(action.shape[1]):
+        if alive.any():
+            current = predict(model, current, action[:, step])
+        alive = sums.add(step, current, state[:, step + 1], initial, alive)
+        sums.diverged[step] += int((~alive).sum())
+        kept.append(torch.where(alive[:keep, None, None], current[:keep], torch.nan))
+        # Diverged sequences go on from their start: huge values would only slow the others down.
+        current = torch.where(alive[:, None, None], current, initial)
+    return torch.stack(kept, dim=1).cpu()
+
+
+def _batches(
+    states: Tensor, actions: Tensor, size: int, device: torch.device | str | None, layout: StateLayout
+) -> Iterator[tuple[Tensor, Tensor]]:
+    for start in range(0, len(states), size):
+        state = torch.as_tensor(states[start : start + size]).to(device or states.device)
+        good = state.isfinite().all(-1) & ~_without_angle(state, layout)
+        if not bool(good.all()):
+            bad = start + int((~good.flatten(1).all(1)).nonzero()[0])
+            raise ValueError(f"Trajectory {bad} contains states that are not finite or have a zero quaternion.")
+        yield state, torch.as_tensor(actions[start : start + size]).to(state.device)
+
+
+def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:
+    """``[..., N]``: nodes of ``[..., N, 13]`` that have a zero quaternion (or ``cos = sin = 0``)."""
+    turning = [layout.slices[component.name] for component in layout.components if component.kind != "add"]
+    return torch.stack([(state[..., where] == 0).all(-1) for where in turning]).any(0)
+
+
+def _dead_components(scene: Scene, layout: StateLayout) -> set[str]:
+    live = scene.live[scene.predicted]
+    return {name for name, where in layout.delta_slices.items() if not live[:, where].any()}
+
+
+def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Scene, layout: StateLayout) -> None:
+    if states is None or actions is None:
+        raise ValueError('Trajectories need the entries "state" [M, T + 1, N, 13] and "action" [M, T, A].')
+    if states.ndim != 4 or states.shape[2:] != (scene.num_nodes, layout.size):
+        raise ValueError(
+            f"States of scene {scene.name!r} must be [M, T + 1, {scene.num_nodes}, {layout.size}],"
+            f" got {list(states.shape)}."
+        )
+    if states.shape[0] == 0 or states.shape[1] < 2:
+        raise ValueError(f"Errors need at least one sequence of two states, got {list(states.shape)}.")
+    expected = (states.shape[0], states.shape[1] - 1, scene.num_actions)
+    if actions.shape != expected:
+        raise ValueError(
+            f"Actions must be {list(expected)} to go with states {list(states.shape)}, got {list(actions.shape)}."
+        )
+    if horizons and horizons[0] < 1:
+        raise ValueError(f"Horizons must be at least 1 step, got {horizons[0]}.")
+    if horizons and horizons[-1] > expected[1]:
+        raise ValueError(
+            f"A rollout of {horizons[-1]} steps needs trajectories of {horizons[-1] + 1} states, got {states.shape[1]}."
+        )
+    if batch_size < 1:
+        raise ValueError(f"batch_size must be at least 1, got {batch_size}.")
+
+
+@contextmanager
+def _evaluation_mode(model: TensorDictModuleBase) -> Iterator[None]:
+    modes = [(module, module.training) for module in model.modules()]
+    model.eval()
+    try:
+        yield
+    finally:
+        for module, training in modes:
+            module.training = training

@@ -1,0 +1,154 @@
+"""Where a scene's geometric shapes are when its nodes are in given states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+import torch
+
+from torchrl_gn.modules import quaternion
+from torchrl_gn.modules.state_layout import BODY_STATE
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes import Scene
+
+_Geom = mujoco.mjtGeom
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One visible geom: the convex hull of some points, thickened by a radius.
+
+    A sphere is one point, a capsule two; boxes, cylinders, ellipsoids and meshes
+    (their convex hull) have points only.
+
+    Attributes:
+        geom: MuJoCo id.
+        points: ``[P, 3]`` in the geom's frame, metres.
+        radius: metres.
+    """
+
+    geom: int
+    points: np.ndarray
+    radius: float
+
+
+class SceneGeometry:
+    """Shapes of a scene, fixed to its nodes.
+
+    Bodies welded into a node hang off the node's frame by fixed offsets, so a
+    predicted state is drawn as it is, joints that came apart included.
+
+    Args:
+        scene: the scene.
+
+    Attributes:
+        geom_node: ``[G]`` node that carries each geom.
+        shapes: the visible geoms; planes, height fields and transparent or hidden ones are not.
+        joints: ``(node, [3] anchor in the node's frame)`` of hinge and ball joints between bodies;
+            not of those that only turn a body that also slides, such as Cheetah's torso.
+        floor: height of a horizontal floor plane, metres, or None.
+        fixed: which shapes belong to the world.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        model = scene.model
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        node_of_root = {int(body): node for node, body in enumerate(scene.body)}
+        self._body_node = np.array([node_of_root[int(root)] for root in model.body_weldid])
+        self.geom_node = self._body_node[model.geom_bodyid]
+        # Welded bodies keep their place in the node's frame, so any configuration gives the offsets.
+        roots = scene.body[self.geom_node]
+        root_mat = data.xmat.reshape(-1, 3, 3)[roots]
+        self._pos = np.einsum("gji,gj->gi", root_mat, data.geom_xpos - data.xpos[roots])
+        self._mat = np.einsum("gji,gjk->gik", root_mat, data.geom_xmat.reshape(-1, 3, 3))
+        self.shapes = [
+            shape for geom in range(model.ngeom) if _is_visible(model, geom) if (shape := _shape(model, geom))
+        ]
+        self.fixed = [self.geom_node[shape.geom] == 0 for shape in self.shapes]
+        self.joints = self._joints(model)
+        planes = [g for g in range(model.ngeom) if model.geom_type[g] == _Geom.mjGEOM_PLANE]
+        levels = [data.geom_xpos[g][2] for g in planes if data.geom_xmat[g].reshape(3, 3)[2, 2] > 0.99]
+        self.floor = float(levels[0]) if levels else None
+
+    def _joints(self, model: mujoco.MjModel) -> list[tuple[int, np.ndarray]]:
+        turning = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
+        sliding = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if int(model.jnt_type[j]) not in turning}
+        return [
+            (int(self._body_node[body]), model.jnt_pos[joint].copy())
+            for joint, body in enumerate(model.jnt_bodyid)
+            if int(body) not in sliding
+        ]
+
+    def poses(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World poses of all geoms.
+
+        Args:
+            states: ``[T, N, 13]`` states of the nodes.
+
+        Returns:
+            positions ``[T, G, 3]`` and rotation matrices ``[T, G, 3, 3]``.
+        """
+        position, rotation = node_frames(states)
+        position, rotation = position[:, self.geom_node], rotation[:, self.geom_node]
+        return position + np.einsum("tgij,gj->tgi", rotation, self._pos), rotation @ self._mat
+
+    def anchors(self, states: np.ndarray) -> np.ndarray:
+        """World positions ``[T, J, 3]`` of the joints' anchors, as the child nodes carry them."""
+        position, rotation = node_frames(states)
+        if not self.joints:
+            return np.zeros((len(states), 0, 3))
+        nodes = [node for node, _ in self.joints]
+        offsets = np.stack([offset for _, offset in self.joints])
+        return position[:, nodes] + np.einsum("tjik,jk->tji", rotation[:, nodes], offsets)
+
+
+def node_frames(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions ``[..., 3]`` and rotation matrices ``[..., 3, 3]`` of node states ``[..., 13]``."""
+    quat = quaternion.normalize(torch.as_tensor(states[..., BODY_STATE.slices["orientation"]], dtype=torch.float64))
+    matrix = quaternion.to_matrix(quat).numpy().reshape(*states.shape[:-1], 3, 3)
+    return states[..., BODY_STATE.slices["position"]], matrix
+
+
+def _is_visible(model: mujoco.MjModel, geom: int) -> bool:
+    # MuJoCo's viewers show groups 0 to 2; collision shapes and the like live in higher ones.
+    material = model.geom_matid[geom]
+    alpha = model.geom_rgba[geom][3] if material < 0 else model.mat_rgba[material][3]
+    return model.geom_group[geom] <= 2 and alpha > 0 and model.geom_rgba[geom][3] > 0
+
+
+def _shape(model: mujoco.MjModel, geom: int) -> Shape | None:
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == _Geom.mjGEOM_SPHERE:
+        return Shape(geom, np.zeros((1, 3)), float(size[0]))
+    if kind == _Geom.mjGEOM_CAPSULE:
+        return Shape(geom, np.array([[0, 0, size[1]], [0, 0, -size[1]]]), float(size[0]))
+    if kind == _Geom.mjGEOM_BOX:
+        corners = np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
+        return Shape(geom, corners * size, 0.0)
+    if kind == _Geom.mjGEOM_CYLINDER:
+        angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+        rim = np.stack((np.cos(angle) * size[0], np.sin(angle) * size[0], np.full_like(angle, size[1])), axis=-1)
+        return Shape(geom, np.concatenate((rim, rim * [1, 1, -1])), 0.0)
+    if kind == _Geom.mjGEOM_ELLIPSOID:
+        return Shape(geom, _directions(200) * size, 0.0)
+    if kind == _Geom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        start, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        vertices = model.mesh_vert[start : start + number].astype(float)
+        # The vertices farthest along each direction are the convex hull's, up to small facets.
+        extreme = np.unique((vertices @ _directions(400).T).argmax(axis=0))
+        return Shape(geom, vertices[extreme], 0.0)
+    return None
+
+
+def _directions(number: int) -> np.ndarray:
+    """``[number, 3]`` unit vectors spread evenly (Fibonacci sphere)."""
+    index = np.arange(number) + 0.5
+    height, angle = 1 - 2 * index / number, np.pi * (1 + 5**0.5) * index
+    radius = np.sqrt(1 - height**2)
+    return np.stack((radius * np.cos(angle), radius * np.sin(angle), height), axis=-1)

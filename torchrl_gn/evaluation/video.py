@@ -1,0 +1,203 @@
+"""Videos of rollouts: the truth beside the prediction."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from torch import Tensor
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.evaluation import palette
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from torchrl_gn.scenes import Scene
+
+Engine = Literal["drawn", "gl"]
+
+_SHORTEST_FRAME = 0.02  # seconds; viewers slow down GIFs with shorter frames
+_HEADER = 58  # pixels above the panels
+_GAP = 8  # pixels around and between them
+
+
+def rollout_video(
+    scene: Scene,
+    truth: Tensor,
+    prediction: Tensor | None,
+    path: str | os.PathLike,
+    *,
+    speed: float = 1.0,
+    size: int = 360,
+    engine: Engine = "drawn",
+    labels: tuple[str, str] = ("truth", "prediction"),
+) -> Path:
+    """Write a rollout as a video, the truth on the left and the prediction on the right.
+
+    Behind the prediction the truth stands pale. The camera looks at the plane that the
+    scene moves in (or from the side and above), follows the truth where the scene is
+    translation invariant, and never follows the prediction. Bodies are drawn where the
+    states put them, also where the prediction has torn a joint apart.
+
+    Args:
+        scene: whose states they are.
+        truth: ``[T + 1, N, 13]`` true states.
+        prediction: ``[T + 1, N, 13]`` predicted states, or None to show the truth alone;
+            frames of states that are not finite say so.
+        path: file to write: ``.gif``, or ``.mp4`` (needs ``imageio[ffmpeg]``).
+        speed: 1 is real time. States are skipped where frames would be shorter than
+            20 ms (walker at 2.5 ms: every eighth state is shown).
+        size: width and height of a panel, pixels.
+        engine: ``"drawn"`` flat shapes, on any machine; ``"gl"`` MuJoCo's own renderer,
+            which needs a working EGL, OSMesa or display.
+        labels: captions of the two panels.
+
+    Returns:
+        The written path.
+
+    Raises:
+        ValueError: if shapes do not fit the scene, the truth is not finite, or an option is unknown.
+        RuntimeError: if ``engine="gl"`` cannot render here, or ``.mp4`` cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in (".gif", ".mp4"):
+        raise ValueError(f"A video's name must end in .gif or .mp4, got {path.name!r}.")
+    if not speed > 0:
+        raise ValueError(f"speed must be positive, got {speed}.")
+    every = frame_stride(scene.timestep / speed)
+    frames = rollout_frames(scene, truth, prediction, every=every, size=size, engine=engine, labels=labels)
+    seconds = every * scene.timestep / speed
+    with atomic_path(path) as temporary:
+        (_write_gif if path.suffix == ".gif" else _write_mp4)(temporary, frames, seconds)
+    return path
+
+
+def frame_stride(interval: float) -> int:
+    """How many states, ``interval`` seconds of video apart, one frame must stand for to last 20 ms."""
+    return max(1, math.ceil(_SHORTEST_FRAME / interval - 1e-6))
+
+
+def rollout_frames(
+    scene: Scene,
+    truth: Tensor,
+    prediction: Tensor | None = None,
+    *,
+    every: int = 1,
+    size: int = 360,
+    engine: Engine = "drawn",
+    labels: tuple[str, str] = ("truth", "prediction"),
+) -> Iterator[Image.Image]:
+    """The pictures of :func:`rollout_video`, one by one; arguments and errors are the same.
+
+    Args:
+        scene: whose states they are.
+        truth: ``[T + 1, N, 13]``.
+        prediction: ``[T + 1, N, 13]`` or None.
+        every: show every so many-th state.
+        size: width and height of a panel, pixels.
+        engine: ``"drawn"`` or ``"gl"``.
+        labels: captions of the two panels.
+
+    Returns:
+        Iterator of RGB pictures with even widths and heights.
+    """
+    sequences = [_to_numpy(scene, "Truth", truth)]
+    if prediction is not None:
+        if prediction.shape != truth.shape:
+            raise ValueError(f"Prediction is {list(prediction.shape)}, truth is {list(truth.shape)}: they must agree.")
+        sequences.append(_to_numpy(scene, "Prediction", prediction))
+    if not np.isfinite(sequences[0]).all():
+        raise ValueError("The true states contain values that are not finite.")
+    if every < 1 or size < 32 or size % 2:
+        raise ValueError(f"every must be at least 1 and size an even number from 32, got {every} and {size}.")
+    sequences = [states[::every] for states in sequences]
+    if engine == "drawn":
+        panels = _drawn_panels(scene, sequences, size)
+    elif engine == "gl":
+        from torchrl_gn.evaluation.gl_frames import render
+
+        panels = render(scene, sequences, size)
+    else:
+        raise ValueError(f'engine must be "drawn" or "gl", got {engine!r}.')
+    return (_compose(scene.name, step * every * scene.timestep, row, size, labels) for step, row in enumerate(panels))
+
+
+def _drawn_panels(scene: Scene, sequences: list[np.ndarray], size: int) -> Iterator[list[Image.Image]]:
+    from torchrl_gn.evaluation.drawing import SceneDrawing
+
+    drawing = SceneDrawing(scene, sequences[0], size)
+    motions = [drawing.truth, *map(drawing.motion, sequences[1:])]
+    colors = (palette.TRUTH, palette.PREDICTION)
+    for step in range(len(sequences[0])):
+        yield [
+            drawing.panel(step, motion, color, ghost=number > 0)
+            for number, (motion, color) in enumerate(zip(motions, colors, strict=False))
+        ]
+
+
+def _compose(name: str, time: float, row: list[Image.Image], size: int, labels: tuple[str, str]) -> Image.Image:
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.new("RGB", (_GAP + len(row) * (size + _GAP), _HEADER + size + _GAP), "white")
+    draw = ImageDraw.Draw(image)
+    draw.text((_GAP + 2, 16), name, palette.INK, ImageFont.load_default(17), "lm")
+    draw.text((image.width - _GAP - 2, 16), f"t = {time:.2f} s", palette.INK, ImageFont.load_default(17), "rm")
+    for number, (panel, label) in enumerate(zip(row, labels, strict=False)):
+        left = _GAP + number * (size + _GAP)
+        color = (palette.TRUTH, palette.PREDICTION)[number]
+        draw.text((left + size // 2, 44), label, color, ImageFont.load_default(15), "mm")
+        if panel.width != size:
+            panel = panel.reduce(panel.width // size)
+        image.paste(panel, (left, _HEADER))
+        draw.rectangle((left, _HEADER, left + size - 1, _HEADER + size - 1), outline=palette.GRID)
+    return image
+
+
+def _write_gif(path: Path, frames: Iterator[Image.Image], seconds: float) -> None:
+    from PIL import Image
+
+    pictures = list(frames)
+    # One palette for all frames, from a few of them side by side, keeps colours from flickering.
+    sample = pictures[:: max(1, len(pictures) // 6)]
+    strip = Image.new("RGB", (sample[0].width, sample[0].height * len(sample)))
+    for number, picture in enumerate(sample):
+        strip.paste(picture, (0, number * picture.height))
+    colors = strip.quantize(128)
+    pictures = [picture.quantize(palette=colors, dither=Image.Dither.NONE) for picture in pictures]
+    # GIF counts in hundredths of a second: rounding the running time keeps the whole in real time.
+    ends = [round(100 * seconds * (number + 1)) for number in range(len(pictures))]
+    durations = [10 * max(2, end - start) for start, end in zip([0, *ends], ends, strict=False)]
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=False)
+
+
+def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> None:
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise RuntimeError("Writing .mp4 needs ffmpeg: pip install 'imageio[ffmpeg]', or write a .gif.") from None
+    first = next(frames)
+    # Rates need not be whole numbers, whatever the annotation says.
+    rate: Any = 1 / seconds
+    writer = imageio_ffmpeg.write_frames(
+        str(path), first.size, fps=rate, quality=8, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    writer.send(None)
+    try:
+        writer.send(first.tobytes())
+        for frame in frames:
+            writer.send(frame.tobytes())
+    finally:
+        writer.close()
+
+
+def _to_numpy(scene: Scene, what: str, states: Tensor) -> np.ndarray:
+    if states.ndim != 3 or states.shape[0] == 0 or states.shape[1:] != (scene.num_nodes, 13):
+        raise ValueError(
+            f"{what} of scene {scene.name!r} must be [T + 1, {scene.num_nodes}, 13], got {list(states.shape)}."
+        )
+    return states.detach().double().cpu().numpy()
