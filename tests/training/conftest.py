@@ -1,0 +1,64 @@
+"""A pendulum, its simulated transitions and a training that takes milliseconds a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.modules import FeatureSet, ForwardModel
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.optimizers import make_optimizer
+from torchrl_gn.training.trainer import Trainer
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    return load_scene("pendulum")
+
+
+@pytest.fixture(scope="session")
+def trajectories(scene) -> TensorDict:
+    return collect_trajectories(scene, num=20, steps=20)
+
+
+@pytest.fixture
+def make_model(scene) -> Callable[..., ForwardModel]:
+    def make(seed: int = 0, **options) -> ForwardModel:
+        torch.manual_seed(seed)
+        small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+        return ForwardModel(FeatureSet.of(scene), **(small | options))
+
+    return make
+
+
+@pytest.fixture
+def make_trainer(scene, trajectories, make_model) -> Callable[..., Trainer]:
+    """A training of a fresh model, or of the one given, always from the same seeds."""
+
+    def make(
+        budget: Budget,
+        model: ForwardModel | None = None,
+        *,
+        preset="muon",
+        noise: float = 0.01,
+        unroll=0.0,
+        **options,
+    ) -> Trainer:
+        fresh = model is None
+        model = make_model() if model is None else model
+        loss = ForwardModelLoss(model.bind(scene), noise=noise, generator=torch.Generator().manual_seed(0))
+        if fresh:
+            loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=500, seed=1).sample())
+        if unroll:
+            options |= {"unroll": trajectory_buffer(trajectories, batch_size=8, window=3, seed=2)}
+            options |= {"unroll_fraction": unroll}
+        buffer = trajectory_buffer(trajectories, batch_size=32, seed=0)
+        return Trainer(loss, buffer, make_optimizer(model, preset), budget, **options)
+
+    return make

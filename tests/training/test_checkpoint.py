@@ -1,0 +1,196 @@
+"""Checkpoints: exact round trips, and errors that name the file for every damage."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from torchrl_gn.training import checkpoint as module
+from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.checkpoint import CheckpointError, load_checkpoint, package_versions, save_checkpoint
+
+
+@pytest.fixture
+def trained(make_trainer):
+    trainer = make_trainer(Budget(steps=10))
+    for _ in trainer.run():
+        pass
+    return trainer
+
+
+@pytest.fixture
+def saved(tmp_path, trained, scene):
+    path = tmp_path / module.CHECKPOINT_FILE
+    save_checkpoint(path, trained.model, scene=scene, config={"lr": 0.1, "name": "x"}, training=trained.state_dict())
+    return path
+
+
+def same(a, b) -> bool:
+    """Equal nested values; tensors bit for bit, lists and tuples alike."""
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and a == b
+
+
+def test_everything_comes_back(saved, trained, scene):
+    loaded = load_checkpoint(saved)
+    assert same(dict(loaded.model.state_dict()), dict(trained.model.state_dict()))
+    assert loaded.model.description() == trained.model.description()
+    for name, normalizer in trained.model.named_modules():
+        if hasattr(normalizer, "inverse_std"):  # derived, not stored
+            assert torch.equal(loaded.model.get_submodule(name).inverse_std, normalizer.inverse_std)
+    assert same(loaded.training, trained.state_dict())
+    assert loaded.config == {"lr": 0.1, "name": "x"}
+    assert loaded.versions == package_versions()
+    assert loaded.scene().fingerprint() == scene.fingerprint()
+    state = torch.zeros(4, 2, 13, dtype=torch.float64)
+    state[..., 3] = 1
+    action = torch.ones(4, 1)
+    predicted = loaded.model.bind(loaded.scene(), strict=True).step(state, action)
+    assert torch.equal(predicted, trained.model.bind(scene).step(state, action))
+
+
+def test_optimizers_keep_integer_keys_and_exact_rates(saved, trained, make_trainer):
+    state = load_checkpoint(saved).training["optimizer"]
+    before = trained.optimizer.state_dict()
+    for index in ("0", "1"):
+        assert list(state[index]["state"]) == list(before[index]["state"]) == list(range(len(state[index]["state"])))
+        assert [g["lr"] for g in state[index]["param_groups"]] == [g["lr"] for g in before[index]["param_groups"]]
+    again = make_trainer(Budget(steps=10)).optimizer
+    again.load_state_dict(state)
+    assert same(again.state_dict(), before)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_weights_keep_their_dtype(tmp_path, make_model, scene, dtype):
+    model = make_model().to(dtype)
+    save_checkpoint(tmp_path / "c.safetensors", model, scene=scene)
+    loaded = load_checkpoint(tmp_path / "c.safetensors")
+    assert same(dict(loaded.model.state_dict()), dict(model.state_dict()))
+    assert loaded.training == {}
+
+
+def test_nested_training_state_comes_back(tmp_path, make_model, scene):
+    training = {
+        "scalars": {
+            "int": 3,
+            "float": 0.1,
+            "tiny": 5e-324,
+            "none": None,
+            "flag": True,
+            "text": "ünï",
+            "inf": math.inf,
+        },
+        "tensors": [
+            torch.arange(3),
+            torch.tensor(2.5),
+            torch.zeros(0, 4),
+            torch.tensor([True]),
+            torch.ones(2).bfloat16(),
+        ],
+        "keys": {0: {1: torch.zeros(1)}, "a.b": [1, [2.0, {}], []]},
+        "bytes": torch.Generator().manual_seed(3).get_state(),
+        "view": torch.arange(12.0).view(3, 4).T[1:],
+    }
+    save_checkpoint(tmp_path / "c.safetensors", make_model(), scene=scene, training=training)
+    assert same(load_checkpoint(tmp_path / "c.safetensors").training, training)
+
+
+def test_the_file_is_safetensors_and_holds_no_pickle(saved):
+    with safe_open(saved, framework="pt") as file:
+        metadata = file.metadata()
+        description = json.loads(metadata["description"])
+        assert any(name.startswith("model.core.") for name in file.keys())
+    assert metadata["format"] == str(module.FORMAT)
+    assert {"torch", "mujoco", "torchrl_gn"} <= set(description["versions"])
+
+
+def test_a_run_folder_stands_for_the_checkpoint_in_it(tmp_path, saved, trained):
+    assert same(dict(load_checkpoint(tmp_path).model.state_dict()), dict(trained.model.state_dict()))
+
+
+def refused(path, message: str) -> None:
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_files(tmp_path):
+    refused(tmp_path / "no.safetensors", "No checkpoint at")
+    with pytest.raises(CheckpointError, match=f"No checkpoint at .*{module.CHECKPOINT_FILE}"):
+        load_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 7, 8, 100, 0.3, 0.9, -1])
+def test_truncated_files(saved, keep):
+    content = saved.read_bytes()
+    saved.write_bytes(content[: int(keep * len(content)) if isinstance(keep, float) else keep])
+    refused(saved, "damaged")
+
+
+def test_any_flipped_bit_is_noticed(saved):
+    content = saved.read_bytes()
+    header = 8 + int.from_bytes(content[:8], "little")
+    generator = torch.Generator().manual_seed(0)
+    places = [*range(0, 12), header - 1, header, len(content) - 1]
+    places += torch.randint(header, (60,), generator=generator).tolist()
+    places += torch.randint(header, len(content), (40,), generator=generator).tolist()
+    for place in places:
+        bit = 1 << int(torch.randint(8, (), generator=generator))
+        damaged = bytearray(content)
+        damaged[place] ^= bit
+        saved.write_bytes(damaged)
+        refused(saved, "damaged|no checkpoint of torchrl_gn")
+    saved.write_bytes(content)
+    load_checkpoint(saved)
+
+
+def test_files_that_are_not_ours(tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_file({"x": torch.zeros(3)}, path)
+    refused(path, "is a safetensors file, but no checkpoint of torchrl_gn")
+    path.write_text("hello, this is plain text and no checkpoint at all")
+    refused(path, "damaged")
+    torch.save({"x": torch.zeros(3)}, path)
+    refused(path, "damaged")
+
+
+def test_a_newer_format_asks_for_an_update(tmp_path, make_model, scene, monkeypatch):
+    path = tmp_path / "new.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "FORMAT", module.FORMAT + 1)
+        save_checkpoint(path, make_model(), scene=scene)
+    refused(path, rf"has format {module.FORMAT + 1}, this version reads up to {module.FORMAT}; update torchrl_gn")
+
+
+def test_what_cannot_be_stored_is_named_and_leaves_the_old_file(saved, make_model, scene):
+    content = saved.read_bytes()
+    with pytest.raises(TypeError, match=r"entry training\.a\.1 has type object; only tensors and plain values fit"):
+        save_checkpoint(saved, make_model(), scene=scene, training={"a": [1, object()]})
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        save_checkpoint(saved, make_model(), scene=scene, config={"a": object()})
+    assert saved.read_bytes() == content
+    assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_a_failing_write_leaves_the_old_file(saved, make_model, scene, monkeypatch):
+    content = saved.read_bytes()
+
+    def full_disk(tensors, path, metadata):
+        path.write_bytes(b"half")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(module, "save_file", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(saved, make_model(1), scene=scene)
+    assert saved.read_bytes() == content
+    assert list(saved.parent.iterdir()) == [saved]

@@ -1,0 +1,125 @@
+"""Optimiser presets, clipping, schedules, and updates that are refused whole."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from torchrl_gn.training.optimizers import ScheduledOptimizer, make_optimizer
+
+
+def network() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(3, 4), nn.ReLU(), nn.Linear(4, 2))
+
+
+def give_gradients(module: nn.Module, size: float = 1.0) -> None:
+    generator = torch.Generator().manual_seed(0)
+    for parameter in module.parameters():
+        parameter.grad = size * torch.randn(parameter.shape, generator=generator)
+
+
+def rates(optimizer: ScheduledOptimizer) -> list[float]:
+    return [group["lr"] for one in optimizer.optimizers for group in one.param_groups]
+
+
+def test_the_papers_preset_is_adam_with_a_slow_decay():
+    module = network()
+    optimizer = make_optimizer(module, "paper")
+    assert [type(one) for one in optimizer.optimizers] == [torch.optim.Adam]
+    for step, factor in ((0, 1), (49_999, 1), (50_000, 0.975), (149_999, 0.975**2), (1_000_000, 0.975**20)):
+        give_gradients(module)
+        optimizer.step(step, 0.5)
+        assert rates(optimizer) == [pytest.approx(1e-4 * factor, rel=1e-12)]
+
+
+def test_the_papers_first_update_is_adams():
+    """Adam's first step moves every weight by the learning rate against its gradient's sign."""
+    module = network()
+    before = [parameter.detach().clone() for parameter in module.parameters()]
+    give_gradients(module, 1e-3)
+    make_optimizer(module, "paper").step(0, 0.0)
+    for old, new in zip(before, module.parameters(), strict=True):
+        torch.testing.assert_close(new - old, -1e-4 * new.grad.sign(), rtol=1e-2, atol=0)
+
+
+@pytest.mark.parametrize("preset", ["adam", "muon"])
+def test_rates_fall_to_zero_as_a_cosine(preset):
+    module = network()
+    optimizer = make_optimizer(module, preset)
+    highest = rates(optimizer)
+    for fraction in (0.0, 0.25, 0.5, 1.0):
+        give_gradients(module)
+        optimizer.step(0, fraction)
+        factor = 0.5 * (1 + math.cos(math.pi * fraction))
+        assert rates(optimizer) == pytest.approx([rate * factor for rate in highest])
+    before = [parameter.clone() for parameter in module.parameters()]
+    optimizer.step(0, 1.0)
+    assert all(map(torch.equal, before, module.parameters()))
+
+
+def test_muon_takes_the_matrices_and_adam_the_rest():
+    module = network()
+    muon, adam = make_optimizer(module, "muon").optimizers
+    assert isinstance(muon, torch.optim.Muon) and isinstance(adam, torch.optim.Adam)
+    by_optimizer = [{id(p) for group in one.param_groups for p in group["params"]} for one in (muon, adam)]
+    assert by_optimizer[0] == {id(p) for p in module.parameters() if p.ndim == 2}
+    assert by_optimizer[1] == {id(p) for p in module.parameters() if p.ndim == 1}
+    assert len(make_optimizer(nn.Linear(2, 2, bias=False), "muon").optimizers) == 1
+
+
+def test_the_rate_can_be_given_and_frozen_weights_stay():
+    module = network()
+    module[0].requires_grad_(False)
+    optimizer = make_optimizer(module, "adam", lr=0.1)
+    give_gradients(module)
+    before = module[0].weight.clone()
+    optimizer.step(0, 0.0)
+    assert rates(optimizer) == [0.1]
+    assert torch.equal(module[0].weight, before)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e3])
+def test_gradients_are_clipped_together(size):
+    module = network()
+    give_gradients(module, size)
+    optimizer = make_optimizer(module, "adam")
+    exact = torch.cat([parameter.grad.flatten() for parameter in module.parameters()])
+    norm = optimizer.step(0, 0.0)
+    assert norm == pytest.approx(exact.norm().item(), rel=1e-6)
+    clipped = torch.cat([parameter.grad.flatten() for parameter in module.parameters()])
+    torch.testing.assert_close(clipped, exact * min(1, 1 / norm), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+@pytest.mark.parametrize("preset", ["paper", "adam", "muon"])
+def test_a_gradient_that_is_not_finite_changes_nothing(preset, bad):
+    module = network()
+    optimizer = make_optimizer(module, preset)
+    give_gradients(module)
+    optimizer.step(0, 0.0)
+    before, state = [parameter.clone() for parameter in module.parameters()], str(optimizer.state_dict())
+    give_gradients(module)
+    module[2].weight.grad[1, 2] = bad
+    with pytest.raises(FloatingPointError, match="not finite at step 7; lower the learning rate"):
+        optimizer.step(7, 0.1)
+    assert all(map(torch.equal, before, module.parameters()))
+    assert str(optimizer.state_dict()) == state
+
+
+def test_zero_grad_forgets():
+    module = network()
+    give_gradients(module)
+    make_optimizer(module).zero_grad()
+    assert all(parameter.grad is None for parameter in module.parameters())
+
+
+def test_bad_choices_are_named():
+    with pytest.raises(ValueError, match=r"preset 'sgd' is not known; use one of \['muon', 'adam', 'paper'\]"):
+        make_optimizer(network(), "sgd")
+    for lr in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match=f"lr={lr} must be positive"):
+            make_optimizer(network(), lr=lr)

@@ -1,0 +1,49 @@
+"""A run's folder: what is written is plain, complete and inside the folder."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from torchrl_gn.training import RunFolder, package_versions
+
+
+def test_metrics_are_flat_plain_numbers(tmp_path):
+    folder = RunFolder(tmp_path / "run", "train")
+    written = folder.write_metrics({"error": 0.1, "steps": 3, "diverged": math.inf, "nan": math.nan}, seed=7)
+    read = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert read == written
+    assert (read["error"], read["steps"], read["diverged"], read["nan"]) == (0.1, 3, None, None)
+    assert read["seed"] == 7 and read["wall_clock_seconds"] >= 0
+    assert {name: read[f"version/{name}"] for name in package_versions()} == package_versions()
+
+
+def test_only_files_that_exist_are_listed_once_and_in_order(tmp_path):
+    folder = RunFolder(tmp_path / "run", "train")
+    folder.write_config("a: 1\n")
+    folder.write_config("a: 2\n")
+    folder.file("never.png")
+    folder.write_metrics({}, seed=0)
+    assert folder.written == [tmp_path / "run" / "config.yaml", tmp_path / "run" / "metrics.json"]
+    assert folder.written[0].read_text() == "a: 2\n"
+    assert folder.checkpoint.is_relative_to(folder.path) and folder.data.is_relative_to(folder.path)
+
+
+def test_a_run_is_continued_in_its_folder(tmp_path):
+    RunFolder(tmp_path, "train").write_config("a: 1\n")
+    again = RunFolder(tmp_path, "train")
+    assert (again.path / "config.yaml").read_text() == "a: 1\n"
+
+
+def test_the_default_folder_is_named_after_recipe_and_time(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = RunFolder(None, "train")
+    assert folder.path.parts[:2] == ("runs", "train") and folder.path.is_dir()
+
+
+def test_a_file_is_no_run_folder(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError, match="run_dir=.*file is a file; name a folder"):
+        RunFolder(tmp_path / "file", "train")

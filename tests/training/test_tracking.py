@@ -1,0 +1,106 @@
+"""Runs are logged completely: an offline wandb run and a csv run are read back."""
+
+import csv
+import json
+import struct
+
+import pytest
+
+from torchrl_gn.training import Tracker, package_versions
+
+
+def wandb_records(path):
+    """Records of an offline run's file: a header of 7 bytes, then LevelDB's log format.
+
+    Blocks of 32 KiB hold pieces, each with a checksum (4 bytes), a length (2) and a type
+    (1 whole, 2 first, 3 middle, 4 last).
+    """
+    data, position, record = path.read_bytes(), 7, b""
+    while position + 7 <= len(data):
+        if 32768 - position % 32768 < 7:
+            position += 32768 - position % 32768
+            continue
+        length, kind = struct.unpack_from("<HB", data, position + 4)
+        record += data[position + 7 : position + 7 + length]
+        position += 7 + length
+        if kind in (1, 4):
+            yield record
+            record = b""
+
+
+def read_wandb(folder):
+    """Configuration, history and files of the offline run in a folder."""
+    from wandb.proto import wandb_internal_pb2
+
+    (path,) = folder.glob("wandb/offline-run-*/*.wandb")
+    config, history = {}, []
+    for data in wandb_records(path):
+        record = wandb_internal_pb2.Record()
+        record.ParseFromString(data)
+        kind = record.WhichOneof("record_type")
+        if kind in ("run", "config"):
+            update = record.run.config.update if kind == "run" else record.config.update
+            config |= {item.key: json.loads(item.value_json) for item in update if item.key}
+        elif kind == "history":
+            row = {".".join(item.nested_key) or item.key: json.loads(item.value_json) for item in record.history.item}
+            history.append(row)
+    return config, history, {file.name.split("_")[0] for file in path.parent.glob("files/media/*/*")}
+
+
+@pytest.fixture
+def picture(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "prediction.png"
+    Image.new("RGB", (8, 8)).save(path)
+    return path
+
+
+def test_offline_wandb_run_holds_everything(tmp_path, monkeypatch, picture):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    from PIL import Image
+
+    video = tmp_path / "rollout.gif"
+    frames = [Image.new("RGB", (8, 8), color) for color in ("red", "blue")]
+    frames[0].save(video, save_all=True, append_images=frames[1:])
+
+    tracker = Tracker("wandb", tmp_path / "log", name="run", config={"seed": 3, "model": {"latent": 128}})
+    tracker.log({"train/loss": 0.5, "version/torch": "no number"}, step=1)
+    tracker.log({"train/loss": 0.25}, step=2)
+    tracker.log_table("errors", [["error", "one step"], ["total", "0.1"]])
+    tracker.log_files([picture, video])
+    tracker.close()
+
+    config, history, media = read_wandb(tmp_path / "log")
+    assert config["seed"] == 3
+    assert config["model"] == {"latent": 128}
+    assert config["versions"] == package_versions()
+    losses = [row["train/loss"] for row in history if "train/loss" in row]
+    assert losses == [0.5, 0.25]
+    assert not any("version/torch" in row for row in history)
+    assert {"errors", "prediction", "rollout"} <= media
+
+
+def test_csv_run_holds_the_numbers(tmp_path):
+    tracker = Tracker("csv", tmp_path, name="run", config={"seed": 3})
+    for step, value in ((1, 0.5), (2, 0.25)):
+        tracker.log({"loss": value}, step)
+    tracker.close()
+    (path,) = tmp_path.glob("**/loss.csv")
+    with path.open() as file:
+        assert [(int(step), float(value)) for step, value in csv.reader(file)] == [(1, 0.5), (2, 0.25)]
+
+
+def test_none_writes_nothing(tmp_path, picture):
+    tracker = Tracker("none", tmp_path / "log", name="run", config={})
+    tracker.log({"loss": 1.0}, 1)
+    tracker.log_table("errors", [["a"], ["b"]])
+    tracker.log_files([picture])
+    tracker.close()
+    assert not (tmp_path / "log").exists()
+
+
+def test_unknown_logger_is_named(tmp_path):
+    with pytest.raises(ValueError, match="tensorbored.*none.*csv.*wandb"):
+        Tracker("tensorbored", tmp_path, name="run", config={})

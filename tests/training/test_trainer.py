@@ -1,0 +1,183 @@
+"""The training loop: it learns, stops when it should, and resumes bit for bit."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_gn.training.precision import fast_matmul
+
+
+def weights(trainer) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in trainer.model.state_dict().items()}
+
+
+def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
+    assert a.keys() == b.keys()
+    for name in a:
+        assert torch.equal(a[name], b[name]), name
+
+
+@pytest.mark.parametrize("preset", ["muon", "adam"])
+def test_the_loss_falls(make_trainer, preset):
+    trainer = make_trainer(Budget(steps=200), preset=preset, noise=0.0)
+    losses = [progress.loss for progress in trainer.run()]
+    assert len(losses) == 200
+    assert sum(losses[-20:]) < (0.3 if preset == "muon" else 0.7) * sum(losses[:20])
+
+
+def test_progress_counts_steps_seconds_and_the_budget(make_trainer):
+    progress = list(make_trainer(Budget(steps=8)).run())
+    assert [p.step for p in progress] == list(range(1, 9))
+    assert [p.fraction for p in progress] == [step / 8 for step in range(1, 9)]
+    seconds = [p.seconds for p in progress]
+    assert seconds == sorted(seconds) and seconds[0] > 0
+    assert all(p.validation is None for p in progress)
+
+
+def test_a_budget_of_minutes_ends_by_time(make_trainer):
+    trainer = make_trainer(Budget(minutes=0.2 / 60))
+    last = list(trainer.run())[-1]
+    assert last.fraction == 1 and last.seconds >= 0.2
+    trainer.seconds = 0.0  # as good as a larger budget: it goes on
+    assert next(trainer.run()).step == last.step + 1
+
+
+def test_the_callers_time_counts(make_trainer):
+    """Saving and logging between steps is part of the budget and of the share outside the model."""
+    trainer = make_trainer(Budget(steps=3))
+    clock = itertools.count(step=1.0)
+    import torchrl_gn.training.trainer as module
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module.time, "perf_counter", lambda: next(clock))
+        for _ in trainer.run():
+            next(clock)  # one second of the caller's own
+    assert trainer.spent["caller"] > 0 and trainer.spent["sampling"] > 0
+    share = trainer.outside_share()
+    step = trainer.spent["sampling"] + trainer.spent["caller"] + trainer.spent["model"] + trainer.spent["optimizer"]
+    assert share == pytest.approx((trainer.spent["sampling"] + trainer.spent["caller"]) / step)
+    assert 0 < share < 1
+    assert make_trainer(Budget(steps=3)).outside_share() == 0
+
+
+class Errors:
+    """Validation errors given in advance, counting how often it was asked."""
+
+    def __init__(self, *errors: float) -> None:
+        self.errors, self.asked = errors, 0
+
+    def __call__(self) -> float:
+        self.asked += 1
+        return self.errors[self.asked - 1]
+
+
+def test_the_best_weights_are_kept(make_trainer):
+    trainer = make_trainer(Budget(steps=12), validate=Errors(3.0, 1.0, 2.0, math.nan), validations=4)
+    seen = {p.step: (p.validation, weights(trainer)) for p in trainer.run() if p.validation is not None}
+    assert list(seen) == [3, 6, 9, 12]
+    assert trainer.best == 1.0
+    assert not all(torch.equal(value, seen[12][1][name]) for name, value in seen[6][1].items())
+    trainer.restore_best()
+    assert_same(weights(trainer), seen[6][1])
+
+
+def test_without_validation_nothing_is_restored(make_trainer):
+    trainer = make_trainer(Budget(steps=3))
+    for _ in trainer.run():
+        pass
+    before = weights(trainer)
+    trainer.restore_best()
+    assert_same(weights(trainer), before)
+
+
+def test_patience_stops_after_validations_without_a_new_best(make_trainer):
+    errors = Errors(5.0, 3.0, 4.0, 3.5, 1.0, 1.0)
+    trainer = make_trainer(Budget(steps=12), validate=errors, validations=6, patience=2)
+    assert [p.validation for p in trainer.run() if p.validation is not None] == [5.0, 3.0, 4.0, 3.5]
+    assert trainer.step == 8
+    assert list(trainer.run()) == []
+
+
+@pytest.mark.parametrize("stop", [1, 4, 7])
+@pytest.mark.parametrize("preset", ["muon", "paper"])
+def test_resumed_training_is_the_uninterrupted_one(make_trainer, scene, tmp_path, stop, preset):
+    """Weights, normalisers, optimisers, sampled batches, noise, unrolling and validation all go on."""
+
+    def trainer(model=None):
+        options = {"preset": preset, "unroll": 0.4, "validations": 5, "patience": 10}
+        made = make_trainer(Budget(steps=10), model, **options)
+        made.validate = lambda: float(sum(p.detach().abs().sum() for p in made.model.parameters()))
+        return made
+
+    whole = trainer()
+    expected = {p.step: (p.loss, p.validation) for p in whole.run()}
+
+    first = trainer()
+    before = {p.step: (p.loss, p.validation) for p in itertools.islice(first.run(), stop)}
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, first.model, scene=scene, training=first.state_dict())
+    for _ in first.run():  # what happens after saving does not matter
+        pass
+
+    loaded = load_checkpoint(path)
+    torch.manual_seed(123)
+    resumed = trainer(loaded.model)
+    resumed.load_state_dict(loaded.training)
+    assert resumed.step == stop and resumed.seconds > 0
+    after = {p.step: (p.loss, p.validation) for p in resumed.run()}
+
+    assert before | after == expected
+    assert_same(weights(resumed), weights(whole))
+    assert_same(resumed.best_weights, whole.best_weights)
+    assert (resumed.best, resumed.since_best, resumed.validated) == (
+        whole.best,
+        whole.since_best,
+        whole.validated,
+    )
+    last, expected_last = resumed.optimizer.state_dict(), whole.optimizer.state_dict()
+    for index in expected_last:
+        rates = [[group["lr"] for group in state[index]["param_groups"]] for state in (last, expected_last)]
+        assert rates[0] == rates[1]
+
+
+def test_windows_are_unrolled_at_the_end(make_trainer):
+    trainer = make_trainer(Budget(steps=10), unroll=0.3)
+    shapes, inner = [], trainer.loss.forward
+    trainer.loss.forward = lambda batch: shapes.append(tuple(batch.shape)) or inner(batch)
+    for _ in trainer.run():
+        pass
+    assert shapes == [(32,)] * 7 + [(8, 3)] * 3
+
+
+def test_a_loss_that_is_not_finite_stops_before_any_weight_changes(make_trainer):
+    trainer = make_trainer(Budget(steps=10))
+    for _ in itertools.islice(trainer.run(), 3):
+        pass
+    with torch.no_grad():
+        trainer.model.core.second.node_mlp[-1].bias[5] = torch.inf
+    before = weights(trainer)
+    with pytest.raises(FloatingPointError, match="The loss is (nan|inf) at step 3; lower the learning rate"):
+        next(trainer.run())
+    assert_same(weights(trainer), before)
+    assert trainer.step == 3
+
+
+def test_fast_products_last_as_long_as_their_block():
+    cpu, cuda = torch.backends.mkldnn.matmul, torch.backends.cuda.matmul
+    before = cpu.fp32_precision, cuda.fp32_precision
+    with pytest.raises(RuntimeError), fast_matmul():
+        assert (cpu.fp32_precision, cuda.fp32_precision) == ("bf16", "tf32")
+        raise RuntimeError
+    assert (cpu.fp32_precision, cuda.fp32_precision) == before
+
+
+def test_callers_see_their_own_precision_between_steps(make_trainer):
+    before = torch.backends.mkldnn.matmul.fp32_precision
+    for _ in make_trainer(Budget(steps=2)).run():
+        assert torch.backends.mkldnn.matmul.fp32_precision == before

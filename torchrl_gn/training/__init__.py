@@ -1,0 +1,16 @@
+"""Training loop, optimiser presets, checkpoints, and what recipes share."""
+
+from torchrl_gn.training.budget import Budget as Budget
+from torchrl_gn.training.checkpoint import Checkpoint as Checkpoint
+from torchrl_gn.training.checkpoint import CheckpointError as CheckpointError
+from torchrl_gn.training.checkpoint import load_checkpoint as load_checkpoint
+from torchrl_gn.training.checkpoint import package_versions as package_versions
+from torchrl_gn.training.checkpoint import save_checkpoint as save_checkpoint
+from torchrl_gn.training.exit import clean_exit as clean_exit
+from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer
+from torchrl_gn.training.optimizers import make_optimizer as make_optimizer
+from torchrl_gn.training.precision import fast_matmul as fast_matmul
+from torchrl_gn.training.run_folder import RunFolder as RunFolder
+from torchrl_gn.training.tracking import Tracker as Tracker
+from torchrl_gn.training.trainer import Progress as Progress
+from torchrl_gn.training.trainer import Trainer as Trainer

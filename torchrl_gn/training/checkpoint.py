@@ -1,0 +1,189 @@
+"""Checkpoints: weights, normalisers and all that is needed to use or resume them, in one file."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.modules import ForwardModel
+from torchrl_gn.scenes import Scene, scene_from_description
+
+CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
+"""Where a run folder keeps its checkpoint."""
+
+FORMAT = 1
+"""Version of the checkpoint format that this package writes, and the newest it reads."""
+
+_PACKAGES = (
+    "torchrl_gn",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "torch-geometric",
+    "mujoco",
+    "dm-control",
+    "numpy",
+)
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used: missing, damaged, of a newer format, or not ours."""
+
+
+@dataclass
+class Checkpoint:
+    """What a checkpoint file holds.
+
+    Attributes:
+        model: the forward model with its weights and normalisers.
+        scene_description: description of the scene it was trained on.
+        config: configuration of the run that made it.
+        versions: package versions of that run.
+        training: nested state of the training, empty if only the model was saved.
+    """
+
+    model: ForwardModel
+    scene_description: dict
+    config: dict
+    versions: dict
+    training: dict = field(default_factory=dict)
+
+    def scene(self) -> Scene:
+        """The scene that the model was trained on, built again."""
+        return scene_from_description(self.scene_description)
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of the packages that decide what a run computes."""
+    versions = {}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
+def save_checkpoint(
+    path: str | os.PathLike,
+    model: ForwardModel,
+    *,
+    scene: Scene,
+    config: Mapping[str, Any] | None = None,
+    training: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a checkpoint, atomically and without pickle.
+
+    Args:
+        path: file to write, ``.safetensors``.
+        model: the forward model.
+        scene: the scene it is trained on.
+        config: configuration of the run, plain JSON-able values.
+        training: nested dictionaries and lists of tensors and plain values, to resume from.
+    """
+    tensors: dict[str, Tensor] = {}
+    plain = _flatten(training or {}, "training", tensors)
+    for name, value in model.state_dict().items():
+        tensors[f"model.{name}"] = value
+    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    description = {
+        "model": model.description(),
+        "scene": scene.description(),
+        "config": dict(config or {}),
+        "versions": package_versions(),
+        "training": plain,
+    }
+    text = json.dumps(description, sort_keys=True)
+    digest = _digest(tensors, text)
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata={"format": str(FORMAT), "description": text, "sha256": digest})
+
+
+def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
+    """Read a checkpoint.
+
+    Args:
+        path: the file, or the run folder that holds it.
+
+    Raises:
+        CheckpointError: if the file is missing, damaged, of a newer format or no checkpoint.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / CHECKPOINT_FILE
+    if not path.is_file():
+        raise CheckpointError(f"No checkpoint at {path}.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError, struct.error) as error:
+        raise CheckpointError(f"Checkpoint {path} is damaged ({error}); use another or train again.") from error
+    if not {"format", "description", "sha256"} <= metadata.keys():
+        raise CheckpointError(f"{path} is a safetensors file, but no checkpoint of torchrl_gn.")
+    if int(metadata["format"]) > FORMAT:
+        raise CheckpointError(
+            f"Checkpoint {path} has format {metadata['format']}, this version reads up to {FORMAT}; update torchrl_gn."
+        )
+    text = metadata["description"]
+    if _digest(tensors, text) != metadata["sha256"]:
+        raise CheckpointError(f"Checkpoint {path} is damaged (checksum differs); use another or train again.")
+    description = json.loads(text)
+    model = ForwardModel.from_description(description["model"])
+    weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
+    model.to(next(value.dtype for name, value in weights.items() if name.startswith("core.")))
+    model.load_state_dict(weights)
+    return Checkpoint(
+        model=model,
+        scene_description=description["scene"],
+        config=description["config"],
+        versions=description["versions"],
+        training=_unflatten(description["training"], tensors),
+    )
+
+
+def _digest(tensors: Mapping[str, Tensor], text: str) -> str:
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        value = tensors[name].contiguous()
+        digest.update(f"{name}{value.dtype}{list(value.shape)}".encode())
+        digest.update(value.flatten().view(torch.uint8).numpy().tobytes() if value.numel() else b"")
+    return digest.hexdigest()
+
+
+def _flatten(value: Any, prefix: str, tensors: dict[str, Tensor]) -> Any:
+    """Plain mirror of a nested structure in which each tensor is replaced by its name."""
+    if isinstance(value, Tensor):
+        tensors[prefix] = value
+        return {"tensor": prefix}
+    if isinstance(value, Mapping):
+        items = [[key, _flatten(item, f"{prefix}.{key}", tensors)] for key, item in value.items()]
+        return {"dict": items}
+    if isinstance(value, (list, tuple)):
+        return {"list": [_flatten(item, f"{prefix}.{index}", tensors) for index, item in enumerate(value)]}
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return {"value": value}
+    raise TypeError(f"Checkpoint entry {prefix} has type {type(value).__name__}; only tensors and plain values fit.")
+
+
+def _unflatten(mirror: Any, tensors: Mapping[str, Tensor]) -> Any:
+    if "tensor" in mirror:
+        return tensors[mirror["tensor"]]
+    if "dict" in mirror:
+        return {key: _unflatten(item, tensors) for key, item in mirror["dict"]}
+    if "list" in mirror:
+        return [_unflatten(item, tensors) for item in mirror["list"]]
+    return mirror["value"]

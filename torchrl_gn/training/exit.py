@@ -1,0 +1,35 @@
+"""How a recipe ends: exit codes, and errors as a person wants to read them."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
+    """Let a recipe's main function end cleanly.
+
+    What its user can mend (a bad option, file or data set, an unstable simulation) is one line
+    on standard error and exit code 1, without a traceback. Ctrl-C is exit code 130, after the
+    recipe has saved what it has. Anything else is a bug and keeps its traceback.
+    """
+
+    @functools.wraps(main)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return main(*args, **kwargs)
+        except KeyboardInterrupt:
+            sys.stderr.write("Interrupted; what was done is saved. The same run_dir goes on from there.\n")
+            raise SystemExit(130) from None
+        except (ValueError, OSError, RuntimeError, FloatingPointError, ImportError) as error:
+            if type(error) is RuntimeError:
+                raise
+            sys.stderr.write(f"{type(error).__name__}: {error}\n")
+            raise SystemExit(1) from error
+
+    return wrapped

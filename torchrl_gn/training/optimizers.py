@@ -1,0 +1,115 @@
+"""Optimiser presets: which optimisers a model trains with and how their rates fall."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal, get_args
+
+import torch
+from torch import nn
+
+Preset = Literal["muon", "adam", "paper"]
+
+
+class ScheduledOptimizer:
+    """Optimisers that step together, with clipped gradients and scheduled learning rates.
+
+    Args:
+        optimizers: the optimisers, each with its own parameters; the learning rates they
+            are made with are the highest.
+        schedule: factor on all learning rates from ``(step, fraction)``, where
+            ``fraction`` of the training budget is spent.
+        max_norm: norm that the gradient of all parameters together is clipped to.
+    """
+
+    def __init__(
+        self,
+        optimizers: list[torch.optim.Optimizer],
+        schedule: Callable[[int, float], float],
+        *,
+        max_norm: float = 1.0,
+    ) -> None:
+        self.optimizers, self.schedule, self.max_norm = optimizers, schedule, max_norm
+        self._highest = [[group["lr"] for group in optimizer.param_groups] for optimizer in optimizers]
+        self._parameters = [p for o in optimizers for group in o.param_groups for p in group["params"]]
+
+    def zero_grad(self) -> None:
+        """Forget all gradients."""
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+
+    def step(self, step: int, fraction: float) -> float:
+        """Clip gradients, set the rates and update the parameters.
+
+        Args:
+            step: updates done before this one.
+            fraction: share of the training budget spent, 0 to 1.
+
+        Returns:
+            Norm of the gradient before clipping.
+
+        Raises:
+            FloatingPointError: if the gradient is not finite; no parameter is changed.
+        """
+        norm = float(nn.utils.clip_grad_norm_(self._parameters, self.max_norm))
+        if not math.isfinite(norm):
+            raise FloatingPointError(f"The gradient is not finite at step {step}; lower the learning rate.")
+        factor = self.schedule(step, fraction)
+        for optimizer, rates in zip(self.optimizers, self._highest, strict=True):
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+            optimizer.step()
+        return norm
+
+    def state_dict(self) -> dict:
+        """State of all optimisers, for checkpoints."""
+        return {str(index): optimizer.state_dict() for index, optimizer in enumerate(self.optimizers)}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Take back what :meth:`state_dict` gave."""
+        for index, optimizer in enumerate(self.optimizers):
+            optimizer.load_state_dict(state[str(index)])
+
+
+def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | None = None) -> ScheduledOptimizer:
+    """Optimiser of a preset for a module's parameters.
+
+    - ``"muon"``: Muon on matrices (2e-2) and Adam on the rest (1e-3), cosine to 0.
+    - ``"adam"``: Adam (1e-3), cosine to 0.
+    - ``"paper"``: Adam at 1e-4, times 0.975 every 50,000 steps (SM "Training details", fast
+      training; Paper: the rate is printed as ``1^{-4}``).
+
+    Args:
+        module: what to train.
+        preset: name of the preset.
+        lr: highest learning rate (of Muon's matrices), instead of the preset's.
+
+    Raises:
+        ValueError: if the preset is unknown or the rate is not positive.
+    """
+    if preset not in get_args(Preset):
+        raise ValueError(f"Optimiser preset {preset!r} is not known; use one of {list(get_args(Preset))}.")
+    if lr is not None and not lr > 0:
+        raise ValueError(f"lr={lr} must be positive.")
+    parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    if preset == "paper":
+        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-4)], _paper_decay)
+    if preset == "adam":
+        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-3)], _cosine)
+    matrices = [parameter for parameter in parameters if parameter.ndim == 2]
+    rest = [parameter for parameter in parameters if parameter.ndim != 2]
+    optimizers: list[torch.optim.Optimizer] = []
+    if matrices:
+        optimizers.append(torch.optim.Muon(matrices, lr=lr or 2e-2, weight_decay=0.0))
+    if rest:
+        optimizers.append(torch.optim.Adam(rest, lr=1e-3))
+    return ScheduledOptimizer(optimizers, _cosine)
+
+
+def _paper_decay(step: int, fraction: float) -> float:
+    return 0.975 ** (step // 50_000)
+
+
+def _cosine(step: int, fraction: float) -> float:
+    return 0.5 * (1 + math.cos(math.pi * min(max(fraction, 0.0), 1.0)))

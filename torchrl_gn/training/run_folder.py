@@ -1,0 +1,89 @@
+"""The folder that a recipe writes to, and nothing else."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from torchrl_gn.atomic import atomic_path, write_json
+from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
+
+
+class RunFolder:
+    """A run's folder: configuration, metrics, checkpoint, figures and videos.
+
+    A folder that already holds a run is continued.
+
+    Args:
+        path: the folder; by default ``runs/<name>/<time>``.
+        name: name of the recipe.
+
+    Raises:
+        NotADirectoryError: if ``path`` is a file.
+    """
+
+    def __init__(self, path: str | os.PathLike | None, name: str) -> None:
+        self.path = Path(path) if path else Path("runs") / name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        if self.path.exists() and not self.path.is_dir():
+            raise NotADirectoryError(f"run_dir={self.path} is a file; name a folder.")
+        self.name = name
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._start = time.perf_counter()
+        self._written: list[Path] = []
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where the run's checkpoint lies."""
+        return self.path / CHECKPOINT_FILE
+
+    @property
+    def data(self) -> Path:
+        """Where the run keeps data that it collects."""
+        return self.path / "data"
+
+    def file(self, name: str) -> Path:
+        """Path of a file of this run, listed in :attr:`written`."""
+        path = self.path / name
+        if path not in self._written:
+            self._written.append(path)
+        return path
+
+    @property
+    def written(self) -> list[Path]:
+        """Files of this run that exist, in the order they were asked for."""
+        return [path for path in self._written if path.exists()]
+
+    def write_config(self, text: str) -> None:
+        """Write ``config.yaml``."""
+        with atomic_path(self.file("config.yaml")) as temporary:
+            temporary.write_text(text)
+
+    def write_metrics(self, metrics: Mapping[str, Any], *, seed: int) -> dict[str, Any]:
+        """Write ``metrics.json``: flat names and plain numbers, versions, seed and seconds.
+
+        JSON has no infinity: a number that is not finite (the error of a diverged
+        rollout) is written as null.
+
+        Returns:
+            What was written.
+        """
+        numbers = {key: _plain(value) for key, value in metrics.items()}
+        everything = {
+            **numbers,
+            "seed": seed,
+            "wall_clock_seconds": round(time.perf_counter() - self._start, 3),
+            **{f"version/{name}": version for name, version in package_versions().items()},
+        }
+        write_json(self.file("metrics.json"), everything)
+        return everything
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,100 @@
+"""Log a run with TorchRL's loggers."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from torchrl_gn.training.checkpoint import package_versions
+
+LoggerKind = Literal["none", "csv", "wandb"]
+
+
+class Tracker:
+    """Numbers, figures, videos and configuration of a run, sent to a TorchRL logger.
+
+    Args:
+        kind: ``"none"``, ``"csv"`` files or ``"wandb"``. Without an account (no API key and no
+            login), wandb runs offline; ``wandb sync`` uploads such a run later.
+        folder: where the logger writes.
+        name: name of the run.
+        config: configuration of the run.
+
+    Raises:
+        ValueError: if the kind is unknown.
+        ImportError: if wandb is asked for but not installed.
+    """
+
+    def __init__(self, kind: LoggerKind, folder: Path, *, name: str, config: Mapping[str, Any]) -> None:
+        if kind not in get_args(LoggerKind):
+            raise ValueError(f"logger={kind!r} is not known; use one of {list(get_args(LoggerKind))}.")
+        self.kind = kind
+        self._logger: Any = None
+        if kind == "none":
+            return
+        from torchrl.record.loggers import get_logger
+
+        options: dict[str, Any] = {}
+        if kind == "wandb":
+            options["wandb_kwargs"] = {
+                "offline": not _has_account(),
+                "project": "torchrl_gn",
+                "config": dict(config),
+                # The same folder is the same run, so that a resumed run goes on where it was.
+                "id": hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
+                "log_env_packages": False,
+            }
+            os.environ.setdefault("WANDB_SILENT", "true")
+        folder.mkdir(parents=True, exist_ok=True)
+        self._logger = get_logger(kind, logger_name=str(folder), experiment_name=name, **options)
+        if kind == "wandb":
+            self._logger.experiment.config.update({"versions": package_versions()})
+        else:
+            self._logger.log_hparams({**config, "versions": package_versions()})
+
+    def log(self, numbers: Mapping[str, float], step: int) -> None:
+        """Log numbers at a step; entries that are no numbers are passed over."""
+        if self._logger is None:
+            return
+        for name, value in numbers.items():
+            if isinstance(value, (int, float)):
+                self._logger.log_scalar(name, float(value), step=step)
+
+    def log_files(self, paths: list[Path]) -> None:
+        """Log figures and videos; only wandb takes them, the csv logger's lie in the run folder."""
+        if self.kind != "wandb" or self._logger is None:
+            return
+        import wandb
+
+        for path in paths:
+            if path.suffix == ".png":
+                self._logger.experiment.log({path.stem: wandb.Image(str(path))})
+            elif path.suffix in (".gif", ".mp4"):
+                video = wandb.Video(str(path), format="gif" if path.suffix == ".gif" else "mp4")
+                self._logger.experiment.log({path.stem: video})
+
+    def log_table(self, name: str, rows: Sequence[Sequence[Any]]) -> None:
+        """Log a table whose first row holds the titles; only wandb takes it."""
+        if self.kind != "wandb" or self._logger is None:
+            return
+        import wandb
+
+        titles, *data = rows
+        self._logger.experiment.log({name: wandb.Table(columns=list(titles), data=[list(row) for row in data])})
+
+    def close(self) -> None:
+        """Finish the run."""
+        if self.kind == "wandb" and self._logger is not None:
+            self._logger.experiment.finish()
+
+
+def _has_account() -> bool:
+    if os.environ.get("WANDB_MODE") == "offline":
+        return False
+    return bool(os.environ.get("WANDB_API_KEY")) or any(
+        (Path.home() / name).exists() and "wandb" in (Path.home() / name).read_text(errors="ignore")
+        for name in (".netrc", "_netrc")
+    )

@@ -1,0 +1,191 @@
+"""The training loop of a forward model, resumable at any step."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torchrl.data import ReplayBuffer
+
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.optimizers import ScheduledOptimizer
+from torchrl_gn.training.precision import fast_matmul
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training stands, yielded after every step.
+
+    Attributes:
+        step: optimiser steps done.
+        seconds: training seconds spent, over all resumed runs.
+        fraction: share of the budget spent.
+        loss: loss of this step's batch.
+        validation: validation error, if it was measured after this step.
+    """
+
+    step: int
+    seconds: float
+    fraction: float
+    loss: float
+    validation: float | None = None
+
+
+class Trainer:
+    """Train a forward model from a replay buffer.
+
+    Iterate over :meth:`run`; every step yields a :class:`Progress`, so the caller shows
+    progress, logs and saves checkpoints where it likes, and may stop at any step.
+
+    Args:
+        loss: the loss; its model is what is trained.
+        buffer: replay buffer of transitions.
+        optimizer: optimiser of the model's weights.
+        budget: when to stop.
+        unroll: buffer of windows of several steps, used at the end of the training.
+        unroll_fraction: share of the budget spent on the windows of ``unroll``.
+        validate: error on data that is not trained on; the weights with the lowest one
+            seen are kept (paper: 20-step rollouts of the validation set).
+        validations: how often to validate over the whole budget.
+        patience: stop after so many validations without a new best. Default: never.
+    """
+
+    def __init__(
+        self,
+        loss: ForwardModelLoss,
+        buffer: ReplayBuffer,
+        optimizer: ScheduledOptimizer,
+        budget: Budget,
+        *,
+        unroll: ReplayBuffer | None = None,
+        unroll_fraction: float = 0.0,
+        validate: Callable[[], float] | None = None,
+        validations: int = 20,
+        patience: int | None = None,
+    ) -> None:
+        self.loss, self.buffer, self.optimizer, self.budget = loss, buffer, optimizer, budget
+        self.unroll, self.unroll_fraction = unroll, unroll_fraction
+        self.validate, self.validations, self.patience = validate, validations, patience
+        self.model = loss.model.model
+        self.step, self.seconds = 0, 0.0
+        self.best, self.since_best, self.validated = math.inf, 0, 0
+        self.best_weights: dict[str, torch.Tensor] = {}
+        # Seconds by part, to see what a step spends outside the model.
+        self.spent = {"sampling": 0.0, "model": 0.0, "optimizer": 0.0, "validation": 0.0, "caller": 0.0}
+
+    @property
+    def fraction(self) -> float:
+        """Share of the budget that is spent, 0 to 1."""
+        return self.budget.fraction(self.step, self.seconds)
+
+    def run(self) -> Iterator[Progress]:
+        """Train until the budget is spent, yielding after every step.
+
+        Raises:
+            FloatingPointError: if the loss or the gradient is not finite, before any
+                weight is touched by it.
+        """
+        while self.fraction < 1 and not self._patience_is_over():
+            start = time.perf_counter()
+            with fast_matmul():
+                loss = self._update()
+            self._add("", start)
+            validation = self._validation()
+            start = time.perf_counter()
+            yield Progress(self.step, self.seconds, self.fraction, loss, validation)
+            self._add("caller", start)
+
+    def _update(self) -> float:
+        fraction = self.fraction
+        clock = time.perf_counter()
+        buffer = self.buffer
+        if self.unroll is not None and fraction >= 1 - self.unroll_fraction:
+            buffer = self.unroll
+        batch = buffer.sample()
+        clock = self._lap("sampling", clock)
+        loss = self.loss(batch)["loss_forward_model"]
+        if not bool(torch.isfinite(loss)):
+            raise FloatingPointError(f"The loss is {loss.item()} at step {self.step}; lower the learning rate.")
+        self.optimizer.zero_grad()
+        loss.backward()
+        clock = self._lap("model", clock)
+        self.optimizer.step(self.step, fraction)
+        self._lap("optimizer", clock)
+        self.step += 1
+        return loss.item()
+
+    def _validation(self) -> float | None:
+        due = math.floor(self.fraction * self.validations)
+        if self.validate is None or due <= self.validated:
+            return None
+        start = time.perf_counter()
+        error = self.validate()
+        self.validated = due
+        self.since_best += 1
+        if error < self.best:
+            self.best, self.since_best = error, 0
+            self.best_weights = {name: value.clone() for name, value in self.model.state_dict().items()}
+        self._add("validation", start)
+        return error
+
+    def _patience_is_over(self) -> bool:
+        return self.patience is not None and self.since_best >= self.patience
+
+    def _lap(self, part: str, since: float) -> float:
+        now = time.perf_counter()
+        self.spent[part] += now - since
+        return now
+
+    def _add(self, part: str, since: float) -> None:
+        elapsed = time.perf_counter() - since
+        self.seconds += elapsed
+        if part:
+            self.spent[part] += elapsed
+
+    def outside_share(self) -> float:
+        """Share of a step's time spent outside model and optimiser: sampling and the caller's work."""
+        step = sum(seconds for part, seconds in self.spent.items() if part != "validation")
+        return (self.spent["sampling"] + self.spent["caller"]) / step if step else 0.0
+
+    def restore_best(self) -> None:
+        """Give the model the weights of the best validation, if there was one."""
+        if self.best_weights:
+            self.model.load_state_dict(self.best_weights)
+
+    def state_dict(self) -> dict:
+        """All that is needed to go on later exactly here, weights apart."""
+        buffers = {"main": self.buffer, "unroll": self.unroll}
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "noise_scale": self.loss.noise_scale,
+            "samplers": {name: buffer.sampler.state_dict() for name, buffer in buffers.items() if buffer is not None},
+            "noise_generator": None if self.loss.generator is None else self.loss.generator.get_state(),
+            "best_weights": self.best_weights,
+            "progress": {
+                "step": self.step,
+                "seconds": self.seconds,
+                "best": self.best if math.isfinite(self.best) else None,
+                "since_best": self.since_best,
+                "validated": self.validated,
+                "spent": self.spent,
+            },
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from what :meth:`state_dict` gave."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.loss.noise_scale.copy_(state["noise_scale"])
+        self.buffer.sampler.load_state_dict(state["samplers"]["main"])
+        if self.unroll is not None and "unroll" in state["samplers"]:
+            self.unroll.sampler.load_state_dict(state["samplers"]["unroll"])
+        if self.loss.generator is not None and state["noise_generator"] is not None:
+            self.loss.generator.set_state(state["noise_generator"])
+        self.best_weights = dict(state["best_weights"])
+        progress = state["progress"]
+        self.step, self.seconds, self.spent = progress["step"], progress["seconds"], dict(progress["spent"])
+        self.best = math.inf if progress["best"] is None else progress["best"]
+        self.since_best, self.validated = progress["since_best"], progress["validated"]
