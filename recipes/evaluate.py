@@ -1,0 +1,44 @@
+"""Evaluate a trained forward model, on its own system or on another one.
+
+    python recipes/evaluate.py checkpoint=runs/forward_model/<time> [system=swimmer8] [key=value ...]
+
+Collects fresh test trajectories, prints the error table (docs/evaluation.md says how errors
+are defined), and leaves metrics.json, a figure and a video in its run folder. All options:
+recipes/config/evaluate.yaml. Takes seconds.
+"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.evaluation import report
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
+
+
+@hydra.main(version_base=None, config_path="config", config_name="evaluate")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    checkpoint = load_checkpoint(cfg.checkpoint)
+    scene = load_scene(cfg.system, timestep=cfg.timestep) if cfg.system else checkpoint.scene()
+    model = checkpoint.model.bind(scene, strict=cfg.strict)
+    run = RunFolder(cfg.run_dir, "evaluate")
+    run.write_config(OmegaConf.to_yaml(cfg))
+    with tqdm(total=cfg.sequences, desc="collecting test data", leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, progress=show)
+    table, files = report(model, test, run.path)
+    run.write_metrics(table.to_metrics(), seed=cfg.seed)
+    print(table)
+    for path in [*files, run.path / "metrics.json"]:
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""Every Python example and every link of the README and the docs works."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def examples(page: Path) -> list[str]:
+    """Python blocks of a page, each behind as many empty lines as stand above it."""
+    text = page.read_text()
+    blocks = [match for match in FENCE.finditer(text) if match[1] == "python"]
+    return ["\n" * text.count("\n", 0, match.start(2)) + match[2] for match in blocks]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if examples(page)], ids=name)
+def test_examples_run(page, tmp_path, monkeypatch):
+    """The blocks of one page share their names and run from top to bottom in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "__example__"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # what a reader would see on the screen
+        for block in examples(page):
+            exec(compile(block, name(page), "exec"), names)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_lead_somewhere(page):
+    text = FENCE.sub("", page.read_text())
+    for link in re.findall(r"\]\(([^)]+)\)", text):
+        if "://" in link or link.startswith("mailto:"):
+            continue
+        target, _, anchor = link.partition("#")
+        file = page.parent / target if target else page
+        assert file.exists(), f"{name(page)} links to {link}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", FENCE.sub("", file.read_text()), re.MULTILINE)
+            anchors = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            assert anchor in anchors, f"{name(page)} links to {link}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_named_files_exist(page):
+    """Recipes and folders of this repository that a page names in code are there."""
+    for path in re.findall(r"(?:recipes|torchrl_gn|tests|docs)/[\w/.-]*\w", page.read_text()):
+        assert (ROOT / path).exists(), f"{name(page)} names {path}"
+
+
+def test_readme_has_two_setup_commands_and_ci_runs_its_test_command():
+    commands = [line for line in (ROOT / "README.md").read_text().splitlines() if "-m venv" in line]
+    assert len(commands) == 2
+    assert "recipes/forward_model.py" in commands[0] and "-m pytest" in commands[1]
+    assert "README.md" in (ROOT / ".ci" / "run").read_text()

@@ -1,0 +1,90 @@
+"""Rules of the whole package: what it imports, in which direction, and that it keeps silent."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchrl_gn
+
+PACKAGE = Path(torchrl_gn.__file__).parent
+
+# A folder imports from itself and from those before it: the data flow is the reading order.
+ALLOWED = {
+    "scenes": set(),
+    "data": {"scenes"},
+    "modules": {"scenes"},
+    "rewards": {"scenes", "modules"},
+    "objectives": {"scenes", "data", "modules", "rewards"},
+    "envs": {"scenes", "data", "modules", "rewards"},
+    "planners": {"scenes", "data", "modules", "rewards", "objectives", "envs"},
+    "evaluation": {"scenes", "data", "modules", "rewards", "objectives", "envs", "planners"},
+    "training": {"scenes", "data", "modules", "rewards", "objectives", "envs", "planners", "evaluation"},
+}
+ANYWHERE = {"atomic"}  # modules beside the folders
+
+
+def imports(tree: ast.AST) -> list[str]:
+    """Absolute names of all modules that a file imports, inside functions too."""
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            names.append(node.module or "")
+    return names
+
+
+@pytest.mark.parametrize("file", sorted(PACKAGE.rglob("*.py")), ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_imports_point_one_way(file):
+    folder = file.relative_to(PACKAGE).parts[0]
+    if folder not in ALLOWED:
+        return
+    inside = [name.split(".") for name in imports(ast.parse(file.read_text())) if name.startswith("torchrl_gn")]
+    parts = {name[1] for name in inside if len(name) > 1}
+    wrong = parts - ALLOWED[folder] - ANYWHERE - {folder}
+    assert not wrong, f"torchrl_gn.{folder} must not import torchrl_gn.{', '.join(sorted(wrong))}"
+
+
+def test_every_folder_has_a_place_in_the_order():
+    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert folders <= set(ALLOWED)
+
+
+@pytest.mark.parametrize("file", sorted(PACKAGE.rglob("*.py")), ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_library_does_not_print(file):
+    for node in ast.walk(ast.parse(file.read_text())):
+        assert not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print")
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+
+
+def test_importing_everything_is_silent_and_leaves_the_recipes_libraries_alone():
+    folders = [f"torchrl_gn.{folder}" for folder in ALLOWED if (PACKAGE / folder / "__init__.py").exists()]
+    done = run(
+        f"import sys, {', '.join(['torchrl_gn', *folders])}\n"
+        "wanted = {'hydra', 'omegaconf', 'wandb', 'dm_control', 'gymnasium', 'matplotlib.pyplot'}\n"
+        "print(sorted(wanted & set(sys.modules)))"
+    )
+    assert done.returncode == 0, done.stderr
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+def test_package_itself_is_light():
+    done = run("import sys, torchrl_gn; print(torchrl_gn.__version__, 'torch' in sys.modules)")
+    assert (done.stdout, done.stderr) == (f"{torchrl_gn.__version__} False\n", "")
+
+
+def test_warnings_of_the_package_fail_tests(pytestconfig):
+    assert "error:::torchrl_gn" in pytestconfig.getini("filterwarnings")
+
+
+def test_package_is_typed():
+    assert (PACKAGE / "py.typed").exists()
