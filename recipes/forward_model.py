@@ -36,6 +36,9 @@ from torchrl_gn.training import (
     save_checkpoint,
 )
 
+# A run may go on with more time, another logger or other threads, and nothing else.
+MAY_CHANGE = ("minutes", "steps", "threads", "logger", "run_dir", "checkpoint_seconds", "patience")
+
 
 def options(cfg: DictConfig) -> dict[str, Any]:
     """Options as plain values."""
@@ -69,19 +72,14 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, scene, dataset) -> Traine
     )
 
 
-def train(trainer: Trainer, run: RunFolder, tracker: Tracker, cfg: DictConfig, scene) -> dict[str, list]:
-    """Train with a progress bar, saving every minute and on Ctrl-C; returns the curves."""
-    config = options(cfg)
+def train(trainer: Trainer, curves: dict[str, list], run: RunFolder, tracker: Tracker, cfg: DictConfig) -> None:
+    """Train with a progress bar, saving now and then and on Ctrl-C; extends the curves."""
 
     def save() -> None:
         state = {**trainer.state_dict(), "curves": curves}
-        save_checkpoint(run.checkpoint, trainer.model, scene=scene, config=config, training=state)
+        scene = trainer.loss.model.scene
+        save_checkpoint(run.checkpoint, trainer.model, scene=scene, config=options(cfg), training=state)
 
-    curves: dict[str, list] = {"seconds": [], "loss": [], "validation_seconds": [], "validation": []}
-    if run.checkpoint.exists():
-        state = load_checkpoint(run.checkpoint).training
-        trainer.load_state_dict(state)
-        curves = state["curves"]
     saved, losses = trainer.seconds, []
     bar = tqdm(total=100, initial=int(100 * trainer.fraction), unit="%", desc="training", leave=False)
     try:
@@ -96,8 +94,6 @@ def train(trainer: Trainer, run: RunFolder, tracker: Tracker, cfg: DictConfig, s
                 bar.set_postfix(step=progress.step, loss=f"{mean:.2e}", best20=f"{trainer.best:.2e}")
                 bar.update(int(100 * progress.fraction) - bar.n)
             if progress.validation is not None:
-                curves["validation_seconds"].append(progress.seconds)
-                curves["validation"].append(progress.validation)
                 tracker.log({"validation/rollout_error_20": progress.validation}, progress.step)
             if progress.seconds - saved > cfg.checkpoint_seconds:
                 save()
@@ -109,7 +105,6 @@ def train(trainer: Trainer, run: RunFolder, tracker: Tracker, cfg: DictConfig, s
         bar.close()
     trainer.restore_best()
     save()
-    return curves
 
 
 @hydra.main(version_base=None, config_path="config", config_name="forward_model")
@@ -120,6 +115,9 @@ def main(cfg: DictConfig) -> None:
     scene = load_scene(cfg.system, timestep=cfg.timestep)
     Budget(steps=cfg.steps, minutes=cfg.minutes)  # refuse a bad budget before anything is written
     run = RunFolder(cfg.run_dir, "forward_model")
+    begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
+    if begun:
+        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name=f"forward_model-{scene.name}", config=options(cfg))
 
@@ -139,15 +137,15 @@ def main(cfg: DictConfig) -> None:
             seed=cfg.data.seed,
             progress=show,
         )
-    if run.checkpoint.exists():
-        model = load_checkpoint(run.checkpoint).model
-    else:
-        model = ForwardModel(FeatureSet.of(scene), **options(cfg.model))
+    model = begun.model if begun else ForwardModel(FeatureSet.of(scene), **options(cfg.model))
     trainer = make_trainer(cfg, model, scene, dataset)
-    if not run.checkpoint.exists():
+    if begun:
+        trainer.load_state_dict(begun.training)
+    else:
         sample = trajectory_buffer(dataset.train, batch_size=20_000, seed=cfg.seed).sample()
         trainer.loss.fit_normalizers(sample)
-    curves = train(trainer, run, tracker, cfg, scene)
+    curves = begun.training["curves"] if begun else {"seconds": [], "loss": []}
+    train(trainer, curves, run, tracker, cfg)
 
     table, files = report(model.bind(scene), dataset.test, run.path)
     if curves["seconds"]:

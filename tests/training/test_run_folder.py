@@ -47,3 +47,13 @@ def test_a_file_is_no_run_folder(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError, match="run_dir=.*file is a file; name a folder"):
         RunFolder(tmp_path / "file", "train")
+
+
+def test_a_run_goes_on_with_its_own_options_only(tmp_path):
+    run = RunFolder(tmp_path, "recipe")
+    before = {"system": "pendulum", "minutes": 1, "model": {"latent": 128, "static": "scene"}}
+    run.refuse_changes(before, {**before, "minutes": 5}, free=["minutes"])
+    with pytest.raises(ValueError, match=r"model\.latent=64 \(was 128\), system=jaco \(was pendulum\)"):
+        run.refuse_changes(before, {**before, "system": "jaco", "model": {"latent": 64, "static": "scene"}}, free=[])
+    with pytest.raises(ValueError, match=r"model\.skip=True \(was None\)"):
+        run.refuse_changes(before, {**before, "model": {**before["model"], "skip": True}}, free=[])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,28 @@ class RunFolder:
         """Files of this run that exist, in the order they were asked for."""
         return [path for path in self._written if path.exists()]
 
+    def refuse_changes(self, before: Mapping[str, Any], now: Mapping[str, Any], *, free: Collection[str]) -> None:
+        """Refuse to continue a run with options that would make it another run.
+
+        Args:
+            before: configuration that the run was begun with.
+            now: configuration that it is to go on with.
+            free: names of top-level options that may differ, for example ``"minutes"``.
+
+        Raises:
+            ValueError: naming every other option that differs.
+        """
+        old, new = _flat(before), _flat(now)
+        changed = [
+            f"{name}={new.get(name)} (was {old.get(name)})"
+            for name in sorted(old.keys() | new.keys())
+            if old.get(name) != new.get(name) and name.split(".")[0] not in free
+        ]
+        if changed:
+            raise ValueError(
+                f"run_dir={self.path} holds a run with other options: {', '.join(changed)}. Name a new run_dir."
+            )
+
     def write_config(self, text: str) -> None:
         """Write ``config.yaml``."""
         with atomic_path(self.file("config.yaml")) as temporary:
@@ -81,6 +103,16 @@ class RunFolder:
         }
         write_json(self.file("metrics.json"), everything)
         return everything
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
+    return flat
 
 
 def _plain(value: Any) -> Any:
