@@ -3,6 +3,7 @@
 import csv
 import json
 import struct
+import time
 
 import pytest
 
@@ -21,6 +22,8 @@ def wandb_records(path):
             position += 32768 - position % 32768
             continue
         length, kind = struct.unpack_from("<HB", data, position + 4)
+        if position + 7 + length > len(data):
+            break  # still being written
         record += data[position + 7 : position + 7 + length]
         position += 7 + length
         if kind in (1, 4):
@@ -29,21 +32,27 @@ def wandb_records(path):
 
 
 def read_wandb(folder):
-    """Configuration, history and files of the offline run in a folder."""
+    """Configuration, history and media of the finished offline run in a folder."""
     from wandb.proto import wandb_internal_pb2
 
     (path,) = folder.glob("wandb/offline-run-*/*.wandb")
+    deadline = time.monotonic() + 30
+    while True:
+        records = [wandb_internal_pb2.Record.FromString(data) for data in wandb_records(path)]
+        kinds = [record.WhichOneof("record_type") for record in records]
+        if "exit" in kinds:
+            break
+        # wandb's own process may still be writing when finish() has returned.
+        assert time.monotonic() < deadline, f"{path} has no end: {kinds}"
+        time.sleep(0.1)
     config, history = {}, []
-    for data in wandb_records(path):
-        record = wandb_internal_pb2.Record()
-        record.ParseFromString(data)
-        kind = record.WhichOneof("record_type")
+    for kind, record in zip(kinds, records, strict=True):
         if kind in ("run", "config"):
             update = record.run.config.update if kind == "run" else record.config.update
             config |= {item.key: json.loads(item.value_json) for item in update if item.key}
         elif kind == "history":
-            row = {".".join(item.nested_key) or item.key: json.loads(item.value_json) for item in record.history.item}
-            history.append(row)
+            items = record.history.item
+            history.append({".".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items})
     return config, history, {file.name.split("_")[0] for file in path.parent.glob("files/media/*/*")}
 
 
