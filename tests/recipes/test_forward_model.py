@@ -1,0 +1,88 @@
+"""The contract of recipes, tried as a user would: exit codes, resuming, and a run folder left whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from torchrl_gn.training import load_checkpoint
+
+ROOT = Path(__file__).parents[2]
+SMALL = ("system=pendulum", "data.train=20", "data.validation=5", "data.test=5")
+
+
+def start(*options: str, recipe: str = "forward_model") -> subprocess.Popen:
+    """Start a recipe in the background."""
+    pytest.importorskip("hydra")
+    command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *options]
+    environment = os.environ | {"WANDB_MODE": "offline"}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
+    """Exit code, output and errors of a recipe."""
+    process = start(*options, recipe=recipe)
+    output, errors = process.communicate(timeout=120)
+    return process.returncode, output, errors
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory) -> Path:
+    """Folder of a run that Ctrl-C stopped in the middle of its training."""
+    folder = tmp_path_factory.mktemp("run")
+    process = start(*SMALL, "minutes=5", "checkpoint_seconds=0", f"run_dir={folder}")
+    deadline = time.monotonic() + 60
+    while not list(folder.glob("checkpoint/*.safetensors")):
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    return folder
+
+
+def test_an_interrupted_run_goes_on_to_its_end(interrupted):
+    done = load_checkpoint(interrupted).training["progress"]["step"]
+    assert done > 0
+    code, output, errors = run(*SMALL, "minutes=null", f"steps={done + 5}", f"run_dir={interrupted}", "logger=wandb")
+    assert code == 0, errors
+    assert "warning" not in errors.lower()
+    metrics = json.loads((interrupted / "metrics.json").read_text())
+    assert metrics["steps"] == done + 5
+    assert {"one_step_error", "rollout_error_20", "rollout_error_100", "seed", "wall_clock_seconds"} <= metrics.keys()
+    assert metrics["rollout_error_100/left_out/position"] == 1  # a pendulum's position never moves
+    printed = [line for line in output.splitlines() if Path(line).is_file()]
+    assert {Path(line).name for line in printed} >= {"prediction.png", "rollout.gif", "metrics.json"}
+    assert list(interrupted.glob("log/wandb/offline-run-*/files/media/images/prediction*.png"))
+
+
+def test_bad_options_end_in_one_line_and_touch_nothing(interrupted):
+    before = {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()}
+    for options, message in (
+        (("noise=0.5", "minutes=9"), "other options: noise=0.5"),
+        (("minutes=null",), "either steps or minutes"),
+    ):
+        code, _, errors = run(*SMALL, *options, f"run_dir={interrupted}")
+        assert code == 1
+        assert message in errors
+        assert "Traceback" not in errors
+    assert {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()} == before
+
+
+def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path):
+    options = (f"checkpoint={interrupted}", "sequences=5", f"run_dir={tmp_path}")
+    code, output, errors = run(*options, "system=cartpole", recipe="evaluate")
+    assert code == 0, errors
+    assert "UnseenFeatureWarning" in errors  # what training never saw is named
+    assert "one_step_error" in json.loads((tmp_path / "metrics.json").read_text())
+    code, _, errors = run(*options, "system=cartpole", "strict=true", recipe="evaluate")
+    assert code == 1
+    assert "never saw" in errors
