@@ -113,3 +113,12 @@ def test_unstable_starts_are_drawn_again_and_counted() -> None:
     assert (np.abs(states[:, 1]) < 1.501).all() and 150 < rejected < 300
     with pytest.raises(UnstableSimulationError, match="'repelled'.*1 physics steps"):
         sample_start_states(dataclasses.replace(repelled_hinge(0.01), settle_steps=1), 50, 0)
+
+
+def test_the_arm_never_starts_inside_itself():
+    scene = load_scene("jaco")
+    data = mujoco.MjData(scene.model)
+    for state in sample_start_states(scene, 200, 0):
+        mujoco.mj_setState(scene.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_forward(scene.model, data)
+        assert not (data.contact.dist < 0).any()
