@@ -20,6 +20,7 @@ from torchrl_gn.modules import (
     ForwardModel,
     StateLayout,
     UnseenFeatureWarning,
+    quaternion,
 )
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.systems import find_system
@@ -35,7 +36,9 @@ def thick_swimmer():
 
 
 @pytest.mark.parametrize("name", ALL)
-@pytest.mark.parametrize("options", [{}, {"encoding": "quaternion", "integrate": False, "recenter": False}])
+@pytest.mark.parametrize(
+    "options", [{}, {"joint_axes": True}, {"encoding": "quaternion", "integrate": False, "recenter": False}]
+)
 def test_what_cannot_move_stays_exactly(scenes, make_model, random_states, random_actions, name, options):
     scene = scenes[name]
     bound = make_model(scene, **options).bind(scene)
@@ -340,3 +343,20 @@ def test_models_chain_with_other_modules(scenes, make_model, random_states, rand
 def test_unknown_choices_are_named(name, value):
     with pytest.raises(ValueError, match=f"{name}='{value}' is not known; use one of"):
         ForwardModel(FeatureSet(), **{name: value})
+
+
+def test_joint_axes_turn_with_the_scene(scenes, make_model, random_states, random_actions):
+    scene = scenes["jaco"] if "jaco" in scenes else load_scene("jaco")
+    bound = make_model(scene, joint_axes=True).bind(scene)
+    state, action = random_states(scene, 5), random_actions(scene, 5)
+    features = bound._encode(state, action)[1]
+    assert features.shape == (5, scene.num_edges, 7)
+    axes, pushes = features[..., 1:4], features[..., 4:]
+    torch.testing.assert_close(axes.norm(dim=-1), torch.ones(5, scene.num_edges, dtype=axes.dtype))
+    torch.testing.assert_close(pushes, features[..., :1] * axes)
+    # Every body turned by one rotation turns every axis (none here hangs on the world but the first joint's).
+    turn = quaternion.exp(torch.tensor([0.3, -0.5, 0.8], dtype=state.dtype))
+    turned = state.clone()
+    turned[..., 3:7] = quaternion.product(turn, state[..., 3:7])
+    matrix = quaternion.to_matrix(turn).reshape(3, 3)
+    torch.testing.assert_close(bound._encode(turned, action)[1][..., 1:4], axes @ matrix.T)

@@ -11,7 +11,9 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.graph import Graph
+from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
     from torchrl_gn.modules.forward_model import ForwardModel
@@ -45,6 +47,8 @@ class BoundForwardModel(TensorDictModuleBase):
     model: ForwardModel
     edge_index: Tensor
     edge_action: Tensor
+    joint_node: Tensor
+    joint_axis: Tensor
     live: Tensor
     predicted: Tensor
     predicted_nodes: Tensor
@@ -71,6 +75,10 @@ class BoundForwardModel(TensorDictModuleBase):
         edge_action = torch.as_tensor(scene.edge_action).long()
         # A column of zeros behind the actions stands for joints without motor.
         self._register("edge_action", torch.where(edge_action < 0, scene.num_actions, edge_action))
+        if model.joint_axes:
+            nodes, axes = joint_axes(scene)
+            self._register("joint_node", torch.as_tensor(nodes).long().repeat_interleave(2))
+            self._register("joint_axis", torch.as_tensor(axes).repeat_interleave(2, 0))
         self._register("live", torch.as_tensor(scene.live, dtype=torch.bool))
         predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
         invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
@@ -184,7 +192,7 @@ class BoundForwardModel(TensorDictModuleBase):
         encoded, controls = self._encode(state, action)
         dynamic = Graph(
             model.node_normalizer(encoded, dtype),
-            model.action_normalizer(controls, dtype),
+            model.edge_normalizer(controls, dtype),
             encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype),
             self.edge_index,
         )
@@ -209,8 +217,16 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def _encode(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
-        encoded = self.layout.encode(self.recentered(state), self.model.encoding)
-        return encoded, padded[..., self.edge_action].unsqueeze(-1)
+        controls = padded[..., self.edge_action].unsqueeze(-1)  # [*B, E, 1]
+        if self.model.joint_axes:
+            axes = self._joint_axes(state)
+            controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]
+        return self.layout.encode(self.recentered(state), self.model.encoding), controls
+
+    def _joint_axes(self, state: Tensor) -> Tensor:
+        """World-frame axes of the joints ``[*B, E, 3]``."""
+        rotation = quaternion.to_matrix(state[..., self.joint_node, self.layout.slices["orientation"]])
+        return (rotation.unflatten(-1, (3, 3)) @ self.joint_axis.to(state.dtype).unsqueeze(-1)).squeeze(-1)
 
     def _check_shapes(self, state: Tensor, action: Tensor) -> None:
         item = (self.scene.num_nodes, self.layout.size)
@@ -240,7 +256,7 @@ class BoundForwardModel(TensorDictModuleBase):
         self._check_shapes(state, action)
         encoded, controls = self._encode(state, action)
         self.model.node_normalizer.update(encoded)
-        self.model.action_normalizer.update(controls)
+        self.model.edge_normalizer.update(controls)
         delta = self.layout.delta(state, next_state)
         self.model.delta_normalizer.update(delta, self.live)
         residual = self.layout.residual(state, delta, self.timestep) if self.model.integrate else delta

@@ -61,6 +61,8 @@ class ForwardModel(nn.Module):
             ``"matrix"`` or (paper) as the ``"quaternion"``.
         integrate: predict position and orientation as what their rates do not explain
             (trapezoidal rule); the paper predicts the whole change.
+        joint_axes: show the network each joint's axis in the world frame and the control along
+            it, so that it need not learn to turn them; the paper shows the control alone.
         recenter: make the prediction independent of where a translation-invariant scene
             is (paper: on for single systems, off when several train together).
         latent: features of the graph between the two GN blocks.
@@ -80,6 +82,7 @@ class ForwardModel(nn.Module):
         layout: StateLayout = BODY_STATE,
         encoding: Encoding = "matrix",
         integrate: bool = True,
+        joint_axes: bool = False,
         recenter: bool = True,
         latent: int = 128,
         edge_hidden: Sequence[int] = (128, 128),
@@ -93,11 +96,12 @@ class ForwardModel(nn.Module):
         self.features = features if static == "scene" else FeatureSet()
         self.static, self.layout = static, layout
         self.encoding: Encoding = encoding
-        self.integrate, self.recenter = integrate, recenter
+        self.integrate, self.joint_axes, self.recenter = integrate, joint_axes, recenter
         self.options = {
             "static": static,
             "encoding": encoding,
             "integrate": integrate,
+            "joint_axes": joint_axes,
             "recenter": recenter,
             "latent": latent,
             "edge_hidden": list(edge_hidden),
@@ -108,7 +112,8 @@ class ForwardModel(nn.Module):
         encoded = layout.encoded_size(encoding)
         static_size = GraphSize(len(self.features.nodes), len(self.features.edges), len(self.features.globals_))
         self.node_normalizer = Normalizer(encoded, floor=_DYNAMIC_FLOOR)
-        self.action_normalizer = Normalizer(1)
+        edges = 7 if joint_axes else 1
+        self.edge_normalizer = Normalizer(edges, floor=_DYNAMIC_FLOOR)
         self.static_node_normalizer = Normalizer(static_size.nodes)
         self.static_edge_normalizer = Normalizer(static_size.edges)
         self.static_global_normalizer = Normalizer(static_size.globals_)
@@ -116,7 +121,7 @@ class ForwardModel(nn.Module):
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.core = GNCore(
-            GraphSize(encoded, 1, 0) + static_size,
+            GraphSize(encoded, edges, 0) + static_size,
             layout.delta_size,
             latent=latent,
             edge_hidden=edge_hidden,
