@@ -35,9 +35,23 @@ def thick_swimmer():
     return load_scene(spec, timestep=0.02, name="thick")
 
 
+# An arm that turns about the vertical.
+ARM = """
+<mujoco model="arm">
+  <worldbody>
+    <body pos=".1 .2 1" euler="180 0 0">
+      <joint axis="0 0 1"/><geom type="capsule" size=".05 .2" pos=".1 0 0"/>
+      <body pos=".3 0 0"><joint name="elbow" axis="0 1 0"/><geom size=".1" pos=".2 .1 0"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="elbow" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize(
-    "options", [{}, {"joint_axes": True}, {"encoding": "quaternion", "integrate": False, "recenter": False}]
+    "options", [{}, {"joint_axes": False}, {"encoding": "quaternion", "integrate": False, "recenter": False}]
 )
 def test_what_cannot_move_stays_exactly(scenes, make_model, random_states, random_actions, name, options):
     scene = scenes[name]
@@ -100,6 +114,50 @@ def test_place_matters_along_other_axes_and_without_recentring(scenes, make_mode
     assert (bound.delta(up, action) - bound.delta(state, action)).norm() > 1e-3
     absolute = make_model(scene, recenter=False).bind(scene)
     assert (absolute.delta(along, action) - absolute.delta(state, action)).norm() > 1e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["swimmer6", "arm"])
+def test_predictions_turn_with_the_scene(scenes, make_model, random_states, random_actions, name, dtype):
+    """Turned by any angle about the axis of its heading, a scene changes in the same way, turned."""
+    scene = load_scene(ARM) if name == "arm" else scenes[name]
+    heading = scene.heading
+    assert heading is not None
+    bound = make_model(scene).to(dtype).bind(scene)
+    state, action = random_states(scene, 10, seed=3), random_actions(scene, 10)
+    # The root's orientation is a turn about the axis, as its joint allows.
+    spin = torch.zeros(10, 3, dtype=state.dtype)
+    spin[:, heading.axis] = torch.linspace(-3, 3, 10)
+    rest = torch.as_tensor(heading.rest).expand(10, 4)
+    state[:, heading.node, 3:7] = quaternion.product(quaternion.exp(spin), rest)
+    delta = bound.delta(state, action)
+    for angle in (1e-8, 0.8, torch.pi, -2.0):
+        turn = quaternion.exp(angle * torch.eye(3, dtype=state.dtype)[heading.axis]).expand(10, 4)
+        pivot = torch.zeros(13, dtype=state.dtype)
+        pivot[:3] = torch.as_tensor(heading.pivot)
+        turned = torch.cat((state[:, :1], (BODY_STATE.turn(state - pivot, turn) + pivot)[:, 1:]), 1)
+        error = bound.delta(turned, action) - BODY_STATE.turn_delta(delta, turn)
+        assert error.norm() < (1e-12 if dtype == torch.float64 else 1e-5) * delta.norm()
+    plain = make_model(scene, align=False).bind(scene)
+    error = plain.delta(turned, action) - BODY_STATE.turn_delta(plain.delta(state, action), turn)
+    assert error.norm() > 1e-2 * delta.norm()
+
+
+def test_where_the_world_can_be_touched_it_shows_the_heading(make_model, random_states):
+    scene = load_scene(ARM.replace("<worldbody>", '<worldbody><geom type="plane" size="1 1 1"/>'))
+    bound = make_model(scene).bind(scene)
+    assert scene.heading is not None and not scene.heading.exact
+    state = random_states(scene, 5)
+    seen = bound.local(state)
+    rest = torch.as_tensor(scene.heading.rest).expand(5, 4)
+    turn = bound._turn(state)
+    assert turn is not None
+    torch.testing.assert_close(seen[:, 0, 3:7], quaternion.product(quaternion.conjugate(turn), state[:, 0, 3:7]))
+    free = make_model(load_scene(ARM)).bind(load_scene(ARM)).local(state)
+    assert torch.equal(free[:, 0], state[:, 0])
+    assert torch.equal(free[:, 1:], seen[:, 1:])
+    state[:, 1, 3:7] = rest
+    torch.testing.assert_close(bound.local(state), state, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -211,9 +269,9 @@ def test_a_model_without_statics_reads_none(scenes, make_model, random_states, r
     thick = model.bind(thick_swimmer(), strict=True)
     assert torch.equal(thick.step(state, action), model.bind(scene).step(state, action))
     informed = make_model(scene)
-    dynamic, static = informed.bind(scene).graphs(state, action)
+    static = informed.bind(scene).static_graph()
     assert static.nodes.shape[-1] == len(informed.features.nodes) > 0
-    assert model.bind(scene).graphs(state, action)[1].nodes.shape[-1] == 0
+    assert model.bind(scene).static_graph().nodes.shape[-1] == 0
 
 
 def test_statics_are_read_by_name(scenes, make_model, random_states, random_actions):
@@ -354,7 +412,9 @@ def test_joint_axes_turn_with_the_scene(scenes, make_model, random_states, rando
     axes, pushes = features[..., 1:4], features[..., 4:]
     torch.testing.assert_close(axes.norm(dim=-1), torch.ones(5, scene.num_edges, dtype=axes.dtype))
     torch.testing.assert_close(pushes, features[..., :1] * axes)
-    # Every body turned by one rotation turns every axis (none here hangs on the world but the first joint's).
+    # With the place and heading as they are, every body turned by one rotation turns every axis.
+    bound = make_model(scene, align=False).bind(scene)
+    axes = bound._encode(state, action)[1][..., 1:4]
     turn = quaternion.exp(torch.tensor([0.3, -0.5, 0.8], dtype=state.dtype))
     turned = state.clone()
     turned[..., 3:7] = quaternion.product(turn, state[..., 3:7])

@@ -17,7 +17,7 @@ def predict(loss: ForwardModelLoss, delta) -> list[Tensor]:
     """Make the model predict ``delta(state, action)``; the list collects the states it is fed."""
     fed: list[Tensor] = []
 
-    def stub(state: Tensor, action: Tensor) -> Tensor:
+    def stub(state: Tensor, action: Tensor, _) -> Tensor:
         fed.append(state)
         return delta(state, action) * loss.model.live
 
@@ -235,7 +235,7 @@ def test_noise_comes_from_the_generator_alone(make_loss, windows):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-@pytest.mark.parametrize("options", [{}, {"integrate": False}, {"recenter": False}])
+@pytest.mark.parametrize("options", [{}, {"integrate": False}, {"recenter": False}, {"align": False}])
 def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, noise, options):
     """The network's inputs and its targets have mean 0 and variance 1 over the noisy data."""
     loss = make_loss("swimmer6", noise=noise, generator=torch.Generator().manual_seed(0), model=options)
@@ -245,13 +245,15 @@ def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, no
     target = BODY_STATE.delta(state, batch["next", "state"])
     if model.integrate:
         target = BODY_STATE.residual(state, target, loss.model.timestep)
+    if model.align:
+        target = BODY_STATE.turn_delta(target, quaternion.conjugate(loss.model._turn(state)))
     live = loss.model.live
     targets = model.residual_normalizer(target)
     for channel in live.any(0).nonzero().flatten().tolist():
         seen = targets[..., channel][:, live[:, channel]]
         assert seen.mean().item() == pytest.approx(0, abs=1e-9)
         assert seen.var(correction=0).item() == pytest.approx(1, rel=1e-9)
-    dynamic, _ = loss.model.graphs(state, batch["action"])
+    dynamic = loss.model.dynamic_graph(state, batch["action"])
     for features in (dynamic.nodes.flatten(0, -2), dynamic.edges.flatten(0, -2)):
         varies = features.std(0) > 0
         torch.testing.assert_close(features.mean(0), torch.zeros(len(varies)).double(), rtol=0, atol=1e-9)

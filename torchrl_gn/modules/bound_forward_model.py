@@ -16,6 +16,7 @@ from torchrl_gn.modules.graph import Graph
 from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
+    from torchrl_gn.modules.folded_core import FoldedCore
     from torchrl_gn.modules.forward_model import ForwardModel
     from torchrl_gn.scenes import Scene
 
@@ -49,6 +50,8 @@ class BoundForwardModel(TensorDictModuleBase):
     edge_action: Tensor
     joint_node: Tensor
     joint_axis: Tensor
+    rest: Tensor
+    pivot: Tensor
     live: Tensor
     predicted: Tensor
     predicted_nodes: Tensor
@@ -87,6 +90,10 @@ class BoundForwardModel(TensorDictModuleBase):
         self.recenters = bool(model.recenter and invariant.any() and predicted.any())
         # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
         self._register("shifted", predicted[:, None] * invariant)
+        self.heading = scene.heading if model.align else None
+        if self.heading is not None:
+            self._register("rest", torch.as_tensor(self.heading.rest))
+            self._register("pivot", torch.as_tensor(self.heading.pivot))
         for part, column_names in (
             ("nodes", "node_names"),
             ("edges", "edge_names"),
@@ -177,29 +184,36 @@ class BoundForwardModel(TensorDictModuleBase):
         """
         return self.layout.apply(state, self.delta(state, action))
 
-    def delta(self, state: Tensor, action: Tensor) -> Tensor:
+    def fold(self) -> FoldedCore:
+        """The network for this scene, to pass to :meth:`delta` where many steps share the weights."""
+        return self.model.fold(self.static_graph(), self.predicted_nodes)
+
+    def delta(self, state: Tensor, action: Tensor, folded: FoldedCore | None = None) -> Tensor:
         """Predicted change of the state ``[*B, N, 12]``, exactly zero in dead components."""
-        dynamic, static = self.graphs(state, action)
-        residual = self.model(dynamic, static, self.predicted_nodes).to(state.dtype)
+        residual = self.model(self.dynamic_graph(state, action), folded or self.fold()).to(state.dtype)
+        turn = self._turn(state)
+        if turn is not None:
+            residual = self.layout.turn_delta(residual, turn)
         if self.model.integrate:
             residual = self.layout.integrate(state, residual, self.timestep)
         return residual * self.live
 
-    def graphs(self, state: Tensor, action: Tensor) -> tuple[Graph, Graph]:
-        """Normalised dynamic graph ``[*B, ...]`` and static graph (no batch), in the network's dtype."""
+    def dynamic_graph(self, state: Tensor, action: Tensor) -> Graph:
+        """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
         self._check_shapes(state, action)
         dtype, model = self.network_dtype, self.model
         encoded, controls = self._encode(state, action)
-        dynamic = Graph(
-            model.node_normalizer(encoded, dtype),
-            model.edge_normalizer(controls, dtype),
-            encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype),
-            self.edge_index,
-        )
+        globals_ = encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype)
+        nodes, edges = model.node_normalizer(encoded, dtype), model.edge_normalizer(controls, dtype)
+        return Graph(nodes, edges, globals_, self.edge_index)
+
+    def static_graph(self) -> Graph:
+        """Normalised static graph (no batch) in the network's dtype."""
         nodes, edges, globals_ = (
-            normalizer(getattr(self, f"static_{part}"), dtype) for part, normalizer in self._static_normalizers()
+            normalizer(getattr(self, f"static_{part}"), self.network_dtype)
+            for part, normalizer in self._static_normalizers()
         )
-        return dynamic, Graph(nodes, edges, globals_, self.edge_index)
+        return Graph(nodes, edges, globals_, self.edge_index)
 
     def recentered(self, state: Tensor) -> Tensor:
         """State ``[*B, N, 13]`` with the bodies' mean position moved to 0 along invariant axes.
@@ -215,16 +229,43 @@ class BoundForwardModel(TensorDictModuleBase):
         moved = state[..., position] - center * self.shifted.to(state.dtype)
         return torch.cat((state[..., : position.start], moved, state[..., position.stop :]), dim=-1)
 
+    def local(self, state: Tensor) -> Tensor:
+        """State ``[*B, N, 13]`` as the network sees it: recentred, and turned to heading 0.
+
+        Where the dynamics do not depend on how the scene is turned
+        (:attr:`~torchrl_gn.scenes.Scene.heading`), the root faces one way always and
+        predicted changes are turned back, so that nothing is learned twice. The world stays;
+        where parts can touch it, it is turned with the rest and so shows the heading.
+        """
+        state, turn = self.recentered(state), self._turn(state)
+        if self.heading is None or turn is None:
+            return state
+        pivot = torch.cat((self.pivot, self.pivot.new_zeros(self.layout.size - 3))).to(state.dtype)
+        turned = self.layout.turn(state - pivot, quaternion.conjugate(turn)) + pivot
+        return torch.cat((state[..., :1, :], turned[..., 1:, :]), dim=-2) if self.heading.exact else turned
+
+    def _turn(self, state: Tensor) -> Tensor | None:
+        """Rotation ``[*B, 4]`` from heading 0 to the root's heading; None where there is none."""
+        if self.heading is None:
+            return None
+        orientation = state[..., self.heading.node, self.layout.slices["orientation"]]
+        rest = self.rest.to(state.dtype)
+        turn = quaternion.product(orientation, quaternion.conjugate(rest))
+        kept = torch.zeros(4, dtype=state.dtype, device=state.device)
+        kept[0] = kept[1 + self.heading.axis] = 1
+        return quaternion.normalize(turn * kept)
+
     def _encode(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        state = self.local(state)
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
         controls = padded[..., self.edge_action].unsqueeze(-1)  # [*B, E, 1]
         if self.model.joint_axes:
             axes = self._joint_axes(state)
             controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]
-        return self.layout.encode(self.recentered(state), self.model.encoding), controls
+        return self.layout.encode(state, self.model.encoding), controls
 
     def _joint_axes(self, state: Tensor) -> Tensor:
-        """World-frame axes of the joints ``[*B, E, 3]``."""
+        """Axes of the joints ``[*B, E, 3]`` in the frame of the state."""
         rotation = quaternion.to_matrix(state[..., self.joint_node, self.layout.slices["orientation"]])
         return (rotation.unflatten(-1, (3, 3)) @ self.joint_axis.to(state.dtype).unsqueeze(-1)).squeeze(-1)
 
@@ -260,6 +301,9 @@ class BoundForwardModel(TensorDictModuleBase):
         delta = self.layout.delta(state, next_state)
         self.model.delta_normalizer.update(delta, self.live)
         residual = self.layout.residual(state, delta, self.timestep) if self.model.integrate else delta
+        turn = self._turn(state)
+        if turn is not None:
+            residual = self.layout.turn_delta(residual, quaternion.conjugate(turn))
         self.model.residual_normalizer.update(residual, self.live)
 
     def extra_repr(self) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from torch import Tensor, nn
 
 from torchrl_gn.modules.core import GNCore
-from torchrl_gn.modules.factorized_core import factorized_core
+from torchrl_gn.modules.folded_core import FoldedCore, fold_core
 from torchrl_gn.modules.gn_block import GraphSize
 from torchrl_gn.modules.graph import Graph
 from torchrl_gn.modules.normalizer import Normalizer
@@ -61,10 +61,12 @@ class ForwardModel(nn.Module):
             ``"matrix"`` or (paper) as the ``"quaternion"``.
         integrate: predict position and orientation as what their rates do not explain
             (trapezoidal rule); the paper predicts the whole change.
-        joint_axes: show the network each joint's axis in the world frame and the control along
+        joint_axes: show the network each joint's axis in the frame of the positions and the control along
             it, so that it need not learn to turn them; the paper shows the control alone.
         recenter: make the prediction independent of where a translation-invariant scene
             is (paper: on for single systems, off when several train together).
+        align: make the prediction independent of how a rotation-invariant scene is turned
+            (:attr:`Scene.heading <torchrl_gn.scenes.Scene>`); the paper does not.
         latent: features of the graph between the two GN blocks.
         edge_hidden: hidden sizes of the edge MLPs.
         node_hidden: hidden sizes of the node MLPs.
@@ -82,8 +84,9 @@ class ForwardModel(nn.Module):
         layout: StateLayout = BODY_STATE,
         encoding: Encoding = "matrix",
         integrate: bool = True,
-        joint_axes: bool = False,
+        joint_axes: bool = True,
         recenter: bool = True,
+        align: bool = True,
         latent: int = 128,
         edge_hidden: Sequence[int] = (128, 128),
         node_hidden: Sequence[int] = (128, 128),
@@ -96,13 +99,15 @@ class ForwardModel(nn.Module):
         self.features = features if static == "scene" else FeatureSet()
         self.static, self.layout = static, layout
         self.encoding: Encoding = encoding
-        self.integrate, self.joint_axes, self.recenter = integrate, joint_axes, recenter
+        self.integrate, self.joint_axes = integrate, joint_axes
+        self.recenter, self.align = recenter, align
         self.options = {
             "static": static,
             "encoding": encoding,
             "integrate": integrate,
             "joint_axes": joint_axes,
             "recenter": recenter,
+            "align": align,
             "latent": latent,
             "edge_hidden": list(edge_hidden),
             "node_hidden": list(node_hidden),
@@ -112,8 +117,8 @@ class ForwardModel(nn.Module):
         encoded = layout.encoded_size(encoding)
         static_size = GraphSize(len(self.features.nodes), len(self.features.edges), len(self.features.globals_))
         self.node_normalizer = Normalizer(encoded, floor=_DYNAMIC_FLOOR)
-        edges = 7 if joint_axes else 1
-        self.edge_normalizer = Normalizer(edges, floor=_DYNAMIC_FLOOR)
+        self.dynamic_size = GraphSize(encoded, 7 if joint_axes else 1, 0)
+        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=_DYNAMIC_FLOOR)
         self.static_node_normalizer = Normalizer(static_size.nodes)
         self.static_edge_normalizer = Normalizer(static_size.edges)
         self.static_global_normalizer = Normalizer(static_size.globals_)
@@ -121,7 +126,7 @@ class ForwardModel(nn.Module):
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.core = GNCore(
-            GraphSize(encoded, edges, 0) + static_size,
+            self.dynamic_size + static_size,
             layout.delta_size,
             latent=latent,
             edge_hidden=edge_hidden,
@@ -144,18 +149,26 @@ class ForwardModel(nn.Module):
 
         return BoundForwardModel(self, scene, strict=strict)
 
-    def forward(self, dynamic: Graph, static: Graph, predicted: Tensor) -> Tensor:
+    def fold(self, static: Graph, predicted: Tensor) -> FoldedCore:
+        """The core for one scene, differentiable in the weights.
+
+        Args:
+            static: normalised static graph.
+            predicted: ``[P]`` indices of the nodes that move.
+        """
+        return fold_core(self.core, self.dynamic_size, predicted, static)
+
+    def forward(self, dynamic: Graph, folded: FoldedCore) -> Tensor:
         """Predicted residual change, in SI units.
 
         Args:
             dynamic: normalised dynamic graph ``[*B, ...]``.
-            static: normalised static graph without batch.
-            predicted: ``[P]`` indices of the nodes that move.
+            folded: what :meth:`fold` gave for the scene.
 
         Returns:
             ``[*B, N, delta_size]``, for predicted nodes.
         """
-        return self.residual_normalizer.inverse(factorized_core(self.core, dynamic, static, predicted))
+        return self.residual_normalizer.inverse(folded.predict(dynamic))
 
     def description(self) -> dict:
         """Everything needed to build this model again, as plain JSON-able values."""

@@ -20,17 +20,10 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     Returns:
         ``[..., 4]`` quaternions.
     """
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        dim=-1,
-    )
+    a, b = torch.broadcast_tensors(a, b)
+    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    w = aw * bw - (av * bv).sum(-1, keepdim=True)
+    return torch.cat((w, aw * bv + bw * av + torch.linalg.cross(av, bv)), dim=-1)
 
 
 def conjugate(q: Tensor) -> Tensor:

@@ -190,6 +190,44 @@ class StateLayout:
                 parts.append(timestep * (rate + 0.5 * change))
         return torch.cat(parts, dim=-1)
 
+    def turn(self, state: Tensor, rotation: Tensor) -> Tensor:
+        """State as seen when all of space is turned about the origin.
+
+        Args:
+            state: ``[*B, N, size]``.
+            rotation: ``[*B, 4]`` unit quaternions, one for all ``N`` items.
+
+        Returns:
+            ``[*B, N, size]``.
+
+        Raises:
+            ValueError: if a component is no vector or rotation in space.
+        """
+        self._check_spatial()
+        matrix = quaternion.to_matrix(rotation).unflatten(-1, (3, 3)).mT
+        parts = []
+        for component in self.components:
+            part = state[..., self.slices[component.name]]
+            if component.kind == "rotation":
+                parts.append(quaternion.product(rotation.unsqueeze(-2), part))
+            else:
+                parts.append(part @ matrix)
+        return torch.cat(parts, dim=-1)
+
+    def turn_delta(self, delta: Tensor, rotation: Tensor) -> Tensor:
+        """State change ``[*B, N, delta_size]`` as seen when all of space is turned, see :meth:`turn`."""
+        self._check_spatial()
+        matrix = quaternion.to_matrix(rotation).unflatten(-1, (3, 3)).mT
+        vectors = delta.reshape(*delta.shape[:-2], delta.shape[-2] * len(self.components), 3)
+        return (vectors @ matrix).reshape(delta.shape)
+
+    def _check_spatial(self) -> None:
+        for component in self.components:
+            if component.kind == "circle" or component.delta_size != 3:
+                raise ValueError(
+                    f"Component {component.name!r} is no vector or rotation in space and cannot be turned."
+                )
+
     def encode(self, state: Tensor, encoding: Encoding = "matrix") -> Tensor:
         """Features of a state that the network sees.
 

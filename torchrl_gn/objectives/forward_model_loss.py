@@ -123,10 +123,10 @@ class ForwardModelLoss(LossModule):
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
         layout, steps = self.model.layout, state.shape[1]
         current = self._perturb(state[:, 0])
-        errors = state.new_zeros(len(layout.components))
+        errors, folded = state.new_zeros(len(layout.components)), self.model.fold()
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
-            delta = self.model.delta(current, action[:, step])
+            delta = self.model.delta(current, action[:, step], folded)
             errors = errors + self._component_errors(delta, target)
             if step + 1 < steps:
                 current = layout.apply(current, delta)

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.errors import SceneError, UnsupportedSceneError
+from torchrl_gn.scenes.heading import find_heading
 from torchrl_gn.scenes.invariance import translation_invariant
 from torchrl_gn.scenes.mobility import live_channels
 from torchrl_gn.scenes.scene import Attachment, Scene
@@ -53,6 +54,7 @@ def build_scene(
     actuator_of_joint = _actuator_of_joint(model)
     substeps = _substeps(model, timestep, name)
     named = _namer(model)
+    live, invariant = live_channels(model, graph.body), translation_invariant(model, graph)
     return Scene(
         name=name,
         model=model,
@@ -65,8 +67,9 @@ def build_scene(
         receivers=graph.receivers,
         edge_action=np.repeat(actuator_of_joint, 2),
         static=static_graph(model, graph, actuator_of_joint, substeps * model.opt.timestep),
-        live=live_channels(model, graph.body),
-        translation_invariant=translation_invariant(model, graph),
+        live=live,
+        translation_invariant=invariant,
+        heading=find_heading(model, graph, live, invariant),
         action_low=model.actuator_ctrlrange[:, 0].copy(),
         action_high=model.actuator_ctrlrange[:, 1].copy(),
         substeps=substeps,

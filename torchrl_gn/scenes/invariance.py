@@ -40,16 +40,16 @@ def _invariant_along(model: mujoco.MjModel, graph: Topology, axis: np.ndarray) -
             return False
         shifted.update(joints)
     return (
-        not any(_feels_position(model, joint) for joint in shifted)
-        and not _touches_world(model, graph, axis)
-        and not any(_tied(model, graph, shifted))
+        not any(feels_position(model, joint) for joint in shifted)
+        and not touches_world(model, graph, axis)
+        and not any(tied(model, graph, shifted))
     )
 
 
 def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[int] | None:
     """Joints of a root body whose displacement shifts it along ``axis``; None if it cannot."""
     slides, directions = [], []
-    frame = _reference_rotation(model, body)
+    frame = reference_rotation(model, body)
     first = model.body_jntadr[body]
     for joint in range(first, first + model.body_jntnum[body]):
         kind = mujoco.mjtJoint(model.jnt_type[joint])
@@ -68,7 +68,7 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
     return [joint for joint, amount in zip(slides, amounts, strict=True) if abs(amount) > _TOLERANCE]
 
 
-def _reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
+def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
     """``[3, 3]`` world orientation of a body that only fixed bodies carry."""
     rotation = np.eye(3)
     while body:
@@ -79,7 +79,8 @@ def _reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
     return rotation
 
 
-def _feels_position(model: mujoco.MjModel, joint: int) -> bool:
+def feels_position(model: mujoco.MjModel, joint: int) -> bool:
+    """Whether a limit, spring or actuator of a joint depends on the joint's position."""
     if model.jnt_limited[joint] or model.jnt_stiffness[joint] or np.any(model.jnt_stiffnesspoly[joint]):
         return True
     gains, biases = mujoco.mjtGain, mujoco.mjtBias
@@ -97,8 +98,8 @@ def _feels_position(model: mujoco.MjModel, joint: int) -> bool:
     return False
 
 
-def _touches_world(model: mujoco.MjModel, graph: Topology, axis: np.ndarray) -> bool:
-    """Whether a moving geom can collide with a fixed one that is no plane parallel to ``axis``."""
+def touches_world(model: mujoco.MjModel, graph: Topology, axis: np.ndarray | None) -> bool:
+    """Whether a moving geom can collide with a fixed one, planes parallel to ``axis`` apart."""
     if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
         return False
     fixed = graph.node_of_body[model.geom_bodyid] == 0
@@ -107,7 +108,8 @@ def _touches_world(model: mujoco.MjModel, graph: Topology, axis: np.ndarray) -> 
     mujoco.mj_kinematics(model, data)
     for still in np.flatnonzero(fixed):
         normal = data.geom_xmat[still].reshape(3, 3)[:, 2]
-        if model.geom_type[still] == mujoco.mjtGeom.mjGEOM_PLANE and abs(normal @ axis) < _TOLERANCE:
+        plane = model.geom_type[still] == mujoco.mjtGeom.mjGEOM_PLANE
+        if plane and axis is not None and abs(normal @ axis) < _TOLERANCE:
             continue
         for moving in np.flatnonzero(~fixed):
             if (
@@ -120,7 +122,7 @@ def _touches_world(model: mujoco.MjModel, graph: Topology, axis: np.ndarray) -> 
     return False
 
 
-def _tied(model: mujoco.MjModel, graph: Topology, shifted: set[int]) -> Iterator[bool]:
+def tied(model: mujoco.MjModel, graph: Topology, shifted: set[int]) -> Iterator[bool]:
     """For every equality constraint and tendon, whether it ties the scene to a place."""
     if not model.opt.disableflags & (_Disable.mjDSBL_EQUALITY | _Disable.mjDSBL_CONSTRAINT):
         for equality in range(model.neq):

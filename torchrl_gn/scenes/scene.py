@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.errors import SceneError
+from torchrl_gn.scenes.heading import Heading
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class Scene:
             3, linear velocity 3, angular velocity 3; world frame) can ever differ from zero.
         translation_invariant: ``[3]`` bool, world axes along which the dynamics do not
             depend on where the scene is.
+        heading: how the whole scene is turned, if the dynamics do not depend on it.
         action_low: ``[A]`` lower bounds of the controls.
         action_high: ``[A]`` upper bounds of the controls.
         substeps: physics steps in one control step.
@@ -95,6 +97,7 @@ class Scene:
     static: StaticGraph
     live: np.ndarray
     translation_invariant: np.ndarray
+    heading: Heading | None
     action_low: np.ndarray
     action_high: np.ndarray
     substeps: int
@@ -174,13 +177,15 @@ class Scene:
     def __str__(self) -> str:
         """Readable summary: time steps, nodes, joints, motors, what moves, where it is invariant."""
         axes = "".join(axis for axis, free in zip("xyz", self.translation_invariant, strict=True) if free)
+        turns = "no axis" if self.heading is None else "xyz"[self.heading.axis]
+        turns += " but for contacts with the world" * (self.heading is not None and not self.heading.exact)
         step, physics_step = 1e3 * self.timestep, 1e3 * self.model.opt.timestep
         counts = ((self.num_nodes, "node"), (self.num_edges, "edge"), (self.num_actions, "action"))
         lines = [
             f"Scene {self.name}: " + ", ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts),
             f"  control step {step:g} ms = {self.substeps} x {physics_step:g} ms",
             f"  after a reset, {self.settle_steps} physics steps without control",
-            f"  translation-invariant along {axes or 'no axis'}",
+            f"  translation-invariant along {axes or 'no axis'}, rotation-invariant about {turns}",
         ]
         mass = dict(zip(self.static.node_names, self.static.nodes.T, strict=True))["mass"]
         rows = [("node", "parent", "mass [kg]", "live position", "live rotation", "welded bodies")]

@@ -1,4 +1,4 @@
-"""The factorized core is the core: outputs and gradients, on any topology."""
+"""The folded core is the core: outputs and gradients, on any topology."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchrl_gn.modules import GNCore, Graph, GraphSize, graph_concat
-from torchrl_gn.modules.factorized_core import factorized_core
+from torchrl_gn.modules.folded_core import fold_core
+
+PARTS = ("nodes", "edges", "globals_")
 
 maths = settings(
     max_examples=40,
@@ -47,6 +49,11 @@ def outputs_and_gradients(function, core: GNCore, dynamic: Graph, cotangent: Ten
     ]
 
 
+def folded(core: GNCore, dynamic: Graph, static: Graph, predicted: Tensor) -> Tensor:
+    size = GraphSize(*(part.shape[-1] for part in (dynamic.nodes, dynamic.edges, dynamic.globals_)))
+    return fold_core(core, size, predicted, static).predict(dynamic)
+
+
 def compare(core: GNCore, dynamic: Graph, static: Graph, predicted: Tensor, tolerance: float, dtype=torch.float64):
     """Largest-norm comparison of the two ways, ``tolerance`` relative to each tensor's norm."""
     mask = torch.zeros(dynamic.nodes.shape[-2], 1, dtype=torch.float64)
@@ -61,9 +68,7 @@ def compare(core: GNCore, dynamic: Graph, static: Graph, predicted: Tensor, tole
     dynamic, static = (
         Graph(g.nodes.to(dtype), g.edges.to(dtype), g.globals_.to(dtype), g.edge_index) for g in (dynamic, static)
     )
-    quick = outputs_and_gradients(
-        lambda g: factorized_core(core, g, static, predicted), core, dynamic, cotangent.to(dtype)
-    )
+    quick = outputs_and_gradients(lambda g: folded(core, g, static, predicted), core, dynamic, cotangent.to(dtype))
     scale = max([float(x.norm()) for x in plain], default=0.0)
     for expected, got in zip(plain, quick, strict=True):
         assert got.shape == expected.shape
@@ -87,7 +92,14 @@ def test_factors_are_the_core(random_graph, topology, batch, depth, latent, dyna
     size = GraphSize(3, 1, dynamic_globals)
     core = make_core(size + static_size, 4, latent, depth)
     dynamic = random_graph(size, edge_index, num_nodes, *batch)
-    static = random_graph(static_size, edge_index, num_nodes, seed=1)
+    # Any part of the static graph may differ between samples.
+    static, each = (
+        random_graph(static_size, edge_index, num_nodes, seed=1),
+        random_graph(static_size, edge_index, num_nodes, *batch, seed=2),
+    )
+    varied = data.draw(st.tuples(*[st.booleans()] * 3))
+    parts = [getattr(each if vary else static, part) for vary, part in zip(varied, PARTS, strict=True)]
+    static = Graph(*parts, edge_index)
     predicted = torch.tensor(data.draw(st.lists(st.integers(0, num_nodes - 1), unique=True)), dtype=torch.long)
     compare(core, dynamic, static, predicted, 1e-10)
 
@@ -117,7 +129,7 @@ def test_nodes_that_are_not_predicted_are_exactly_zero(random_graph):
         random_graph(GraphSize(3, 1, 0), edge_index, 3, 5),
         random_graph(GraphSize(0, 0, 0), edge_index, 3),
     )
-    out = factorized_core(core, dynamic, static, torch.tensor([2, 1]))
+    out = folded(core, dynamic, static, torch.tensor([2, 1]))
     assert torch.equal(out[:, 0], torch.zeros(5, 4).double())
     torch.testing.assert_close(out[:, 1:], core(dynamic).nodes[:, 1:], rtol=0, atol=1e-13)
 
@@ -136,7 +148,7 @@ def test_gradients_are_the_finite_differences(random_graph):
             self.core = core
 
         def forward(self, *features):
-            return factorized_core(self.core, Graph(*features, edge_index), static, torch.tensor([1, 2]))
+            return folded(self.core, Graph(*features, edge_index), static, torch.tensor([1, 2]))
 
     module = Factorized()
 
@@ -155,7 +167,7 @@ def test_inputs_are_left_alone(random_graph):
         random_graph(GraphSize(0, 0, 0), edge_index, 2),
     )
     before = [part.clone() for part in (dynamic.nodes, dynamic.edges, dynamic.globals_)]
-    factorized_core(core, dynamic, static, torch.tensor([1]))
+    folded(core, dynamic, static, torch.tensor([1]))
     assert all(map(torch.equal, before, (dynamic.nodes, dynamic.edges, dynamic.globals_)))
 
 
@@ -165,5 +177,8 @@ def test_forward_models_compute_their_core(scenes, make_model, random_states, ra
     scene = scenes[name]
     model = make_model(scene).double()
     bound = model.bind(scene)
-    dynamic, static = bound.graphs(random_states(scene, 5, seed=3), random_actions(scene, 5, seed=3))
+    dynamic, static = (
+        bound.dynamic_graph(random_states(scene, 5, seed=3), random_actions(scene, 5, seed=3)),
+        bound.static_graph(),
+    )
     compare(model.core, dynamic, static, bound.predicted_nodes, 1e-10)

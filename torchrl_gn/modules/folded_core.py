@@ -1,0 +1,354 @@
+"""The core's function computed with fewer operations, exactly, for one scene.
+
+Between two ReLUs everything is linear, so for a batch of graphs of one scene
+
+- a first layer's weight is split by its inputs: nodes are projected once a node, globals
+  once a graph, and what is the same for every sample (static features, biases) once a batch;
+- an MLP's linear last layer commutes with the sum over edges and merges into the
+  next first layer: hidden activations are aggregated and multiplied once a node or graph,
+  and its bias becomes in-degree times bias;
+- only nodes that move are predicted, from edges that lead to them.
+
+:func:`fold_core` does this algebra on the weights of a :class:`~torchrl_gn.modules.GNCore`
+and gives a :class:`FoldedCore`, which only multiplies. Training folds at every step, under
+autograd, and gradients reach the core's weights as they do there; a specialised model
+(:mod:`~torchrl_gn.modules.specialized_model`) folds once.
+
+Items lie first and samples second, ``[N, B, F]``, so that gathering and aggregating are
+products with small incidence matrices, and everything is matrix multiplication. A layer with
+several inputs is one autograd function (:class:`_Layer`) that accumulates into one buffer:
+on a CPU the passes over memory between the products would cost as much as the products.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchrl_gn.modules.core import GNCore
+from torchrl_gn.modules.gn_block import GraphSize
+from torchrl_gn.modules.graph import Graph
+
+Rows = Tensor | slice
+
+
+@dataclass(frozen=True)
+class Factors:
+    """First layer of an MLP by its inputs, and the hidden layers after it.
+
+    Attributes:
+        weights: ``[h, F_k]`` for every input ``k``.
+        table: ``[I, 1, h]``, what every sample has in common; ``[I, B, h]`` with static features
+            of their own for every sample.
+        hidden: weight ``[h', h]`` and bias ``[h']`` of each further hidden layer.
+    """
+
+    weights: tuple[Tensor, ...]
+    table: Tensor
+    hidden: tuple[tuple[Tensor, Tensor], ...]
+
+
+@dataclass(frozen=True)
+class FoldedCore:
+    """A core for one scene, ready to be multiplied; made by :func:`fold_core`.
+
+    Attributes:
+        ends: ``[2 E, N]`` picks every edge's sender, then every edge's receiver.
+        reduce: ``[N + 1, E]`` sums edges at their receivers, and all of them in its last row.
+        gather: ``[E', 2 N + 1]`` adds, for every edge of the second block, its sender's row of the
+            first ``N``, its receiver's row of the next ``N`` and the graph's row.
+        reduce_last: ``[P, E']`` sums the second block's edges at the predicted nodes.
+        kept: edges that lead to a predicted node.
+        predicted: nodes that are predicted.
+        first_edge: inputs: ends and edge, globals.
+        first_node: inputs: received hidden, node, globals.
+        first_global: inputs: summed node hidden, summed edge hidden, globals.
+        second_edge: inputs: first edge hidden, ends and edge.
+        second_ends: ``[h, h_n]`` twice: node hidden as sender and as receiver.
+        second_globals: ``[h, h_g]`` and ``[h, F_g]``: global hidden and globals, into edges.
+        second_node: inputs: received hidden, node, first node hidden.
+        last_globals: as ``second_globals``, into nodes.
+        out: weight ``[F_out, h]`` and bias ``[F_out]``.
+    """
+
+    ends: Tensor
+    reduce: Tensor
+    gather: Tensor
+    reduce_last: Tensor
+    kept: Rows
+    predicted: Rows
+    first_edge: Factors
+    first_node: Factors
+    first_global: Factors
+    second_edge: Factors
+    second_ends: tuple[Tensor, Tensor]
+    second_globals: tuple[Tensor, Tensor]
+    second_node: Factors
+    last_globals: tuple[Tensor, Tensor]
+    out: tuple[Tensor, Tensor]
+
+    def __call__(self, nodes: Tensor, edges: Tensor, globals_: Tensor) -> Tensor:
+        """Output of the predicted nodes.
+
+        Args:
+            nodes: ``[N, B, F_n]`` normalised dynamic features.
+            edges: ``[E, B, F_e]``.
+            globals_: ``[1, B, F_g]``.
+
+        Returns:
+            ``[P, B, F_out]``.
+        """
+        count_n, count_e = nodes.shape[0], edges.shape[0]
+        ends = _product(self.ends, nodes)
+        ends = torch.cat((ends[:count_e], ends[count_e:], edges), dim=-1)
+        everywhere = globals_.expand(count_e, -1, -1)
+
+        edge_hidden = _hidden(self.first_edge, (ends, everywhere))
+        reduced = _product(self.reduce, edge_hidden)
+        everywhere = globals_.expand(count_n, -1, -1)
+        node_hidden = _hidden(self.first_node, (reduced[:count_n], nodes, everywhere))
+        summed = (node_hidden.sum(0, keepdim=True), reduced[count_n:], globals_)
+        global_hidden = _hidden(self.first_global, summed)
+
+        # Projected once a node or graph, then gathered by one product: senders, receivers, graph.
+        projected = torch.cat(
+            (
+                *(_linear(((node_hidden, weight),)) for weight in self.second_ends),
+                _linear(tuple(zip((global_hidden, globals_), self.second_globals, strict=True))),
+            )
+        )
+        inputs = (edge_hidden[self.kept], ends[self.kept])
+        edge_hidden = _hidden(self.second_edge, inputs, self.gather, projected)
+        received = _product(self.reduce_last, edge_hidden)
+
+        graph = _linear(tuple(zip((global_hidden, globals_), self.last_globals, strict=True)))
+        moving, moving_hidden = nodes[self.predicted], node_hidden[self.predicted]
+        ones = graph.new_ones(len(received), 1)
+        hidden = _hidden(self.second_node, (received, moving, moving_hidden), ones, graph)
+        weight, bias = self.out
+        return F.linear(hidden, weight, bias)
+
+    def predict(self, dynamic: Graph) -> Tensor:
+        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, zero if not predicted."""
+        batch = dynamic.nodes.shape[:-2]
+        out = self(
+            _items(dynamic.nodes).contiguous(),
+            _items(dynamic.edges).contiguous(),
+            _items(dynamic.globals_.unsqueeze(-2)),
+        )
+        full = out.new_zeros(dynamic.nodes.shape[-2], *out.shape[1:])
+        full[self.predicted] = out
+        return full.transpose(0, 1).reshape(*batch, *full.shape[::2])
+
+
+def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedCore:
+    """Fold a core for graphs of one topology.
+
+    Args:
+        core: the two GN blocks.
+        size: features of the dynamic graphs; the rest of the core's input is static.
+        predicted: ``[P]`` indices of the nodes to predict, in any order.
+        static: normalised static graph; any part may have a leading batch, which is then that
+            of the dynamic graphs.
+
+    Returns:
+        The folded core: differentiable in the core's weights and the static graph.
+    """
+    n, e, g = size.nodes, size.edges, size.globals_
+    edge_index = static.edge_index
+    sn, se, sg = static.nodes.shape[-1], static.edges.shape[-1], static.globals_.shape[-1]
+    first, second = core.first, core.second
+    assert first.global_mlp is not None
+    num_nodes, num_edges = static.nodes.shape[-2], edge_index.shape[1]
+    dtype = _first_layer(first.edge_mlp)[0].dtype
+
+    sender, receiver = (F.one_hot(index, num_nodes).to(dtype) for index in edge_index)
+    ones = torch.ones(num_edges, 1, dtype=dtype, device=edge_index.device)
+    reduce = torch.cat((receiver, ones), 1).T.contiguous()
+    degree = receiver.sum(0)[:, None, None]
+    kept = _rows(torch.isin(edge_index[1], predicted).nonzero().flatten())
+    rows = _rows(predicted)
+
+    static_nodes, static_globals = _items(static.nodes), _items(static.globals_.unsqueeze(-2))
+    sides = (*(static_nodes[ends] for ends in edge_index), _items(static.edges))
+    static_edges = torch.cat(_broadcast(sides), dim=-1)
+
+    # First block. Weight columns: globals, sender, receiver, edge; each dynamic then static.
+    weight, bias = _first_layer(first.edge_mlp)
+    wg, wsg, ws, wss, wr, wsr, we, wse = weight.split((g, sg, n, sn, n, sn, e, se), dim=1)
+    table = bias + F.linear(static_edges, torch.cat((wss, wsr, wse), 1)) + F.linear(static_globals, wsg)
+    first_edge = _factors(first.edge_mlp, (torch.cat((ws, wr, we), 1), wg), table)
+    edge_out, edge_bias = _last_layer(first.edge_mlp)
+
+    weight, bias = _first_layer(first.node_mlp)
+    wg, wsg, wn, wsn, wa = weight.split((g, sg, n, sn, edge_out.shape[0]), dim=1)
+    table = bias + F.linear(static_nodes, wsn) + F.linear(static_globals, wsg) + degree * (wa @ edge_bias)
+    first_node = _factors(first.node_mlp, (wa @ edge_out, wn, wg), table)
+    node_out, node_bias = _last_layer(first.node_mlp)
+
+    weight, bias = _first_layer(first.global_mlp)
+    wg, wsg, wn, we = weight.split((g, sg, node_out.shape[0], edge_out.shape[0]), dim=1)
+    table = bias + F.linear(static_globals, wsg) + num_nodes * (wn @ node_bias) + num_edges * (we @ edge_bias)
+    first_global = _factors(first.global_mlp, (wn @ node_out, we @ edge_out, wg), table)
+    global_out, global_bias = _last_layer(first.global_mlp)
+
+    # Second block: its input is the first block's input and output side by side.
+    latent_g, latent_n, latent_e = global_out.shape[0], node_out.shape[0], edge_out.shape[0]
+    weight, bias = _first_layer(second.edge_mlp)
+    wg, wsg, wlg, ws, wss, wls, wr, wsr, wlr, we, wse, wle = weight.split(
+        (g, sg, latent_g, n, sn, latent_n, n, sn, latent_n, e, se, latent_e), dim=1
+    )
+    table = bias + F.linear(static_edges, torch.cat((wss, wsr, wse), 1)) + F.linear(static_globals, wsg)
+    table = table + wlg @ global_bias + (wls + wlr) @ node_bias + wle @ edge_bias
+    second_edge = _factors(
+        second.edge_mlp,
+        (wle @ edge_out, torch.cat((ws, wr, we), 1)),
+        table[kept],
+    )
+    second_ends, second_globals = (wls @ node_out, wlr @ node_out), (wlg @ global_out, wg)
+    edge_out, edge_bias = _last_layer(second.edge_mlp)
+
+    weight, bias = _first_layer(second.node_mlp)
+    wg, wsg, wlg, wn, wsn, wln, wa = weight.split((g, sg, latent_g, n, sn, latent_n, edge_out.shape[0]), dim=1)
+    table = bias + F.linear(static_nodes, wsn) + F.linear(static_globals, wsg) + degree * (wa @ edge_bias)
+    table = (table + wlg @ global_bias + wln @ node_bias)[rows]
+    return FoldedCore(
+        ends=torch.cat((sender, receiver)),
+        reduce=reduce,
+        gather=torch.cat((sender, receiver, ones), 1)[kept],
+        reduce_last=reduce[rows][:, kept].contiguous(),
+        kept=kept,
+        predicted=rows,
+        first_edge=first_edge,
+        first_node=first_node,
+        first_global=first_global,
+        second_edge=second_edge,
+        second_ends=second_ends,
+        second_globals=second_globals,
+        second_node=_factors(second.node_mlp, (wa @ edge_out, wn, wln @ node_out), table),
+        last_globals=(wlg @ global_out, wg),
+        out=_last_layer(second.node_mlp),
+    )
+
+
+class _Layer(torch.autograd.Function):
+    """``relu(table + matrix @ items + sum_k x_k @ W_k.T)``, accumulated in one buffer.
+
+    Inputs: ``relu`` flag, ``table`` ``[I, 1 or B, h]`` or None, ``matrix`` ``[I, J]`` and ``items``
+    ``[J, B, h]`` or None, then pairs ``x_k`` ``[I, B, F_k]`` and ``W_k`` ``[h, F_k]``.
+    Output ``[I, B, h]``.
+    """
+
+    @staticmethod
+    def forward(relu, table, matrix, items, *pairs):
+        features, weights = pairs[::2], pairs[1::2]
+        count, batch = features[0].shape[:2]
+        flat = [x.reshape(count * batch, x.shape[-1]) for x in features]
+        start = 0
+        if items is None:
+            out = flat[0] @ weights[0].T
+            start = 1
+        else:
+            out = (matrix @ items.flatten(1)).view(count * batch, items.shape[-1])
+        for x, weight in zip(flat[start:], weights[start:], strict=True):
+            out.addmm_(x, weight.T)
+        shaped = out.view(count, batch, out.shape[-1])
+        if table is not None:
+            shaped.add_(table)
+        return shaped.relu_() if relu else shaped
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        relu, table, matrix, items, *pairs = inputs
+        ctx.relu, ctx.table_batch = relu, None if table is None else table.shape[1]
+        ctx.save_for_backward(output if relu else None, matrix, *pairs)
+
+    @staticmethod
+    def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
+        out, matrix, *pairs = ctx.saved_tensors
+        if ctx.relu:
+            grad = torch.ops.aten.threshold_backward(grad, out, 0)
+        count, batch, size = grad.shape
+        flat_grad = grad.reshape(count * batch, size)
+        needs = ctx.needs_input_grad
+        table = items = None
+        if needs[1]:
+            table = grad.sum(1, keepdim=True) if ctx.table_batch == 1 else grad
+        if matrix is not None and needs[3]:
+            items = (matrix.T @ flat_grad.view(count, batch * size)).view(matrix.shape[1], batch, size)
+        gradients = []
+        for index, (x, weight) in enumerate(zip(pairs[::2], pairs[1::2], strict=True)):
+            gradients.append((flat_grad @ weight).view(x.shape) if needs[4 + 2 * index] else None)
+            gradients.append(flat_grad.T @ x.reshape(len(flat_grad), x.shape[-1]) if needs[5 + 2 * index] else None)
+        return None, table, None, items, *gradients
+
+
+def _plain_layer(relu, table, matrix, items, *pairs):
+    """:class:`_Layer` in single operations, for a compiler to fuse."""
+    terms = [F.linear(x, weight) for x, weight in zip(pairs[::2], pairs[1::2], strict=True)]
+    if items is not None:
+        terms.append(_product(matrix, items))
+    if table is not None:
+        terms.append(table)
+    out = terms[0]
+    for term in terms[1:]:
+        out = out + term
+    return F.relu(out) if relu else out
+
+
+def _linear(pairs, table=None, matrix=None, items=None, relu: bool = False) -> Tensor:
+    used = [tensor for pair in pairs if pair[0].shape[-1] for tensor in pair]
+    layer = _plain_layer if torch.compiler.is_compiling() else _Layer.apply
+    return layer(relu, table, matrix, items, *used)
+
+
+def _hidden(factors: Factors, inputs, matrix=None, items=None) -> Tensor:
+    """Last hidden activation of an MLP whose first layer is given by its factors."""
+    pairs = tuple(zip(inputs, factors.weights, strict=True))
+    hidden = _linear(pairs, factors.table, matrix, items, relu=True)
+    for weight, bias in factors.hidden:
+        hidden = _linear(((hidden, weight),), bias.expand(hidden.shape[0], 1, -1), relu=True)
+    return hidden
+
+
+def _factors(mlp: nn.Sequential, weights: tuple[Tensor, ...], table: Tensor) -> Factors:
+    hidden = [layer for layer in list(mlp)[2:-1:2] if isinstance(layer, nn.Linear)]
+    return Factors(weights, table, tuple((layer.weight, layer.bias) for layer in hidden))
+
+
+def _rows(index: Tensor) -> Rows:
+    """Indices in a row as a slice, which picks without a copy."""
+    first, count = int(index[0]) if len(index) else 0, len(index)
+    in_a_row = torch.arange(first, first + count, device=index.device)
+    return slice(first, first + count) if torch.equal(index, in_a_row) else index
+
+
+def _items(features: Tensor) -> Tensor:
+    """``[*B, I, F]`` as ``[I, 1 or B, F]``."""
+    return features.reshape(features.shape[:-2].numel(), *features.shape[-2:]).transpose(0, 1)
+
+
+def _broadcast(parts) -> list[Tensor]:
+    """Give all parts ``[I, 1 or B, F]`` the larger batch."""
+    batch = max((part.shape[1] for part in parts), default=1)
+    return [part.expand(-1, batch, -1) for part in parts]
+
+
+def _first_layer(mlp: nn.Sequential) -> tuple[Tensor, Tensor]:
+    layer = mlp[0]
+    assert isinstance(layer, nn.Linear)
+    return layer.weight, layer.bias
+
+
+def _last_layer(mlp: nn.Sequential) -> tuple[Tensor, Tensor]:
+    layer = mlp[-1]
+    assert isinstance(layer, nn.Linear)
+    return layer.weight, layer.bias
+
+
+def _product(matrix: Tensor, items: Tensor) -> Tensor:
+    """``[M, I]`` times ``[I, B, F]``: weighted sums of items, ``[M, B, F]``."""
+    return (matrix @ items.flatten(1)).view(matrix.shape[0], *items.shape[1:])
