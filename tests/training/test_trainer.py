@@ -8,9 +8,9 @@ import math
 import pytest
 import torch
 
+from torchrl_gn.modules import fast_matmul
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.checkpoint import load_checkpoint, save_checkpoint
-from torchrl_gn.training.precision import fast_matmul
 
 
 def weights(trainer) -> dict[str, torch.Tensor]:

@@ -7,6 +7,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_gn.modules import BoundForwardModel
+
 
 def predict(model: TensorDictModuleBase, state: Tensor, action: Tensor) -> Tensor:
     """Predict one step with a bound model, whatever its keys.
@@ -50,6 +52,8 @@ def rollout(model: TensorDictModuleBase, state: Tensor, actions: Tensor) -> Tens
             f"rollout needs a state [*B, N, 13] and actions [*B, T, A] with the same *B,"
             f" got {list(state.shape)} and {list(actions.shape)}."
         )
+    if isinstance(model, BoundForwardModel):
+        return model.rollout(state, actions)
     states = [state]
     for action in actions.unbind(-2):
         states.append(predict(model, states[-1], action))

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_gn.modules import quaternion
-from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ class BoundForwardModel(TensorDictModuleBase):
         model: the shared weights.
         scene: the scene to predict.
         strict: raise, instead of warning, on features that training never saw vary.
+        plain: evaluate the core as the paper writes it, by message passing, edge by edge. The same
+            function, slowly: what everything faster is compared with.
         state_key: where to read the state.
         action_key: where to read the action.
 
@@ -63,6 +65,7 @@ class BoundForwardModel(TensorDictModuleBase):
         scene: Scene,
         *,
         strict: bool = False,
+        plain: bool = False,
         state_key: NestedKey = "state",
         action_key: NestedKey = "action",
     ) -> None:
@@ -71,7 +74,7 @@ class BoundForwardModel(TensorDictModuleBase):
         next_key = ("next", state_key) if isinstance(state_key, str) else ("next", *state_key)
         self.out_keys: list[NestedKey] = [next_key]
         self.model, self.scene, self.layout = model, scene, model.layout
-        self.timestep = float(scene.timestep)
+        self.timestep, self.plain = float(scene.timestep), plain
 
         ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
         self._register("edge_index", torch.stack(ends).long())
@@ -182,21 +185,57 @@ class BoundForwardModel(TensorDictModuleBase):
         Raises:
             ValueError: if a shape does not fit the scene.
         """
-        return self.layout.apply(state, self.delta(state, action))
+        self._check_shapes(state, action)
+        return self._advance(state, action, self.fold())
 
-    def fold(self) -> FoldedCore:
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """States from a start state under a sequence of actions.
+
+        Args:
+            state: ``[*B, N, 13]`` start states.
+            actions: ``[*B, T, A]``; ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``.
+
+        Returns:
+            ``[*B, T + 1, N, 13]``; the first is the start state itself.
+
+        Raises:
+            ValueError: if a shape does not fit the scene.
+        """
+        for action in actions.unbind(-2)[:1]:
+            self._check_shapes(state, action)
+        states, folded = [state], self.fold()
+        for action in actions.unbind(-2):
+            states.append(self._advance(states[-1], action, folded))
+        return torch.stack(states, dim=-3)
+
+    def _advance(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
+        return self.layout.apply(state, self._delta(state, action, folded))
+
+    def fold(self) -> FoldedCore | None:
         """The network for this scene, to pass to :meth:`delta` where many steps share the weights."""
-        return self.model.fold(self.static_graph(), self.predicted_nodes)
+        return None if self.plain else self.model.fold(self.static_graph(), self.predicted_nodes)
 
     def delta(self, state: Tensor, action: Tensor, folded: FoldedCore | None = None) -> Tensor:
         """Predicted change of the state ``[*B, N, 12]``, exactly zero in dead components."""
-        residual = self.model(self.dynamic_graph(state, action), folded or self.fold()).to(state.dtype)
+        self._check_shapes(state, action)
+        return self._delta(state, action, folded or self.fold())
+
+    def _delta(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
+        residual = self._residual(state, action, folded).to(state.dtype)
         turn = self._turn(state)
         if turn is not None:
             residual = self.layout.turn_delta(residual, turn)
         if self.model.integrate:
             residual = self.layout.integrate(state, residual, self.timestep)
         return residual * self.live
+
+    def _residual(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
+        """What the network predicts ``[*B, N, 12]``, in the local frame."""
+        dynamic = self.dynamic_graph(state, action)
+        if folded is not None:
+            return self.model(dynamic, folded)
+        normalized = self.model.core(graph_concat(dynamic, self.static_graph())).nodes
+        return self.model.residual_normalizer.inverse(normalized)
 
     def dynamic_graph(self, state: Tensor, action: Tensor) -> Graph:
         """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
@@ -207,10 +246,10 @@ class BoundForwardModel(TensorDictModuleBase):
         nodes, edges = model.node_normalizer(encoded, dtype), model.edge_normalizer(controls, dtype)
         return Graph(nodes, edges, globals_, self.edge_index)
 
-    def static_graph(self) -> Graph:
-        """Normalised static graph (no batch) in the network's dtype."""
+    def static_graph(self, dtype: torch.dtype | None = None) -> Graph:
+        """Normalised static graph (no batch), by default in the network's dtype."""
         nodes, edges, globals_ = (
-            normalizer(getattr(self, f"static_{part}"), self.network_dtype)
+            normalizer(getattr(self, f"static_{part}"), dtype or self.network_dtype)
             for part, normalizer in self._static_normalizers()
         )
         return Graph(nodes, edges, globals_, self.edge_index)

@@ -22,7 +22,9 @@ on a CPU the passes over memory between the products would cost as much as the p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +35,7 @@ from torchrl_gn.modules.gn_block import GraphSize
 from torchrl_gn.modules.graph import Graph
 
 Rows = Tensor | slice
+Columns = tuple[Tensor, Tensor]  # indices, and factors on what is there
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,38 @@ class FoldedCore:
         full = out.new_zeros(dynamic.nodes.shape[-2], *out.shape[1:])
         full[self.predicted] = out
         return full.transpose(0, 1).reshape(*batch, *full.shape[::2])
+
+    def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> FoldedCore:
+        """This core with fewer and rescaled features (with ``F_n`` and ``F_e`` those that are left).
+
+        Args:
+            nodes: columns of the nodes' dynamic features that are kept, and factors on them.
+            edges: the same for edges.
+            out: rows of the output that are kept, and factors on them.
+            shift: added to the scaled output.
+        """
+        n = self.first_node.weights[1].shape[1]
+        node, edge = nodes[0], edges[0]
+        ends = torch.cat((node, n + node, 2 * n + edge)), torch.cat((nodes[1], nodes[1], edges[1]))
+
+        def change(factors: Factors, index: int, columns: Columns) -> Factors:
+            weights = list(factors.weights)
+            weights[index] = _columns(weights[index], columns)
+            return replace(factors, weights=tuple(weights))
+
+        weight, bias = self.out
+        return replace(
+            self,
+            first_edge=change(self.first_edge, 0, ends),
+            first_node=change(self.first_node, 1, nodes),
+            second_edge=change(self.second_edge, 1, ends),
+            second_node=change(self.second_node, 1, nodes),
+            out=(_columns(weight.T, out).T, bias[out[0]] * out[1] + shift),
+        )
+
+    def snapshot(self, dtype: torch.dtype) -> FoldedCore:
+        """Copy that shares no memory and passes no gradient to the weights."""
+        return _map(self, lambda tensor: tensor.detach().to(dtype).clone(memory_format=torch.contiguous_format))
 
 
 def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedCore:
@@ -317,6 +352,47 @@ def _hidden(factors: Factors, inputs, matrix=None, items=None) -> Tensor:
 def _factors(mlp: nn.Sequential, weights: tuple[Tensor, ...], table: Tensor) -> Factors:
     hidden = [layer for layer in list(mlp)[2:-1:2] if isinstance(layer, nn.Linear)]
     return Factors(weights, table, tuple((layer.weight, layer.bias) for layer in hidden))
+
+
+def _columns(weight: Tensor, columns: Columns) -> Tensor:
+    index, factor = columns
+    return weight[:, index] * factor
+
+
+def _map(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    """The same nested tuples and dataclasses with ``function`` on every floating-point tensor."""
+    if isinstance(value, Tensor):
+        return function(value) if value.is_floating_point() else value
+    if isinstance(value, tuple):
+        return tuple(_map(entry, function) for entry in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        changed = {field.name: _map(getattr(value, field.name), function) for field in fields(value)}
+        return replace(value, **changed)
+    return value
+
+
+def copy_into(old, new) -> bool:
+    """Overwrite the tensors of nested tuples and dataclasses, if all else is equal; whether it was."""
+    pairs: list[tuple[Tensor, Tensor]] = []
+
+    def collect(a, b) -> bool:
+        if type(a) is not type(b):
+            return False
+        if isinstance(a, Tensor):
+            pairs.append((a, b))
+            return (a.shape, a.dtype, a.device) == (b.shape, b.dtype, b.device)
+        if isinstance(a, tuple):
+            return len(a) == len(b) and all(map(collect, a, b))
+        if is_dataclass(a):
+            return all(collect(getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
+        return a == b
+
+    if not collect(old, new):
+        return False
+    with torch.no_grad():
+        for a, b in pairs:
+            a.copy_(b)
+    return True
 
 
 def _rows(index: Tensor) -> Rows:

@@ -134,20 +134,21 @@ class ForwardModel(nn.Module):
             global_hidden=global_hidden,
         )
 
-    def bind(self, scene: Scene, *, strict: bool = False) -> BoundForwardModel:
+    def bind(self, scene: Scene, *, strict: bool = False, plain: bool = False) -> BoundForwardModel:
         """Join these weights to a scene.
 
         Args:
             scene: any scene with the features the model reads.
             strict: refuse, instead of warning, a scene with a value that training never saw
                 in a feature that never varied.
+            plain: evaluate the core as the paper writes it, slowly: the reference for all that is faster.
 
         Returns:
             TensorDict module ``state, action -> ("next", "state")`` that shares these weights.
         """
         from torchrl_gn.modules.bound_forward_model import BoundForwardModel
 
-        return BoundForwardModel(self, scene, strict=strict)
+        return BoundForwardModel(self, scene, strict=strict, plain=plain)
 
     def fold(self, static: Graph, predicted: Tensor) -> FoldedCore:
         """The core for one scene, differentiable in the weights.

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_gn.modules import BoundForwardModel, Normalizer, quaternion
+from torchrl_gn.modules import BoundForwardModel, Normalizer, SpecializedForwardModel, quaternion
 
 
 class ForwardModelLoss(LossModule):
@@ -70,6 +70,8 @@ class ForwardModelLoss(LossModule):
         super().__init__()
         if noise < 0:
             raise ValueError(f"noise={noise} must not be negative.")
+        if isinstance(model, SpecializedForwardModel):
+            raise TypeError("A specialised model passes no gradient to the weights; train the bound model.")
         self.model = model
         self.noise = noise
         self.generator = generator

@@ -9,7 +9,6 @@ from torchrl_gn.training.checkpoint import save_checkpoint as save_checkpoint
 from torchrl_gn.training.exit import clean_exit as clean_exit
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer
 from torchrl_gn.training.optimizers import make_optimizer as make_optimizer
-from torchrl_gn.training.precision import fast_matmul as fast_matmul
 from torchrl_gn.training.run_folder import RunFolder as RunFolder
 from torchrl_gn.training.tracking import Tracker as Tracker
 from torchrl_gn.training.trainer import Progress as Progress

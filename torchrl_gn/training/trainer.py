@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import torch
 from torchrl.data import ReplayBuffer
 
+from torchrl_gn.modules import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.optimizers import ScheduledOptimizer
-from torchrl_gn.training.precision import fast_matmul
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,83 @@
+"""One prediction step and its gradient, compiled."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Step = Callable[[Tensor, Tensor], Tensor]
+
+
+class CompiledStep:
+    """``step(state, action) -> next_state`` through ``torch.compile``, once for every shape and dtype.
+
+    The gradient is compiled too, as one function that computes the step again and pulls the
+    gradient back through it: activations are never stored, so memory does not grow with the
+    network over long rollouts.
+
+    Args:
+        step: what to compile; differentiable by :func:`torch.func.vjp`.
+        stamp: value that changes when the function does. A gradient through a step whose function
+            has changed since is refused.
+
+    Raises:
+        RuntimeError: without a C++ compiler on a CPU.
+    """
+
+    def __init__(self, step: Step, stamp: Callable[[], int]) -> None:
+        self.stamp = stamp
+
+        def pull(state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+            return torch.func.vjp(step, state, action)[1](gradient)
+
+        self._step, self._pull = _compile(step), _compile(pull)
+
+    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
+        """Next state, differentiable once in state and action."""
+        if torch.is_grad_enabled() and (state.requires_grad or action.requires_grad):
+            return _Differentiable.apply(self, state, action)
+        with torch.no_grad():
+            return self._step(state, action)
+
+
+class _Differentiable(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, compiled: CompiledStep, state: Tensor, action: Tensor) -> Tensor:
+        ctx.compiled, ctx.stamp = compiled, compiled.stamp()
+        ctx.save_for_backward(state, action)
+        return compiled._step(state.detach(), action.detach())
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        if ctx.stamp != ctx.compiled.stamp():
+            raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
+        return None, *ctx.compiled._pull(*ctx.saved_tensors, gradient.contiguous())
+
+
+def _compile(function: Callable) -> Callable:
+    options: dict[str, Any] = {"fullgraph": True, "dynamic": False, "recompile_limit": 1000, "isolate_recompiles": True}
+    if not torch.cuda.is_available():
+        # The kernels of a small graph take less time than calling them from Python.
+        options["options"] = {"cpp_wrapper": True}
+    known = inspect.signature(torch.compile).parameters  # two of them are newer than torch 2.11
+    return torch.compile(function, **{name: value for name, value in options.items() if name in known})
+
+
+def check_compiler() -> None:
+    """Refuse to compile for a CPU without a C++ compiler, before anything is waited for.
+
+    Raises:
+        RuntimeError: if there is none.
+    """
+    from torch._inductor.cpp_builder import get_cpp_compiler
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler as error:
+        raise RuntimeError("compile=True needs a C++ compiler: install g++, or leave compile out.") from error

@@ -1,0 +1,199 @@
+"""A forward model folded for one scene: the same function, without what the scene doesn't need."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from torchrl_gn.modules.bound_forward_model import BoundForwardModel, UnseenFeatureWarning
+from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
+from torchrl_gn.modules.folded_core import FoldedCore, copy_into, fold_core
+from torchrl_gn.modules.graph import Graph, graph_concat
+
+
+class _Source:
+    """A tensor that a snapshot was made from, and whether it is still the same."""
+
+    def __init__(self, owner: dict[str, Any], name: str) -> None:
+        self.owner, self.name, self.tensor = owner, name, owner[name]
+        # Sharing the storage keeps it alive: nothing new can come to lie at its address.
+        self.kept = None if self.tensor is None else self.tensor.detach()
+        self.address, self.version = (0, 0) if self.kept is None else (self.kept.data_ptr(), self.kept._version)
+
+    def unchanged(self) -> bool:
+        now = self.owner.get(self.name)
+        if now is not self.tensor or now is None:
+            return now is self.tensor
+        return now._version == self.version and now.data_ptr() == self.address
+
+
+class SpecializedForwardModel(BoundForwardModel):
+    """Forward model of one scene with everything constant folded away; made by :func:`specialize`.
+
+    Predicts what the bound model predicts, from a *snapshot* of its weights, normalisers
+    and the scene's static features. The snapshot looks after itself: when any of them was
+    changed, moved or cast since (an optimiser step, ``load_state_dict``, ``to``), the next
+    prediction folds again, so a stale one is never used. (Only a change through ``.data``, which
+    PyTorch does not count, goes unseen.) Differentiable in states and actions, never in
+    weights. Reads and writes the same keys as the bound model and stands in for it in
+    environments, planners and rollouts. ``print`` shows what was skipped.
+    """
+
+    def __init__(self, bound: BoundForwardModel, *, dtype: torch.dtype | None = None, compile: bool = False) -> None:
+        state_key, action_key = bound.in_keys
+        with warnings.catch_warnings():  # the bound model has warned
+            warnings.simplefilter("ignore", UnseenFeatureWarning)
+            super().__init__(bound.model, bound.scene, state_key=state_key, action_key=action_key)
+        self.to(bound.live.device)
+        if compile and bound.live.device.type == "cpu":
+            check_compiler()
+        self._dtype, self.compile_steps = dtype, compile
+        self._folded: FoldedCore | None = None
+        self._folds = 0
+        self._sources: list[_Source] = []
+        self._compiled: CompiledStep | None = None
+
+    def __getstate__(self) -> dict:
+        # A copy folds and compiles for itself.
+        return {**super().__getstate__(), "_folded": None, "_sources": [], "_compiled": None}
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Dtype of the products."""
+        return self._dtype or self.network_dtype
+
+    def fold(self) -> FoldedCore:
+        """The snapshot, made again if anything it came from has changed."""
+        if self._folded is None or not all(source.unchanged() for source in self._sources):
+            folded = self._fold()
+            if self._folded is None or not copy_into(self._folded, folded):
+                self._folded, self._compiled = folded, None
+            self._folds += 1
+            owners = [module._parameters for module in self.model.modules()]
+            owners += [module._buffers for module in (*self.model.modules(), self)]
+            self._sources = [_Source(owner, name) for owner in owners for name in owner]
+        return self._folded
+
+    def _advance(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
+        if not self.compile_steps:
+            return super()._advance(state, action, folded)
+        if self._compiled is None:
+            plain = super()._advance
+            self._compiled = CompiledStep(lambda state, action: plain(state, action, folded), lambda: self._folds)
+        return self._compiled(state, action)
+
+    @torch.no_grad()
+    def _fold(self) -> FoldedCore:
+        model = self.model
+        nodes, edges, residual = model.node_normalizer, model.edge_normalizer, model.residual_normalizer
+        self.node_columns = (~nodes.constant).nonzero().flatten()
+        self.edge_columns = (~edges.constant).nonzero().flatten()
+        self.rows = (self.live.any(0) & ~residual.constant).nonzero().flatten()
+        self._runs = _runs(self.rows.tolist(), self.layout.delta_size)
+        # In float64, so that folding loses nothing.
+        core = copy.deepcopy(model.core).double()
+        static = self.static_graph(torch.float64)
+        full = fold_core(core, model.dynamic_size, self.predicted_nodes, static)
+        small = full.reduced(
+            (self.node_columns, nodes.inverse_std[self.node_columns]),
+            (self.edge_columns, edges.inverse_std[self.edge_columns]),
+            (self.rows, residual.std[self.rows]),
+            residual.mean[self.rows],
+        )
+        return small.snapshot(self.dtype)
+
+    def _residual(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
+        assert folded is not None
+        encoded, controls = self._encode(state, action)
+        nodes = _centered(encoded, self.model.node_normalizer.mean, self.node_columns)
+        edges = _centered(controls, self.model.edge_normalizer.mean, self.edge_columns)
+        dtype = folded.out[0].dtype
+        globals_ = nodes.new_zeros((*state.shape[:-2], 0), dtype=dtype)
+        predicted = folded.predict(Graph(nodes.to(dtype), edges.to(dtype), globals_, self.edge_index)).to(state.dtype)
+        # Channels that never varied are predicted as what they were.
+        constant = self.model.residual_normalizer.mean.to(state.dtype).expand(*predicted.shape[:-1], -1)
+        return torch.cat([(predicted if varies else constant)[..., where] for varies, where in self._runs], dim=-1)
+
+    def skipped(self) -> dict[str, tuple[float, float]]:
+        """What a prediction of one state handles in the plain model, and here."""
+        core, size, folded = self.model.core, self.model.dynamic_size, self.fold()
+        nodes, edges = self.scene.num_nodes, self.scene.num_edges
+        static = self.static_graph()
+
+        def graph(nodes_: int, edges_: int, dtype: torch.dtype) -> Graph:
+            def empty(*shape: int) -> Tensor:
+                return torch.zeros(1, *shape, dtype=dtype, device=self.live.device)
+
+            return Graph(empty(nodes, nodes_), empty(edges, edges_), empty(0), self.edge_index)
+
+        with FlopCounterMode(display=False) as plain, torch.no_grad():
+            core(graph_concat(graph(size.nodes, size.edges, self.network_dtype), static))
+        with FlopCounterMode(display=False) as quick, torch.no_grad():
+            folded.predict(graph(len(self.node_columns), len(self.edge_columns), self.dtype))
+        first = core.first.in_size
+        return {
+            "node features": (first.nodes, len(self.node_columns)),
+            "edge features": (first.edges, len(self.edge_columns)),
+            "global features": (first.globals_, 0),
+            "nodes predicted": (nodes, len(self.predicted_nodes)),
+            "channels predicted": (self.layout.delta_size, len(self.rows)),
+            "edges of the second block": (edges, folded.gather.shape[0]),
+            "kFLOP": (plain.get_total_flops() / 1e3, quick.get_total_flops() / 1e3),
+        }
+
+    def __str__(self) -> str:
+        """Table of what was skipped."""
+        name = str(self.dtype).removeprefix("torch.")
+        lines = [f"Forward model of {self.scene.name}, specialised, {name}", f"  {'':26}{'plain':>10}{'here':>10}"]
+        for what, (plain, here) in self.skipped().items():
+            lines.append(f"  {what:26}{plain:10,.0f}{here:10,.0f}")
+        return "\n".join(lines)
+
+
+def specialize(
+    bound: BoundForwardModel, *, dtype: torch.dtype | None = None, compile: bool = False
+) -> SpecializedForwardModel:
+    """Fold everything that a scene doesn't need out of its forward model.
+
+    The result predicts the same function with fewer operations: static features and
+    biases become tables, layers that are linear in a row are merged, inputs that never
+    varied and channels, nodes and edges that don't matter are left out
+    (:mod:`~torchrl_gn.modules.folded_core`).
+
+    Args:
+        bound: the forward model of the scene.
+        dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster
+            where the processor multiplies it; states keep their dtype.
+        compile: compile ``step`` and ``rollout`` with ``torch.compile``, at their first call with
+            every new shape: seconds to a minute then, and much faster steps of small batches.
+
+    Returns:
+        A module with the same keys that shares the weights and folds them again when they change.
+
+    Raises:
+        RuntimeError: to compile for a CPU without a C++ compiler.
+    """
+    return SpecializedForwardModel(bound, dtype=dtype, compile=compile)
+
+
+def _runs(rows: list[int], size: int) -> list[tuple[bool, slice]]:
+    """Where to take a full row of ``size`` from: from kept ``rows`` lying side by side, or from their constants."""
+    runs: list[tuple[bool, slice]] = []
+    for column in range(size):
+        kept = column in rows
+        place = rows.index(column) if kept else column
+        if runs and runs[-1][0] == kept and runs[-1][1].stop == place:
+            runs[-1] = (kept, slice(runs[-1][1].start, place + 1))
+        else:
+            runs.append((kept, slice(place, place + 1)))
+    return runs
+
+
+def _centered(features: Tensor, mean: Tensor, columns: Tensor) -> Tensor:
+    """Kept columns less their mean: large numbers cancel before they are rounded."""
+    return features[..., columns] - mean[columns].to(features.dtype)
