@@ -177,3 +177,15 @@ def test_normalize_of_zero_is_no_rotation():
 def test_normalize_has_the_gradient_of_the_projection():
     q = (3 * rotations(5)).requires_grad_()
     assert torch.autograd.gradcheck(quaternion.normalize, (q,))
+
+
+def test_matrices_of_quaternions_of_any_length():
+    generator = torch.Generator().manual_seed(0)
+    q = quaternion.normalize(torch.randn(50, 4, generator=generator, dtype=torch.float64))
+    for length in (1e-6, 0.5, 3.0, 1e6):
+        torch.testing.assert_close(quaternion.to_matrix(length * q), quaternion.to_matrix(q), rtol=0, atol=1e-14)
+    zero = torch.zeros(4, dtype=torch.float64, requires_grad=True)
+    matrix = quaternion.to_matrix(zero)
+    assert torch.equal(matrix.detach(), torch.eye(3, dtype=torch.float64).flatten())
+    (gradient,) = torch.autograd.grad(matrix.sum(), zero)
+    assert torch.isfinite(gradient).all()

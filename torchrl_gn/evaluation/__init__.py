@@ -1,11 +1,13 @@
 """Errors as the paper defines them, rollouts, figures and videos."""
 
+from torchrl_gn.evaluation.energy import kinetic_energy as kinetic_energy
 from torchrl_gn.evaluation.error_table import ErrorTable as ErrorTable
 from torchrl_gn.evaluation.error_table import PredictionError as PredictionError
 from torchrl_gn.evaluation.errors import evaluate_errors as evaluate_errors
 from torchrl_gn.evaluation.errors import squared_errors as squared_errors
 from torchrl_gn.evaluation.figures import plot_body_trajectory as plot_body_trajectory
 from torchrl_gn.evaluation.figures import plot_errors as plot_errors
+from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve
 from torchrl_gn.evaluation.report import report as report
 from torchrl_gn.evaluation.rollout import rollout as rollout

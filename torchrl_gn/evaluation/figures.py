@@ -88,6 +88,34 @@ def plot_body_trajectory(
     return _save(figure, path)
 
 
+def plot_loglog(
+    panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]],
+    path: str | os.PathLike,
+    *,
+    ylabel: str,
+) -> Path:
+    """Lines on logarithmic axes, one panel beside the other.
+
+    Args:
+        panels: ``(x, y)`` by label, by the name of the panel's horizontal axis.
+        path: file to write; its suffix is the format.
+        ylabel: name of the vertical axis.
+
+    Returns:
+        The written path.
+    """
+    figure = _figure((4.2 * len(panels) + 0.6, 3.8))
+    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        for number, (label, (x, y)) in enumerate(lines.items()):
+            axes.loglog(x, y, color=colors[number % len(colors)], label=label, linewidth=1.6, marker="o", markersize=4)
+        axes.set_xlabel(xlabel)
+        axes.set_ylabel(ylabel)
+        axes.grid(alpha=0.25, which="both")
+        axes.legend(frameon=False)
+    return _save(figure, path)
+
+
 def plot_training_curve(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     path: str | os.PathLike,

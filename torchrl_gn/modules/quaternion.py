@@ -112,26 +112,30 @@ def angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def to_matrix(q: Tensor) -> Tensor:
-    """Rotation matrices of unit quaternions, row by row.
+    """Rotation matrices of quaternions of any length, row by row; the identity for zero.
 
     Args:
-        q: ``[..., 4]`` unit quaternions.
+        q: ``[..., 4]`` quaternions.
 
     Returns:
         ``[..., 9]`` entries of the matrices in row-major order.
     """
+    square = q.square().sum(-1)
+    # 1 for zero: all products below vanish and leave the identity.
+    scale = 2 / torch.where(square > 0, square, torch.ones_like(square))
     w, x, y, z = q.unbind(-1)
+    _, sx, sy, sz = (scale.unsqueeze(-1) * q).unbind(-1)
     return torch.stack(
         (
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
+            1 - (y * sy + z * sz),
+            x * sy - w * sz,
+            x * sz + w * sy,
+            x * sy + w * sz,
+            1 - (x * sx + z * sz),
+            y * sz - w * sx,
+            x * sz - w * sy,
+            y * sz + w * sx,
+            1 - (x * sx + y * sy),
         ),
         dim=-1,
     )

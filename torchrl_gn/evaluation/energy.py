@@ -1,0 +1,44 @@
+"""Kinetic energy of a scene from the states of its bodies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchrl_gn.modules import quaternion
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes import Scene
+
+
+def kinetic_energy(state: Tensor, scene: Scene) -> Tensor:
+    """Kinetic energy of all moving bodies, joints' armature left out.
+
+    Args:
+        state: ``[..., N, 13]``.
+        scene: whose state it is.
+
+    Returns:
+        ``[...]`` joules.
+    """
+    columns = {
+        name: torch.as_tensor(column)
+        for name, column in zip(scene.static.node_names, scene.static.nodes.T, strict=True)
+    }
+
+    def feature(name: str, size: int) -> Tensor:
+        return torch.stack([columns[f"{name}[{index}]"] for index in range(size)], -1).to(state)
+
+    def turn(q: Tensor, v: Tensor) -> Tensor:
+        return (quaternion.to_matrix(q).unflatten(-1, (3, 3)) @ v.unsqueeze(-1)).squeeze(-1)
+
+    mass, moves = columns["mass"].to(state), torch.as_tensor(scene.predicted).to(state)
+    orientation, linear, angular = state[..., 3:7], state[..., 7:10], state[..., 10:13]
+    arm = turn(orientation, feature("ipos", 3).expand_as(linear))
+    velocity = linear + torch.linalg.cross(angular, arm)
+    principal = quaternion.product(orientation, feature("iquat", 4))
+    spin = turn(quaternion.conjugate(principal), angular)
+    energy = mass * velocity.square().sum(-1) + (feature("inertia", 3) * spin.square()).sum(-1)
+    return 0.5 * (energy * moves).sum(-1)
