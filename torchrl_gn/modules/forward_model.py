@@ -67,6 +67,9 @@ class ForwardModel(nn.Module):
             is (paper: on for single systems, off when several train together).
         align: make the prediction independent of how a rotation-invariant scene is turned
             (:attr:`Scene.heading <torchrl_gn.scenes.Scene>`); the paper does not.
+        link: keep bodies that joints pin together together: of the predicted positions and
+            velocities only those of each linkage as a whole are used, the rest follows
+            from the orientations and angular velocities. The paper lets bodies drift apart.
         latent: features of the graph between the two GN blocks.
         edge_hidden: hidden sizes of the edge MLPs.
         node_hidden: hidden sizes of the node MLPs.
@@ -87,6 +90,7 @@ class ForwardModel(nn.Module):
         joint_axes: bool = True,
         recenter: bool = True,
         align: bool = True,
+        link: bool = True,
         latent: int = 128,
         edge_hidden: Sequence[int] = (128, 128),
         node_hidden: Sequence[int] = (128, 128),
@@ -100,7 +104,7 @@ class ForwardModel(nn.Module):
         self.static, self.layout = static, layout
         self.encoding: Encoding = encoding
         self.integrate, self.joint_axes = integrate, joint_axes
-        self.recenter, self.align = recenter, align
+        self.recenter, self.align, self.link = recenter, align, link
         self.options = {
             "static": static,
             "encoding": encoding,
@@ -108,6 +112,7 @@ class ForwardModel(nn.Module):
             "joint_axes": joint_axes,
             "recenter": recenter,
             "align": align,
+            "link": link,
             "latent": latent,
             "edge_hidden": list(edge_hidden),
             "node_hidden": list(node_hidden),

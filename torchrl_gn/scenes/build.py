@@ -8,6 +8,7 @@ import numpy as np
 from torchrl_gn.scenes.errors import SceneError, UnsupportedSceneError
 from torchrl_gn.scenes.heading import find_heading
 from torchrl_gn.scenes.invariance import translation_invariant
+from torchrl_gn.scenes.linkage import find_linkage
 from torchrl_gn.scenes.mobility import live_channels
 from torchrl_gn.scenes.scene import Attachment, Scene
 from torchrl_gn.scenes.static_features import static_graph
@@ -69,6 +70,7 @@ def build_scene(
         static=static_graph(model, graph, actuator_of_joint, substeps * model.opt.timestep),
         live=live,
         translation_invariant=invariant,
+        linkage=find_linkage(model, graph),
         heading=find_heading(model, graph, live, invariant),
         action_low=model.actuator_ctrlrange[:, 0].copy(),
         action_high=model.actuator_ctrlrange[:, 1].copy(),

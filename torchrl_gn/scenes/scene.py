@@ -11,6 +11,7 @@ import numpy as np
 
 from torchrl_gn.scenes.errors import SceneError
 from torchrl_gn.scenes.heading import Heading
+from torchrl_gn.scenes.linkage import Linkage
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class Scene:
             3, linear velocity 3, angular velocity 3; world frame) can ever differ from zero.
         translation_invariant: ``[3]`` bool, world axes along which the dynamics do not
             depend on where the scene is.
+        linkage: where joints pin the nodes together.
         heading: how the whole scene is turned, if the dynamics do not depend on it.
         action_low: ``[A]`` lower bounds of the controls.
         action_high: ``[A]`` upper bounds of the controls.
@@ -98,6 +100,7 @@ class Scene:
     live: np.ndarray
     translation_invariant: np.ndarray
     heading: Heading | None
+    linkage: Linkage
     action_low: np.ndarray
     action_high: np.ndarray
     substeps: int

@@ -1,0 +1,69 @@
+"""Which bodies are pinned together by joints, and where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.topology import Topology
+
+_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Linkage:
+    """Where hinges and balls pin every node to its parent.
+
+    Nodes that are pinned together, directly or through others, are a linkage. Its root is pinned
+    to nothing above it: the world, or a node that hangs on a slide or a free joint.
+
+    Attributes:
+        parent: ``[N]`` parent node; itself for a root.
+        parent_arm: ``[N, 3]`` the pin in the parent's frame, metres; 0 for a root.
+        arm: ``[N, 3]`` the pin in the node's own frame; 0 for a root.
+        chain: ``[N, N]`` 1 where the second node lies between the root and the first, the first
+            included and the root not.
+        root: ``[N]`` root of each node's linkage.
+    """
+
+    parent: np.ndarray
+    parent_arm: np.ndarray
+    arm: np.ndarray
+    chain: np.ndarray
+    root: np.ndarray
+
+
+def find_linkage(model: mujoco.MjModel, graph: Topology) -> Linkage:
+    """Read the pins of a model's joints.
+
+    A body is pinned to its parent if all its joints are hinges and balls about one point.
+    """
+    count = len(graph.body)
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    mujoco.mj_kinematics(model, data)
+    parent, root = np.arange(count), np.arange(count)
+    parent_arm, arm, chain = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, count))
+    for node in range(1, count):
+        body = int(graph.body[node])
+        first = model.body_jntadr[body]
+        joints = np.arange(first, first + model.body_jntnum[body])
+        if not _pinned(model, joints):
+            continue
+        above = int(graph.parent[node])
+        anchor, frame = data.xanchor[joints[0]], data.xmat[graph.body[above]].reshape(3, 3)
+        parent[node], root[node] = above, root[above]
+        parent_arm[node] = frame.T @ (anchor - data.xpos[graph.body[above]])
+        arm[node] = model.jnt_pos[joints[0]]
+        chain[node] = chain[above]
+        chain[node, node] = 1
+    return Linkage(parent, parent_arm, arm, chain, root)
+
+
+def _pinned(model: mujoco.MjModel, joints: np.ndarray) -> bool:
+    turning = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
+    if len(joints) == 0 or not np.isin(model.jnt_type[joints], turning).all():
+        return False
+    return bool(np.abs(model.jnt_pos[joints] - model.jnt_pos[joints[0]]).max() < _TOLERANCE)
