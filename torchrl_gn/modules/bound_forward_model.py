@@ -11,18 +11,16 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.nn import functional as F
 
 from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.graph import Graph, graph_concat
+from torchrl_gn.modules.linking import Linking
 from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
     from torchrl_gn.modules.folded_core import FoldedCore
     from torchrl_gn.modules.forward_model import ForwardModel
     from torchrl_gn.scenes import Scene
-
-_BODY = ("position", "orientation", "linear_velocity", "angular_velocity")
 
 
 class UnseenFeatureWarning(UserWarning):
@@ -56,14 +54,6 @@ class BoundForwardModel(TensorDictModuleBase):
     edge_action: Tensor
     joint_node: Tensor
     joint_axis: Tensor
-    link_parent: Tensor
-    parent_arm: Tensor
-    arm: Tensor
-    chain: Tensor
-    linkage_mean: Tensor
-    linkage_root: Tensor
-    root_moves: Tensor
-    turning: Tensor
     rest: Tensor
     pivot: Tensor
     live: Tensor
@@ -105,17 +95,8 @@ class BoundForwardModel(TensorDictModuleBase):
         self.recenters = bool(model.recenter and invariant.any() and predicted.any())
         # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
         self._register("shifted", predicted[:, None] * invariant)
-        linkage = scene.linkage
-        self.links = bool(model.link and (linkage.parent != np.arange(scene.num_nodes)).any())
-        if self.links:
-            together = linkage.root[:, None] == linkage.root
-            for name, values in (("parent_arm", linkage.parent_arm), ("arm", linkage.arm), ("chain", linkage.chain)):
-                self._register(name, torch.as_tensor(values))
-            self._register("link_parent", torch.as_tensor(linkage.parent))
-            self._register("linkage_mean", torch.as_tensor(together / together.sum(1, keepdims=True)))
-            self._register("linkage_root", torch.as_tensor(np.eye(scene.num_nodes)[linkage.root]))
-            self._register("turning", torch.as_tensor(scene.live[:, 9:].ravel().nonzero()[0]))
-            self._register("root_moves", torch.as_tensor(scene.live[linkage.root, :3]))
+        pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
+        self.linking = Linking(scene) if model.link and pinned else None
         self.heading = scene.heading if model.align else None
         if self.heading is not None:
             self._register("rest", torch.as_tensor(self.heading.rest))
@@ -251,69 +232,9 @@ class BoundForwardModel(TensorDictModuleBase):
         if self.model.integrate:
             residual = self.layout.integrate(state, residual, self.timestep)
         delta = residual * self.live
-        return self._linked(state, delta) if self.links else delta
-
-    def _linked(self, state: Tensor, delta: Tensor) -> Tensor:
-        """Change that ends where every joint's pin is at one place, and moves at one speed, on both its bodies.
-
-        Of all such changes the nearest, in units of how much each component varies: by one Gauss-Newton
-        step on orientations and angular velocities, from which positions and velocities of
-        a linkage follow but for its own (the mean of its bodies', or its root's where that cannot move).
-        """
-        change = self.layout.delta_slices
-        shift, turn, push, spin = (delta[..., change[name]] for name in _BODY)
-        places, speeds, arms = self._pins(state, turn, spin)
-        moves = self._lever(*arms)  # [*B, 3 N, L]: how turning moves the bodies of a linkage
-        misses = torch.stack((self._gap(state, _BODY[0], shift, places), self._gap(state, _BODY[2], push, speeds)), -1)
-        scale = self.model.delta_normalizer.std.to(state.dtype)
-        ratio = scale[change[_BODY[3]]].square().sum() / scale[change[_BODY[2]]].square().sum().clamp(min=1e-30)
-        pull = ratio * moves.mT
-        normal = pull @ moves + torch.eye(moves.shape[-1], dtype=state.dtype, device=state.device)
-        better = self._spread(torch.linalg.solve(normal, pull @ misses.flatten(-3, -2)))
-        turn, spin = turn + better[..., 0], spin + better[..., 1]
-
-        places, speeds, _ = self._pins(state, turn, spin)
-        shift = shift - self._gap(state, _BODY[0], shift, places)
-        push = push - self._gap(state, _BODY[2], push, speeds)
-        return torch.cat((shift, turn, push, spin), dim=-1) * self.live
-
-    def _pins(self, state: Tensor, turn: Tensor, spin: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-        """Places and speeds ``[*B, N, 3]`` of bodies relative to their linkage's root, and the arms to their pins."""
-        at = self.layout.slices
-        orientation = quaternion.product(quaternion.exp(turn), state[..., at["orientation"]])
-        frame = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
-        speed = state[..., at["angular_velocity"]] + spin
-        upper = (frame[..., self.link_parent, :, :] @ self.parent_arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
-        lower = (frame @ self.arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
-        slip = torch.linalg.cross(speed[..., self.link_parent, :], upper) - torch.linalg.cross(speed, lower)
-        chain = self.chain.to(state.dtype)
-        return chain @ (upper - lower), chain @ slip, (upper, lower)
-
-    def _gap(self, state: Tensor, name: str, change: Tensor, along: Tensor) -> Tensor:
-        """How far a predicted position or velocity ``[*B, N, 3]`` is from where its linkage has it."""
-        start = state[..., self.layout.slices[name]] + change - along  # every body's opinion of its root's
-        mean, root = (matrix.to(state.dtype) for matrix in (self.linkage_mean, self.linkage_root))
-        return start - torch.where(self.root_moves, mean @ start, root @ start)
-
-    def _lever(self, upper: Tensor, lower: Tensor) -> Tensor:
-        """``[*B, 3 N, L]`` velocities of bodies about their linkage's own, for a unit of each live angular velocity."""
-        # Node i moves with every pin j on its way to the root: by parent's spin x upper less own spin x lower.
-        parents = F.one_hot(self.link_parent, self.scene.num_nodes).to(upper.dtype)
-        own = torch.eye(self.scene.num_nodes, dtype=upper.dtype, device=upper.device)
-        pins = own[..., None, None] * _cross(lower).unsqueeze(-3) - parents[..., None, None] * _cross(upper).unsqueeze(
-            -3
-        )
-        bodies = torch.einsum("ij,...jkab->...iakb", self.chain.to(upper.dtype), pins)
-        mean = self.linkage_mean.to(upper.dtype)
-        bodies = bodies - self.root_moves.to(upper.dtype)[:, :, None, None] * torch.einsum(
-            "ij,...jakb->...iakb", mean, bodies
-        )
-        return bodies.flatten(-2).flatten(-3, -2)[..., self.turning]
-
-    def _spread(self, values: Tensor) -> Tensor:
-        """``[*B, L, R]`` values of live angular components as ``[*B, N, 3, R]``."""
-        full = values.new_zeros(*values.shape[:-2], 3 * self.scene.num_nodes, values.shape[-1])
-        return full.index_copy(-2, self.turning, values).unflatten(-2, (-1, 3))
+        if self.linking is not None:
+            delta = self.linking(state, delta, self.model.delta_normalizer.std)
+        return delta
 
     def _residual(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
         """What the network predicts ``[*B, N, 12]``, in the local frame."""
@@ -433,10 +354,3 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"
-
-
-def _cross(v: Tensor) -> Tensor:
-    """Matrices ``[..., 3, 3]`` of the cross product with vectors ``[..., 3]``."""
-    x, y, z = v.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack((o, -z, y, z, o, -x, -y, x, o), -1).unflatten(-1, (3, 3))

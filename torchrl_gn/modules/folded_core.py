@@ -15,9 +15,7 @@ autograd, and gradients reach the core's weights as they do there; a specialised
 (:mod:`~torchrl_gn.modules.specialized_model`) folds once.
 
 Items lie first and samples second, ``[N, B, F]``, so that gathering and aggregating are
-products with small incidence matrices, and everything is matrix multiplication. A layer with
-several inputs is one autograd function (:class:`_Layer`) that accumulates into one buffer:
-on a CPU the passes over memory between the products would cost as much as the products.
+products with small incidence matrices, and everything is matrix multiplication.
 """
 
 from __future__ import annotations
@@ -33,6 +31,7 @@ from torch.nn import functional as F
 from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.gn_block import GraphSize
 from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.linear import linear, product
 
 Rows = Tensor | slice
 Columns = tuple[Tensor, Tensor]  # indices, and factors on what is there
@@ -105,12 +104,12 @@ class FoldedCore:
             ``[P, B, F_out]``.
         """
         count_n, count_e = nodes.shape[0], edges.shape[0]
-        ends = _product(self.ends, nodes)
+        ends = product(self.ends, nodes)
         ends = torch.cat((ends[:count_e], ends[count_e:], edges), dim=-1)
         everywhere = globals_.expand(count_e, -1, -1)
 
         edge_hidden = _hidden(self.first_edge, (ends, everywhere))
-        reduced = _product(self.reduce, edge_hidden)
+        reduced = product(self.reduce, edge_hidden)
         everywhere = globals_.expand(count_n, -1, -1)
         node_hidden = _hidden(self.first_node, (reduced[:count_n], nodes, everywhere))
         summed = (node_hidden.sum(0, keepdim=True), reduced[count_n:], globals_)
@@ -119,15 +118,15 @@ class FoldedCore:
         # Projected once a node or graph, then gathered by one product: senders, receivers, graph.
         projected = torch.cat(
             (
-                *(_linear(((node_hidden, weight),)) for weight in self.second_ends),
-                _linear(tuple(zip((global_hidden, globals_), self.second_globals, strict=True))),
+                *(linear(((node_hidden, weight),)) for weight in self.second_ends),
+                linear(tuple(zip((global_hidden, globals_), self.second_globals, strict=True))),
             )
         )
         inputs = (edge_hidden[self.kept], ends[self.kept])
         edge_hidden = _hidden(self.second_edge, inputs, self.gather, projected)
-        received = _product(self.reduce_last, edge_hidden)
+        received = product(self.reduce_last, edge_hidden)
 
-        graph = _linear(tuple(zip((global_hidden, globals_), self.last_globals, strict=True)))
+        graph = linear(tuple(zip((global_hidden, globals_), self.last_globals, strict=True)))
         moving, moving_hidden = nodes[self.predicted], node_hidden[self.predicted]
         ones = graph.new_ones(len(received), 1)
         hidden = _hidden(self.second_node, (received, moving, moving_hidden), ones, graph)
@@ -269,83 +268,12 @@ def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -
     )
 
 
-class _Layer(torch.autograd.Function):
-    """``relu(table + matrix @ items + sum_k x_k @ W_k.T)``, accumulated in one buffer.
-
-    Inputs: ``relu`` flag, ``table`` ``[I, 1 or B, h]`` or None, ``matrix`` ``[I, J]`` and ``items``
-    ``[J, B, h]`` or None, then pairs ``x_k`` ``[I, B, F_k]`` and ``W_k`` ``[h, F_k]``.
-    Output ``[I, B, h]``.
-    """
-
-    @staticmethod
-    def forward(relu, table, matrix, items, *pairs):
-        features, weights = pairs[::2], pairs[1::2]
-        count, batch = features[0].shape[:2]
-        flat = [x.reshape(count * batch, x.shape[-1]) for x in features]
-        start = 0
-        if items is None:
-            out = flat[0] @ weights[0].T
-            start = 1
-        else:
-            out = (matrix @ items.flatten(1)).view(count * batch, items.shape[-1])
-        for x, weight in zip(flat[start:], weights[start:], strict=True):
-            out.addmm_(x, weight.T)
-        shaped = out.view(count, batch, out.shape[-1])
-        if table is not None:
-            shaped.add_(table)
-        return shaped.relu_() if relu else shaped
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        relu, table, matrix, items, *pairs = inputs
-        ctx.relu, ctx.table_batch = relu, None if table is None else table.shape[1]
-        ctx.save_for_backward(output if relu else None, matrix, *pairs)
-
-    @staticmethod
-    def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
-        out, matrix, *pairs = ctx.saved_tensors
-        if ctx.relu:
-            grad = torch.ops.aten.threshold_backward(grad, out, 0)
-        count, batch, size = grad.shape
-        flat_grad = grad.reshape(count * batch, size)
-        needs = ctx.needs_input_grad
-        table = items = None
-        if needs[1]:
-            table = grad.sum(1, keepdim=True) if ctx.table_batch == 1 else grad
-        if matrix is not None and needs[3]:
-            items = (matrix.T @ flat_grad.view(count, batch * size)).view(matrix.shape[1], batch, size)
-        gradients = []
-        for index, (x, weight) in enumerate(zip(pairs[::2], pairs[1::2], strict=True)):
-            gradients.append((flat_grad @ weight).view(x.shape) if needs[4 + 2 * index] else None)
-            gradients.append(flat_grad.T @ x.reshape(len(flat_grad), x.shape[-1]) if needs[5 + 2 * index] else None)
-        return None, table, None, items, *gradients
-
-
-def _plain_layer(relu, table, matrix, items, *pairs):
-    """:class:`_Layer` in single operations, for a compiler to fuse."""
-    terms = [F.linear(x, weight) for x, weight in zip(pairs[::2], pairs[1::2], strict=True)]
-    if items is not None:
-        terms.append(_product(matrix, items))
-    if table is not None:
-        terms.append(table)
-    out = terms[0]
-    for term in terms[1:]:
-        out = out + term
-    return F.relu(out) if relu else out
-
-
-def _linear(pairs, table=None, matrix=None, items=None, relu: bool = False) -> Tensor:
-    used = [tensor for pair in pairs if pair[0].shape[-1] for tensor in pair]
-    layer = _plain_layer if torch.compiler.is_compiling() else _Layer.apply
-    return layer(relu, table, matrix, items, *used)
-
-
 def _hidden(factors: Factors, inputs, matrix=None, items=None) -> Tensor:
     """Last hidden activation of an MLP whose first layer is given by its factors."""
     pairs = tuple(zip(inputs, factors.weights, strict=True))
-    hidden = _linear(pairs, factors.table, matrix, items, relu=True)
+    hidden = linear(pairs, factors.table, matrix, items, relu=True)
     for weight, bias in factors.hidden:
-        hidden = _linear(((hidden, weight),), bias.expand(hidden.shape[0], 1, -1), relu=True)
+        hidden = linear(((hidden, weight),), bias.expand(hidden.shape[0], 1, -1), relu=True)
     return hidden
 
 
@@ -423,8 +351,3 @@ def _last_layer(mlp: nn.Sequential) -> tuple[Tensor, Tensor]:
     layer = mlp[-1]
     assert isinstance(layer, nn.Linear)
     return layer.weight, layer.bias
-
-
-def _product(matrix: Tensor, items: Tensor) -> Tensor:
-    """``[M, I]`` times ``[I, B, F]``: weighted sums of items, ``[M, B, F]``."""
-    return (matrix @ items.flatten(1)).view(matrix.shape[0], *items.shape[1:])

@@ -1,0 +1,99 @@
+"""Layers with several inputs, items first and samples second, as one autograd function.
+
+On a CPU the passes over memory between the products of a layer would cost as much as
+the products: :class:`_Layer` accumulates them into one buffer.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+
+def linear(pairs, table=None, matrix=None, items=None, relu: bool = False) -> Tensor:
+    """``relu(table + matrix @ items + sum_k x_k @ W_k.T)``; any part may be missing.
+
+    Args:
+        pairs: ``x_k`` ``[I, B, F_k]`` with ``W_k`` ``[h, F_k]``; those without features are left out.
+        table: ``[I, 1 or B, h]``.
+        matrix: ``[I, J]``.
+        items: ``[J, B, h]``.
+        relu: whether to apply a ReLU.
+
+    Returns:
+        ``[I, B, h]``.
+    """
+    used = [tensor for pair in pairs if pair[0].shape[-1] for tensor in pair]
+    layer = _plain_layer if torch.compiler.is_compiling() else _Layer.apply
+    return layer(relu, table, matrix, items, *used)
+
+
+def product(matrix: Tensor, items: Tensor) -> Tensor:
+    """``[M, I]`` times ``[I, B, F]``: weighted sums of items, ``[M, B, F]``."""
+    return (matrix @ items.flatten(1)).view(matrix.shape[0], *items.shape[1:])
+
+
+class _Layer(torch.autograd.Function):
+    """``relu(table + matrix @ items + sum_k x_k @ W_k.T)``, accumulated in one buffer.
+
+    Inputs: ``relu`` flag, ``table`` ``[I, 1 or B, h]`` or None, ``matrix`` ``[I, J]`` and ``items``
+    ``[J, B, h]`` or None, then pairs ``x_k`` ``[I, B, F_k]`` and ``W_k`` ``[h, F_k]``.
+    Output ``[I, B, h]``.
+    """
+
+    @staticmethod
+    def forward(relu, table, matrix, items, *pairs):
+        features, weights = pairs[::2], pairs[1::2]
+        count, batch = features[0].shape[:2]
+        flat = [x.reshape(count * batch, x.shape[-1]) for x in features]
+        start = 0
+        if items is None:
+            out = flat[0] @ weights[0].T
+            start = 1
+        else:
+            out = (matrix @ items.flatten(1)).view(count * batch, items.shape[-1])
+        for x, weight in zip(flat[start:], weights[start:], strict=True):
+            out.addmm_(x, weight.T)
+        shaped = out.view(count, batch, out.shape[-1])
+        if table is not None:
+            shaped.add_(table)
+        return shaped.relu_() if relu else shaped
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        relu, table, matrix, items, *pairs = inputs
+        ctx.relu, ctx.table_batch = relu, None if table is None else table.shape[1]
+        ctx.save_for_backward(output if relu else None, matrix, *pairs)
+
+    @staticmethod
+    def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
+        out, matrix, *pairs = ctx.saved_tensors
+        if ctx.relu:
+            grad = torch.ops.aten.threshold_backward(grad, out, 0)
+        count, batch, size = grad.shape
+        flat_grad = grad.reshape(count * batch, size)
+        needs = ctx.needs_input_grad
+        table = items = None
+        if needs[1]:
+            table = grad.sum(1, keepdim=True) if ctx.table_batch == 1 else grad
+        if matrix is not None and needs[3]:
+            items = (matrix.T @ flat_grad.view(count, batch * size)).view(matrix.shape[1], batch, size)
+        gradients = []
+        for index, (x, weight) in enumerate(zip(pairs[::2], pairs[1::2], strict=True)):
+            gradients.append((flat_grad @ weight).view(x.shape) if needs[4 + 2 * index] else None)
+            gradients.append(flat_grad.T @ x.reshape(len(flat_grad), x.shape[-1]) if needs[5 + 2 * index] else None)
+        return None, table, None, items, *gradients
+
+
+def _plain_layer(relu, table, matrix, items, *pairs):
+    """:class:`_Layer` in single operations, for a compiler to fuse."""
+    terms = [F.linear(x, weight) for x, weight in zip(pairs[::2], pairs[1::2], strict=True)]
+    if items is not None:
+        terms.append(product(matrix, items))
+    if table is not None:
+        terms.append(table)
+    out = terms[0]
+    for term in terms[1:]:
+        out = out + term
+    return F.relu(out) if relu else out

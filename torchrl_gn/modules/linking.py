@@ -1,0 +1,154 @@
+"""Predicted changes that keep bodies together where joints pin them together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchrl_gn.modules import quaternion
+from torchrl_gn.modules.state_layout import BODY_STATE
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes import Scene
+
+_PARTS = ("position", "orientation", "linear_velocity", "angular_velocity")
+
+
+class Linking(nn.Module):
+    """Settle what is predicted for bodies that are pinned together.
+
+    The network predicts every body on its own, but a pin is at one place, and moves at one speed,
+    on both bodies that it joins. Of all changes that keep every pin together the nearest
+    to the prediction is taken, in units of how much each component varies: one Gauss-Newton step of
+    least squares on orientations and angular velocities. Positions and velocities follow from the
+    joints exactly, but for those of each linkage as a whole, which are the mean of its bodies' (or
+    stay the root's where it cannot move).
+
+    Paper: bodies are predicted alone and drift apart.
+
+    Args:
+        scene: whose joints these are (:attr:`Scene.linkage <torchrl_gn.scenes.Scene>`).
+    """
+
+    parent: Tensor
+    parent_arm: Tensor
+    arm: Tensor
+    chain: Tensor
+    mean: Tensor
+    root: Tensor
+    root_moves: Tensor
+    turning: Tensor
+    levers: Tensor
+    live: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        linkage = scene.linkage
+        together = linkage.root[:, None] == linkage.root
+        values = {
+            "parent": linkage.parent,
+            "parent_arm": linkage.parent_arm,
+            "arm": linkage.arm,
+            "chain": linkage.chain,
+            "mean": together / together.sum(1, keepdims=True),
+            "root": np.eye(scene.num_nodes)[linkage.root],
+            "root_moves": scene.live[linkage.root, :3],
+            "turning": scene.live[:, 9:].ravel().nonzero()[0],
+            "live": scene.live,
+        }
+        for name, value in values.items():
+            self.register_buffer(name, torch.as_tensor(value), persistent=False)
+        self.register_buffer("levers", self._levers(), persistent=False)
+
+    def _apply(self, fn, recurse: bool = True):
+        # Geometry keeps float64 whatever the network is cast to: only the device follows.
+        def keep_dtype(tensor: Tensor) -> Tensor:
+            applied = fn(tensor)
+            return applied if applied.dtype == tensor.dtype else tensor.to(applied.device)
+
+        return super()._apply(keep_dtype, recurse)
+
+    def forward(self, state: Tensor, delta: Tensor, std: Tensor) -> Tensor:
+        """The nearest change that keeps pins together.
+
+        Args:
+            state: ``[*B, N, 13]``.
+            delta: ``[*B, N, 12]`` predicted change.
+            std: ``[12]`` how much each channel of a change varies.
+
+        Returns:
+            ``[*B, N, 12]``, zero in dead components; ``delta`` itself where nothing is apart.
+        """
+        shift, turn, push, spin = delta.split(3, dim=-1)
+        places, speeds, arms = self.pins(state, turn, spin)
+        # [*B, 3 N, L]: how turning moves the bodies of a linkage, linear in the arms.
+        moves = (arms.flatten(-3) @ self.levers.to(state.dtype)).unflatten(-1, (-1, len(self.turning)))
+        apart = self._gap(state, _PARTS[0], shift, places)
+        misses = torch.stack((apart, self._gap(state, _PARTS[2], push, speeds)), -1)
+        ratio = (std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)).to(state.dtype)
+        pull = ratio * moves.mT
+        normal = pull @ moves + torch.eye(moves.shape[-1], dtype=state.dtype, device=state.device)
+        better = self._spread(torch.linalg.solve(normal, pull @ misses.flatten(-3, -2)))
+        turn, spin = turn + better[..., 0], spin + better[..., 1]
+
+        places, speeds, _ = self.pins(state, turn, spin)
+        shift = shift - self._gap(state, _PARTS[0], shift, places)
+        push = push - self._gap(state, _PARTS[2], push, speeds)
+        return torch.cat((shift, turn, push, spin), dim=-1) * self.live
+
+    def pins(self, state: Tensor, turn: Tensor, spin: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Where pins put the bodies after a change of orientations and angular velocities.
+
+        Args:
+            state: ``[*B, N, 13]``.
+            turn: ``[*B, N, 3]`` rotation vectors.
+            spin: ``[*B, N, 3]`` changes of angular velocity.
+
+        Returns:
+            Places and speeds ``[*B, N, 3]`` relative to each linkage's root, and the arms
+            ``[*B, 2, N, 3]`` from each pin's upper and lower body to it, all in the world frame.
+        """
+        at = BODY_STATE.slices
+        orientation = quaternion.product(quaternion.exp(turn), state[..., at["orientation"]])
+        frame = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
+        speed = state[..., at["angular_velocity"]] + spin
+        upper = (frame[..., self.parent, :, :] @ self.parent_arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
+        lower = (frame @ self.arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
+        slip = torch.linalg.cross(speed[..., self.parent, :], upper) - torch.linalg.cross(speed, lower)
+        chain = self.chain.to(state.dtype)
+        return chain @ (upper - lower), chain @ slip, torch.stack((upper, lower), dim=-3)
+
+    def _gap(self, state: Tensor, name: str, change: Tensor, along: Tensor) -> Tensor:
+        """How far a predicted position or velocity ``[*B, N, 3]`` is from where its linkage has it."""
+        start = state[..., BODY_STATE.slices[name]] + change - along  # every body's opinion of its root's
+        mean, root = self.mean.to(state.dtype), self.root.to(state.dtype)
+        return start - torch.where(self.root_moves, mean @ start, root @ start)
+
+    def _levers(self) -> Tensor:
+        """``[6 N, 3 N L]``: velocities of bodies about their linkage's own for each live angular velocity, by arm."""
+        count = len(self.parent)
+        upper, lower = torch.eye(6 * count, dtype=torch.float64).view(-1, 2, count, 3).unbind(1)
+        upper, lower = _cross(upper).unsqueeze(-3), _cross(lower).unsqueeze(-3)  # [6 N, N, 1, 3, 3]
+        parents, own = F.one_hot(self.parent, count).double(), torch.eye(count, dtype=torch.float64)
+        # Node i moves with every pin j on its way to the root: by parent's spin x upper less own spin x lower.
+        pins = own[..., None, None] * lower - parents[..., None, None] * upper
+        bodies = torch.einsum("ij,...jkab->...iakb", self.chain, pins)
+        means = torch.einsum("ij,...jakb->...iakb", self.mean, bodies)
+        bodies = bodies - self.root_moves.double()[:, :, None, None] * means
+        return bodies.flatten(-2).flatten(-3, -2)[..., self.turning].flatten(1)
+
+    def _spread(self, values: Tensor) -> Tensor:
+        """``[*B, L, R]`` values of live angular components as ``[*B, N, 3, R]``."""
+        full = values.new_zeros(*values.shape[:-2], 3 * len(self.parent), values.shape[-1])
+        return full.index_copy(-2, self.turning, values).unflatten(-2, (-1, 3))
+
+
+def _cross(v: Tensor) -> Tensor:
+    """Matrices ``[..., 3, 3]`` of the cross product with vectors ``[..., 3]``."""
+    x, y, z = v.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack((o, -z, y, z, o, -x, -y, x, o), -1).unflatten(-1, (3, 3))
