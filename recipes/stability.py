@@ -4,8 +4,8 @@
     python recipes/stability.py system=swimmer6 minutes=2
 
 Without a checkpoint a model is trained first. Every check gives one figure for each dtype of the network (states are
-float64) and has a limit that it can fail; the recipe ends with exit code 1 if one does. Takes about three
-minutes; results and what each check means: docs/performance.md.
+float64) and has a limit that it can fail; the recipe ends with exit code 1 if one does (limits=false: with 0).
+Takes about three minutes; results: docs/performance.md.
 
 Writes config.yaml, metrics.json and, if it trains one, the model to its run folder.
 """
@@ -300,7 +300,7 @@ def main(cfg: DictConfig) -> None:
     print("\n".join(lines))
     for path in run.written:
         print(path)
-    if failed:
+    if failed and cfg.limits:
         raise ValueError(f"{len(failed)} checks failed: " + "; ".join(failed))
 
 

@@ -114,6 +114,14 @@ def test_any_batch(scenes, make_model, random_states, random_actions, batch):
     torch.testing.assert_close(specialize(bound).step(state, action), bound.step(state, action), rtol=0, atol=1e-12)
 
 
+def test_a_model_that_has_seen_nothing(scenes, make_model, random_states, random_actions):
+    """Without statistics no input varies and nothing is predicted to change but what the rates explain."""
+    scene = scenes["swimmer6"]
+    bound = make_model(scene, fitted=False).bind(scene)
+    state, action = random_states(scene, 3), random_actions(scene, 3)
+    assert torch.equal(specialize(bound).step(state, action), bound.step(state, action))
+
+
 def test_far_from_the_origin_nothing_is_lost(scenes, make_model, random_states, random_actions):
     scene = scenes["swimmer6"]
     bound = make_model(scene).bind(scene)

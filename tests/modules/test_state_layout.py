@@ -209,3 +209,9 @@ def test_the_papers_encoding_is_the_state():
 def test_layouts_that_make_no_sense_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_where_channels_lie_is_known_from_the_start():
+    """The compiler cannot trace the first use of a cached property."""
+    layout = StateLayout((Component("angle", 2, "circle"),))
+    assert {"size", "delta_size", "slices", "delta_slices"} <= layout.__dict__.keys()

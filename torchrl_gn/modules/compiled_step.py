@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -60,12 +61,18 @@ class _Differentiable(torch.autograd.Function):
 
 
 def _compile(function: Callable) -> Callable:
+    # Small linear systems are solved through Python's fallback; the user need not know.
+    logging.getLogger("torch._inductor.ir").addFilter(_is_news)
     options: dict[str, Any] = {"fullgraph": True, "dynamic": False, "recompile_limit": 1000, "isolate_recompiles": True}
     if not torch.cuda.is_available():
         # The kernels of a small graph take less time than calling them from Python.
         options["options"] = {"cpp_wrapper": True}
     known = inspect.signature(torch.compile).parameters  # two of them are newer than torch 2.11
     return torch.compile(function, **{name: value for name, value in options.items() if name in known})
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    return "missing a c-shim implementation" not in record.getMessage()
 
 
 def check_compiler() -> None:

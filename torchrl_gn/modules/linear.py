@@ -25,6 +25,9 @@ def linear(pairs, table=None, matrix=None, items=None, relu: bool = False) -> Te
         ``[I, B, h]``.
     """
     used = [tensor for pair in pairs if pair[0].shape[-1] for tensor in pair]
+    if not used and items is None and table is not None:  # nothing varies
+        out = table.expand(-1, pairs[0][0].shape[1], -1)
+        return F.relu(out) if relu else out
     layer = _plain_layer if torch.compiler.is_compiling() else _Layer.apply
     return layer(relu, table, matrix, items, *used)
 

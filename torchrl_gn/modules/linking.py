@@ -92,7 +92,9 @@ class Linking(nn.Module):
         ratio = (std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)).to(state.dtype)
         pull = ratio * moves.mT
         normal = pull @ moves + torch.eye(moves.shape[-1], dtype=state.dtype, device=state.device)
-        better = self._spread(torch.linalg.solve(normal, pull @ misses.flatten(-3, -2)))
+        # At least the identity: never singular, so nothing needs to be checked.
+        solved, _ = torch.linalg.solve_ex(normal, pull @ misses.flatten(-3, -2))
+        better = self._spread(solved)
         turn, spin = turn + better[..., 0], spin + better[..., 1]
 
         places, speeds, _ = self.pins(state, turn, spin)

@@ -82,6 +82,8 @@ class StateLayout:
                 raise ValueError(f"Rate {rate.name!r} of {component.name!r} must have kind 'add' and no rate itself.")
             if rate.delta_size != component.delta_size:
                 raise ValueError(f"Component {component.name!r} and its rate {component.rate!r} differ in size.")
+        # Known before anything is compiled: the compiler cannot trace their first use.
+        _ = self.size, self.delta_size, self.slices, self.delta_slices
 
     @property
     def names(self) -> tuple[str, ...]:
