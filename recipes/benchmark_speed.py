@@ -17,11 +17,13 @@ Writes config.yaml, metrics.json and with curves the figure speed.png to its run
 from __future__ import annotations
 
 import contextlib
+import copy
+import functools
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import cast
+from typing import TypeVar, cast
 
 import hydra
 import torch
@@ -30,12 +32,14 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from torchrl_gn.data import collect_trajectories
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.evaluation import plot_loglog
 from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, fast_matmul, specialize
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, clean_exit, make_optimizer
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,6 @@ class Way:
 
     model: BoundForwardModel
     fast: bool = False
-    compiled: bool = False
 
 
 @dataclass
@@ -59,16 +62,19 @@ class Work:
     errors: dict[str, float] = field(default_factory=dict)
 
 
+def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
+    """What ``run`` gives, and the seconds it takes, with oneDNN's products if ``fast``."""
+    with fast_matmul() if fast else contextlib.nullcontext():
+        start = time.perf_counter()
+        result = run()
+        return result, time.perf_counter() - start
+
+
 def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[ForwardModel, TensorDict]:
     """Random weights with the normalisers of a short collection, and its transitions."""
     scene = load_scene(system)
     trajectories = collect_trajectories(scene, 64, 64, cfg.seed)
-    batch = {
-        "state": trajectories["state"][:, :-1].flatten(0, 1),
-        "action": trajectories["action"].flatten(0, 1),
-        "next": {"state": trajectories["state"][:, 1:].flatten(0, 1)},
-    }
-    transitions = TensorDict(batch, [64 * 64])[torch.randperm(64 * 64)]
+    transitions = cast(TensorDict, trajectory_buffer(trajectories, batch_size=64 * 64, seed=cfg.seed).sample())
     torch.manual_seed(cfg.seed)
     sizes = {"edge_hidden": hidden, "node_hidden": hidden, "global_hidden": hidden, "latent": cfg.latent}
     model = ForwardModel(FeatureSet.of(scene), **sizes)
@@ -90,9 +96,9 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
     }
     if cfg.compile:
         compiled = specialize(bound, compile=True)
-        ways["compiled"] = Way(compiled, compiled=True)
-        ways["compiled, fast"] = Way(compiled, fast=True, compiled=True)
-        ways["compiled, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, compile=True), compiled=True)
+        ways["compiled"] = Way(compiled)
+        ways["compiled, fast"] = Way(compiled, fast=True)
+        ways["compiled, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, compile=True))
     return ways
 
 
@@ -148,10 +154,7 @@ def measure(works: list[Work], ways: dict[str, Way], reference: BoundForwardMode
         expected = None if reference is None else work.run(Way(reference))
         for turn in range(work.repeats + 1):
             for name, way in ways.items():
-                with fast_matmul() if way.fast else contextlib.nullcontext():
-                    start = time.perf_counter()
-                    result = work.run(way)
-                    seconds = time.perf_counter() - start
+                result, seconds = timed(functools.partial(work.run, way), way.fast)
                 bar.update()
                 if turn == 0:  # warms up, compiles
                     if name == "compiled":
@@ -182,12 +185,7 @@ def train_work(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
 def gemm_rate(rows: int, size: int, dtype: torch.dtype, fast: bool, repeats: int) -> float:
     """FLOP/s of a product as large as the model's largest."""
     a, b = torch.randn(rows, size).to(dtype), torch.randn(size, size).to(dtype)
-    seconds = []
-    with fast_matmul() if fast else contextlib.nullcontext():
-        for _ in range(repeats + 1):
-            start = time.perf_counter()
-            torch.mm(a, b)
-            seconds.append(time.perf_counter() - start)
+    seconds = [timed(functools.partial(torch.mm, a, b), fast)[1] for _ in range(repeats + 1)]
     return 2 * rows * size * size / statistics.median(seconds[1:])
 
 
@@ -222,12 +220,9 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
         }
         state, action = transitions["state"][:batch], transitions["action"][:batch]
         for name, way in ways.items():
-            seconds = []
-            with torch.no_grad(), fast_matmul() if way.fast else contextlib.nullcontext():
-                for _ in range(max(4, cfg.repeats // 2)):
-                    start = time.perf_counter()
-                    way.model.step(state, action)
-                    seconds.append(time.perf_counter() - start)
+            step = functools.partial(way.model.step, state, action)
+            with torch.no_grad():
+                seconds = [timed(step, way.fast)[1] for _ in range(max(4, cfg.repeats // 2))]
             line = panels.setdefault(panel, {}).setdefault(name, ([], []))
             line[0].append(x)
             line[1].append(1e3 * statistics.median(seconds[1:]))
@@ -244,9 +239,7 @@ def main(cfg: DictConfig) -> None:
     model, transitions = make_model(cfg, cfg.system, list(cfg.hidden))
     ways, works = make_ways(cfg, model, cfg.system), make_works(cfg, model, transitions)
     model.requires_grad_(False)
-    exact, _ = make_model(cfg, cfg.system, list(cfg.hidden))
-    exact.load_state_dict(model.state_dict())
-    reference = exact.double().requires_grad_(False).bind(load_scene(cfg.system), plain=True)
+    reference = copy.deepcopy(model).double().bind(load_scene(cfg.system), plain=True)
     compile_seconds = measure(works, ways, reference)
     model.requires_grad_(True)
     training = train_work(cfg, model, transitions)

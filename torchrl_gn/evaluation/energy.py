@@ -31,14 +31,11 @@ def kinetic_energy(state: Tensor, scene: Scene) -> Tensor:
     def feature(name: str, size: int) -> Tensor:
         return torch.stack([columns[f"{name}[{index}]"] for index in range(size)], -1).to(state)
 
-    def turn(q: Tensor, v: Tensor) -> Tensor:
-        return (quaternion.to_matrix(q).unflatten(-1, (3, 3)) @ v.unsqueeze(-1)).squeeze(-1)
-
     mass, moves = columns["mass"].to(state), torch.as_tensor(scene.predicted).to(state)
     orientation, linear, angular = state[..., 3:7], state[..., 7:10], state[..., 10:13]
-    arm = turn(orientation, feature("ipos", 3).expand_as(linear))
+    arm = quaternion.rotate(orientation, feature("ipos", 3))
     velocity = linear + torch.linalg.cross(angular, arm)
     principal = quaternion.product(orientation, feature("iquat", 4))
-    spin = turn(quaternion.conjugate(principal), angular)
+    spin = quaternion.rotate(quaternion.conjugate(principal), angular)
     energy = mass * velocity.square().sum(-1) + (feature("inertia", 3) * spin.square()).sum(-1)
     return 0.5 * (energy * moves).sum(-1)

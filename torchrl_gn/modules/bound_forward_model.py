@@ -312,8 +312,8 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def _joint_axes(self, state: Tensor) -> Tensor:
         """Axes of the joints ``[*B, E, 3]`` in the frame of the state."""
-        rotation = quaternion.to_matrix(state[..., self.joint_node, self.layout.slices["orientation"]])
-        return (rotation.unflatten(-1, (3, 3)) @ self.joint_axis.to(state.dtype).unsqueeze(-1)).squeeze(-1)
+        orientation = state[..., self.joint_node, self.layout.slices["orientation"]]
+        return quaternion.rotate(orientation, self.joint_axis.to(state.dtype))
 
     def _check_shapes(self, state: Tensor, action: Tensor) -> None:
         item = (self.scene.num_nodes, self.layout.size)

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_gn.modules import quaternion
+from torchrl_gn.modules.float64_buffers import Float64Buffers
 from torchrl_gn.modules.state_layout import BODY_STATE
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 _PARTS = ("position", "orientation", "linear_velocity", "angular_velocity")
 
 
-class Linking(nn.Module):
+class Linking(Float64Buffers):
     """Settle what is predicted for bodies that are pinned together.
 
     The network predicts every body on its own, but a pin is at one place, and moves at one speed,
@@ -63,14 +64,6 @@ class Linking(nn.Module):
         for name, value in values.items():
             self.register_buffer(name, torch.as_tensor(value), persistent=False)
         self.register_buffer("levers", self._levers(), persistent=False)
-
-    def _apply(self, fn, recurse: bool = True):
-        # Geometry keeps float64 whatever the network is cast to: only the device follows.
-        def keep_dtype(tensor: Tensor) -> Tensor:
-            applied = fn(tensor)
-            return applied if applied.dtype == tensor.dtype else tensor.to(applied.device)
-
-        return super()._apply(keep_dtype, recurse)
 
     def forward(self, state: Tensor, delta: Tensor, std: Tensor) -> Tensor:
         """The nearest change that keeps pins together.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from torchrl_gn.modules.float64_buffers import Float64Buffers
 
 
-class Normalizer(nn.Module):
+class Normalizer(Float64Buffers):
     """Scale features to zero mean and unit variance (paper, SM "Data normalization").
 
     Statistics are one count, mean and sum of squared deviations a feature, shared
@@ -43,14 +45,6 @@ class Normalizer(nn.Module):
     def constant(self) -> Tensor:
         """``[F]`` bool, features that never varied in what was seen."""
         return self.std == 0
-
-    def _apply(self, fn, recurse: bool = True):
-        # Statistics keep float64 whatever the network is cast to: only the device follows.
-        def keep_dtype(tensor: Tensor) -> Tensor:
-            applied = fn(tensor)
-            return applied if applied.dtype == tensor.dtype else tensor.to(applied.device)
-
-        return super()._apply(keep_dtype, recurse)
 
     @torch.no_grad()
     def update(self, features: Tensor, mask: Tensor | None = None) -> None:

@@ -139,3 +139,16 @@ def to_matrix(q: Tensor) -> Tensor:
         ),
         dim=-1,
     )
+
+
+def rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Vectors turned by quaternions.
+
+    Args:
+        q: ``[..., 4]`` quaternions.
+        v: ``[..., 3]`` vectors, broadcast against ``q``.
+
+    Returns:
+        ``[..., 3]`` vectors.
+    """
+    return (to_matrix(q).unflatten(-1, (3, 3)) @ v.unsqueeze(-1)).squeeze(-1)

@@ -42,7 +42,6 @@ def find_linkage(model: mujoco.MjModel, graph: Topology) -> Linkage:
     """
     count = len(graph.body)
     data = mujoco.MjData(model)
-    data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
     parent, root = np.arange(count), np.arange(count)
     parent_arm, arm, chain = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, count))

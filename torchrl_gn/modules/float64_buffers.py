@@ -1,0 +1,16 @@
+"""Modules whose buffers keep their dtype."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+
+class Float64Buffers(nn.Module):
+    """Module whose tensors keep their dtype whatever a network around it is cast to: only the device follows."""
+
+    def _apply(self, fn, recurse: bool = True):
+        def keep_dtype(tensor: Tensor) -> Tensor:
+            applied = fn(tensor)
+            return applied if applied.dtype == tensor.dtype else tensor.to(applied.device)
+
+        return super()._apply(keep_dtype, recurse)
