@@ -8,8 +8,8 @@ true static features) as it is evaluated in different ways: `plain` (PyG message
 products and `torch.compile`. Each way does each piece of work in turn, several times; the table shows medians,
 speed-ups over `plain` and errors against the plain model in float64. The share of the limit is that of the
 specialised model's FLOPs at the rate of a large matrix product measured beside it. `curves=true` draws the cost of
-a step over links, batch sizes and hidden sizes. Takes about ten minutes, half of it compiling; results:
-docs/performance.md.
+a step over links, batch sizes and hidden sizes, and of a rollout's gradient over its length. Takes about ten
+minutes, half of it compiling; results: docs/performance.md.
 
 Writes config.yaml, metrics.json and with curves the figure speed.png to its run folder.
 """
@@ -18,11 +18,14 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import ctypes
 import functools
+import math
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeVar, cast
 
 import hydra
@@ -60,6 +63,24 @@ class Work:
     repeats: int = 9
     milliseconds: dict[str, list[float]] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
+    megabytes: dict[str, float] = field(default_factory=dict)
+
+
+def peak_memory(run: Callable[[], object]) -> float:
+    """Most memory that ``run`` takes beyond what was taken before, in MB; NaN where Linux does not tell."""
+
+    def resident(name: str) -> int:
+        status = Path("/proc/self/status").read_text()
+        return int(next(line for line in status.splitlines() if line.startswith(name)).split()[1])
+
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # gives back what is free
+        Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
+    except (OSError, AttributeError):
+        return math.nan
+    before = resident("VmRSS")
+    run()
+    return (resident("VmHWM") - before) / 1024
 
 
 def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
@@ -76,7 +97,8 @@ def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[Forward
     trajectories = collect_trajectories(scene, 64, 64, cfg.seed)
     transitions = cast(TensorDict, trajectory_buffer(trajectories, batch_size=64 * 64, seed=cfg.seed).sample())
     torch.manual_seed(cfg.seed)
-    sizes = {"edge_hidden": hidden, "node_hidden": hidden, "global_hidden": hidden, "latent": cfg.latent}
+    edges = hidden if cfg.edge_hidden is None else list(cfg.edge_hidden)
+    sizes = {"edge_hidden": edges, "node_hidden": hidden, "global_hidden": hidden, "latent": cfg.latent}
     model = ForwardModel(FeatureSet.of(scene), **sizes)
     ForwardModelLoss(model.bind(scene)).fit_normalizers(transitions)
     return model, transitions
@@ -102,6 +124,20 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
     return ways
 
 
+@torch.no_grad()
+def step_once(model: BoundForwardModel, state: Tensor, action: Tensor) -> Tensor:
+    """Next state."""
+    return model.step(state, action)
+
+
+def pull(model: BoundForwardModel, state: Tensor, actions: Tensor) -> Tensor:
+    """Gradient of a rollout to its actions."""
+    leaf = actions.clone().requires_grad_()
+    model.rollout(state, leaf)[..., :3].square().sum().backward()
+    assert leaf.grad is not None
+    return leaf.grad
+
+
 def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) -> list[Work]:
     """The work of the table, but for the training step."""
 
@@ -114,8 +150,7 @@ def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
         state, actions = first(batch)
 
         def run(way: Way) -> Tensor:
-            with torch.no_grad():
-                return way.model.step(state, actions[:, 0]) - state
+            return step_once(way.model, state, actions[:, 0]) - state
 
         return Work(f"step, batch {batch}", run, repeats=cfg.repeats)
 
@@ -132,10 +167,7 @@ def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
         state, actions = first(batch, horizon)
 
         def run(way: Way) -> Tensor:
-            leaf = actions.clone().requires_grad_()
-            way.model.rollout(state, leaf)[..., :3].square().sum().backward()
-            assert leaf.grad is not None
-            return leaf.grad
+            return pull(way.model, state, actions)
 
         return Work(f"gradient of {horizon}, batch {batch}", run, horizon, cfg.repeats)
 
@@ -163,6 +195,8 @@ def measure(works: list[Work], ways: dict[str, Way], reference: BoundForwardMode
                         work.errors[name] = float((result - expected).norm() / expected.norm())
                 else:
                     work.milliseconds.setdefault(name, []).append(1e3 * seconds / work.steps)
+        for name, way in ways.items():
+            work.megabytes[name] = peak_memory(functools.partial(timed, functools.partial(work.run, way), way.fast))
     bar.close()
     return compile_seconds
 
@@ -205,11 +239,12 @@ def limits(cfg: DictConfig, ways: dict[str, Way], work: Work, batch: int) -> dic
 
 
 def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float]]]]:
-    """Milliseconds of a step against links, batch and hidden size, plain and specialised."""
+    """Milliseconds of a step against links, batch and hidden size, and of gradients against horizons."""
     panels: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
     points = [("links, batch 100", f"swimmer{links}", 100, 128, links) for links in cfg.curve_links]
     points += [("batch", cfg.system, batch, 128, batch) for batch in cfg.curve_batches]
     points += [("hidden size, batch 100", cfg.system, 100, hidden, hidden) for hidden in cfg.curve_hidden]
+    points += [("horizon, batch 100, with gradient", cfg.system, 100, 128, steps) for steps in cfg.curve_horizons]
     for panel, system, batch, hidden, x in tqdm(points, desc="curves", leave=False):
         model, transitions = make_model(cfg, system, [hidden, hidden])
         bound = model.bind(load_scene(system))
@@ -218,11 +253,14 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
             "specialised": Way(specialize(bound)),
             "specialised, fast": Way(specialize(bound), fast=True),
         }
+        model.requires_grad_(False)
         state, action = transitions["state"][:batch], transitions["action"][:batch]
         for name, way in ways.items():
-            step = functools.partial(way.model.step, state, action)
-            with torch.no_grad():
-                seconds = [timed(step, way.fast)[1] for _ in range(max(4, cfg.repeats // 2))]
+            if panel.startswith("horizon"):
+                run = functools.partial(pull, way.model, state, action.unsqueeze(1).expand(-1, x, -1))
+            else:
+                run = functools.partial(step_once, way.model, state, action)
+            seconds = [timed(run, way.fast)[1] for _ in range(max(4, cfg.repeats // 2))]
             line = panels.setdefault(panel, {}).setdefault(name, ([], []))
             line[0].append(x)
             line[1].append(1e3 * statistics.median(seconds[1:]))
@@ -246,7 +284,10 @@ def main(cfg: DictConfig) -> None:
     measure([training], {name: way for name, way in ways.items() if "plain" in name or "folded" in name}, None)
 
     print(ways["specialised"].model)
-    print(f"\nMilliseconds a step, median of {cfg.repeats}, {cfg.threads} threads; speed-up over plain; error")
+    print(
+        f"\nMilliseconds a step, median of {cfg.repeats}, {cfg.threads} threads; speed-up over plain; most MB of"
+        " memory; error"
+    )
     metrics: dict[str, float | int] = {"threads": cfg.threads}
     for work in [*works, training]:
         print(work.name)
@@ -254,7 +295,8 @@ def main(cfg: DictConfig) -> None:
         for name, values in work.milliseconds.items():
             median = statistics.median(values)
             error = f"{work.errors[name]:11.1e}" if name in work.errors else ""
-            print(f"  {name:24}{median:10.3f}{rival / median:8.1f}x{error}")
+            print(f"  {name:24}{median:10.3f}{rival / median:8.1f}x{work.megabytes[name]:9.1f}{error}")
+            metrics[f"{work.name}/{name}/megabytes"] = work.megabytes[name]
             metrics[f"{work.name}/{name}/milliseconds"] = median
             metrics[f"{work.name}/{name}/speedup"] = rival / median
             metrics[f"{work.name}/{name}/spread"] = (max(values) - min(values)) / median
@@ -275,7 +317,7 @@ def main(cfg: DictConfig) -> None:
         for panel, lines in panels.items():
             for name, (xs, ys) in lines.items():
                 metrics.update({f"curve/{panel}/{name}/{x}": y for x, y in zip(xs, ys, strict=True)})
-        print(plot_loglog(panels, run.path / "speed.png", ylabel="milliseconds a step"))
+        print(plot_loglog(panels, run.path / "speed.png", ylabel="milliseconds"))
     run.write_metrics(metrics, seed=cfg.seed)
     for path in run.written:
         print(path)

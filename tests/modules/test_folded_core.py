@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchrl_gn.modules import GNCore, Graph, GraphSize, graph_concat
+from torchrl_gn.modules import GNCore, Graph, GraphSize, folded_core, graph_concat
 from torchrl_gn.modules.folded_core import fold_core
 
 PARTS = ("nodes", "edges", "globals_")
@@ -182,3 +182,16 @@ def test_forward_models_compute_their_core(scenes, make_model, random_states, ra
         bound.static_graph(),
     )
     compare(model.core, dynamic, static, bound.predicted_nodes, 1e-10)
+
+
+@pytest.mark.parametrize("batch", [1, 5, 7])
+def test_large_batches_in_parts_are_the_whole(random_graph, monkeypatch, batch):
+    size, edge_index = GraphSize(3, 2, 1), torch.tensor([[0, 1, 2], [1, 2, 0]])
+    core = make_core(size + GraphSize(2, 0, 0), 4, 5, depth=2)
+    dynamic, static = random_graph(size, edge_index, 3, batch), random_graph(GraphSize(2, 0, 0), edge_index, 3)
+    ready = fold_core(core, size, torch.tensor([1, 2]), static)
+    whole = ready.predict(dynamic)  # with gradients: in one
+    monkeypatch.setattr(folded_core, "_CACHED", 2 * 3 * 7)  # two samples of three edges with seven activations
+    with torch.no_grad():
+        assert len(ready._parts((dynamic.nodes.transpose(0, 1),))) == -(-batch // 2)
+        torch.testing.assert_close(ready.predict(dynamic), whole.detach(), rtol=1e-12, atol=1e-12)

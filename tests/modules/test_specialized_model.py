@@ -226,13 +226,21 @@ def test_a_loss_refuses_to_train_a_snapshot(scenes, make_model):
 
 def test_the_table_names_what_was_skipped(scenes, make_model):
     scene = scenes["swimmer6"]
-    quick = specialize(make_model(scene, latent=64).bind(scene))
+    sizes = {"edge_hidden": (128, 128), "node_hidden": (128, 128), "global_hidden": (128, 128)}
+    quick = specialize(make_model(scene, latent=64, **sizes).bind(scene))
     skipped = quick.skipped()
     assert skipped["nodes predicted"] == (7, 6)
     assert skipped["channels predicted"] == (12, 6)
     assert skipped["edges of the second block"] == (16, 13)  # three lead to the world
     plain, here = skipped["kFLOP"]
-    assert 0 < here < plain / 2
+    # By hand: layers of h by their inputs, the last one of 6, and products with incidence matrices.
+    nodes, edges, kept, moving, h = 7, 16, 13, 6, 128
+    n, e = skipped["node features"][1], skipped["edge features"][1]
+    layers = edges * (2 * n + e + h) + nodes * (h + n + h) + 3 * h + (2 * nodes + 2) * h
+    layers += kept * (h + 2 * n + e + h) + moving * (h + n + h + h + 6)
+    incidence = edges * 2 * nodes * n
+    incidence += h * ((nodes + 1) * edges + kept * (2 * nodes + 1) + moving * kept + moving)
+    assert here == pytest.approx(2e-3 * (layers * h + incidence))
     assert all(what in str(quick) for what in skipped)
 
 

@@ -33,6 +33,8 @@ from torchrl_gn.modules.gn_block import GraphSize
 from torchrl_gn.modules.graph import Graph
 from torchrl_gn.modules.linear import linear, product
 
+_CACHED = 2**20  # numbers
+
 Rows = Tensor | slice
 Columns = tuple[Tensor, Tensor]  # indices, and factors on what is there
 
@@ -104,15 +106,14 @@ class FoldedCore:
             ``[P, B, F_out]``.
         """
         count_n, count_e = nodes.shape[0], edges.shape[0]
-        ends = product(self.ends, nodes)
-        ends = torch.cat((ends[:count_e], ends[count_e:], edges), dim=-1)
+        ends = torch.cat((*product(self.ends, nodes).split((count_e, count_e)), edges), dim=-1)
         everywhere = globals_.expand(count_e, -1, -1)
 
         edge_hidden = _hidden(self.first_edge, (ends, everywhere))
-        reduced = product(self.reduce, edge_hidden)
+        received, summed = product(self.reduce, edge_hidden).split((count_n, 1))
         everywhere = globals_.expand(count_n, -1, -1)
-        node_hidden = _hidden(self.first_node, (reduced[:count_n], nodes, everywhere))
-        summed = (node_hidden.sum(0, keepdim=True), reduced[count_n:], globals_)
+        node_hidden = _hidden(self.first_node, (received, nodes, everywhere))
+        summed = (node_hidden.sum(0, keepdim=True), summed, globals_)
         global_hidden = _hidden(self.first_global, summed)
 
         # Projected once a node or graph, then gathered by one product: senders, receivers, graph.
@@ -136,14 +137,25 @@ class FoldedCore:
     def predict(self, dynamic: Graph) -> Tensor:
         """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, zero if not predicted."""
         batch = dynamic.nodes.shape[:-2]
-        out = self(
+        inputs = (
             _items(dynamic.nodes).contiguous(),
             _items(dynamic.edges).contiguous(),
             _items(dynamic.globals_.unsqueeze(-2)),
         )
+        out = torch.cat([self(*part) for part in self._parts(inputs)], dim=1)
         full = out.new_zeros(dynamic.nodes.shape[-2], *out.shape[1:])
         full[self.predicted] = out
         return full.transpose(0, 1).reshape(*batch, *full.shape[::2])
+
+    def _parts(self, inputs: tuple[Tensor, ...]) -> list[tuple[Tensor, ...]]:
+        """Inputs ``[I, B, F]``, on a processor in parts of as many samples as its cache holds activations of."""
+        table = self.first_edge.table
+        if inputs[0].device.type != "cpu" or torch.is_grad_enabled() or torch.compiler.is_compiling():
+            return [inputs]
+        if table.shape[1] > 1:  # every sample has its own
+            return [inputs]
+        samples = max(1, _CACHED // (table.shape[0] * table.shape[2]))
+        return list(zip(*(part.split(samples, dim=1) for part in inputs), strict=True))
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> FoldedCore:
         """This core with fewer and rescaled features (with ``F_n`` and ``F_e`` those that are left).

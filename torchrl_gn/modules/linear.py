@@ -57,7 +57,7 @@ class _Layer(torch.autograd.Function):
         else:
             out = (matrix @ items.flatten(1)).view(count * batch, items.shape[-1])
         for x, weight in zip(flat[start:], weights[start:], strict=True):
-            out.addmm_(x, weight.T)
+            torch.addmm(out, x, weight.T, out=out)  # in place, and counted by FlopCounterMode
         shaped = out.view(count, batch, out.shape[-1])
         if table is not None:
             shaped.add_(table)
