@@ -13,7 +13,7 @@ LINKED = ["pendulum", "cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", 
 
 
 def link(bound, state, delta):
-    return bound.linking(state, delta, bound.model.delta_normalizer.std)
+    return bound.linking(state, delta, bound.model.delta_normalizer.std, *bound.values[-2:])
 
 
 def gaps(scene, state):
@@ -79,10 +79,10 @@ def test_levers_are_the_derivative_of_places(make_model, name):
     still = torch.zeros_like(turn)
 
     def apart(turn):
-        places, _, _ = bound.linking.pins(state, turn, still)
+        places, _, _ = bound.linking.pins(state, turn, still, *bound.values[-2:])
         return places - torch.where(bound.linking.root_moves, bound.linking.mean @ places, still)
 
-    arms = bound.linking.pins(state, still, still)[2]
+    arms = bound.linking.pins(state, still, still, *bound.values[-2:])[2]
     moves = (arms.flatten(1) @ bound.linking.levers).unflatten(-1, (-1, len(bound.linking.turning)))
     moved = (moves @ turn.flatten(1)[:, bound.linking.turning].unsqueeze(-1)).view_as(turn)
     torch.testing.assert_close((apart(1e-6 * turn) - apart(-1e-6 * turn)) / 2e-6, moved, rtol=1e-6, atol=1e-8)

@@ -246,7 +246,7 @@ def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, no
     if model.integrate:
         target = BODY_STATE.residual(state, target, loss.model.timestep)
     if model.align:
-        target = BODY_STATE.turn_delta(target, quaternion.conjugate(loss.model._turn(state)))
+        target = BODY_STATE.turn_delta(target, quaternion.conjugate(loss.model._turn(state, loss.model.values)))
     live = loss.model.live
     targets = model.residual_normalizer(target)
     for channel in live.any(0).nonzero().flatten().tolist():

@@ -37,7 +37,8 @@ class ModelEnv(ModelBasedEnvBase):
     out of its submodules.
 
     ``reset()`` draws true start states and observes them; ``reset(tensordict,
-    set_state=True)`` starts from the TensorDict's ``state``.
+    set_state=True)`` starts from the TensorDict's ``state``. A model that reads static values of
+    every sample (``static_key``) gets those of the TensorDict, or else its scene's.
 
     Args:
         model: module with ``in_keys`` holding ``"state"`` and ``"action"``, ``out_keys`` holding
@@ -96,7 +97,12 @@ class ModelEnv(ModelBasedEnvBase):
         else:
             physics = self.starts.draw(shape, tensordict.get("_reset", None))
             state = Simulator(self.scene, num_threads=1).observe(physics)
-        return TensorDict({"state": state}, batch_size=shape).to(self.device)
+        reset = TensorDict({"state": state}, batch_size=shape)
+        key = getattr(self.world_model, "static_key", None)
+        if key is not None:
+            own = cast(TensorDictBase, self.world_model.values.tensordict())
+            reset.set(key, tensordict.get(key, own.expand(shape)))
+        return reset.to(self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state = read(tensordict, "state", (self.scene.num_nodes, 13), self)

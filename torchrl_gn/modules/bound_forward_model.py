@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.linking import Linking
+from torchrl_gn.modules.scene_values import SceneValues, topology
 from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
@@ -27,6 +28,18 @@ class UnseenFeatureWarning(UserWarning):
     """A scene has a static value that the model never saw vary in training."""
 
 
+class Folded(NamedTuple):
+    """What many predictions of the same bodies share.
+
+    Attributes:
+        core: the network with all that is constant folded; None where it is evaluated plainly.
+        values: the numbers of the scene, or of every sample's.
+    """
+
+    core: FoldedCore | None
+    values: SceneValues
+
+
 class BoundForwardModel(TensorDictModuleBase):
     """Predict the next state of one scene with a forward model's shared weights.
 
@@ -36,6 +49,11 @@ class BoundForwardModel(TensorDictModuleBase):
     their precision with a float32 network. Differentiable in states, actions and
     weights. Made by :meth:`ForwardModel.bind`.
 
+    With a ``static_key`` every sample may be another variant of the scene (lengths, masses, ...):
+    the module then also reads a TensorDict of the entries of
+    :class:`~torchrl_gn.modules.scene_values.SceneValues`, as :meth:`static_of` gives them or an
+    inference model writes them. Without one, samples that bring other values are refused.
+
     Args:
         model: the shared weights.
         scene: the scene to predict.
@@ -44,6 +62,7 @@ class BoundForwardModel(TensorDictModuleBase):
             function, slowly: what everything faster is compared with.
         state_key: where to read the state.
         action_key: where to read the action.
+        static_key: where to read each sample's static values; None: they are the scene's.
 
     Raises:
         ValueError: if the scene lacks features that the model reads, or with ``strict``.
@@ -53,9 +72,6 @@ class BoundForwardModel(TensorDictModuleBase):
     edge_index: Tensor
     edge_action: Tensor
     joint_node: Tensor
-    joint_axis: Tensor
-    rest: Tensor
-    pivot: Tensor
     live: Tensor
     predicted: Tensor
     predicted_nodes: Tensor
@@ -70,9 +86,13 @@ class BoundForwardModel(TensorDictModuleBase):
         plain: bool = False,
         state_key: NestedKey = "state",
         action_key: NestedKey = "action",
+        static_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
+        self.static_key = static_key
         self.in_keys: list[NestedKey] = [state_key, action_key]
+        if static_key is not None:
+            self.in_keys.append(static_key)
         next_key = ("next", state_key) if isinstance(state_key, str) else ("next", *state_key)
         self.out_keys: list[NestedKey] = [next_key]
         self.model, self.scene, self.layout = model, scene, model.layout
@@ -84,9 +104,7 @@ class BoundForwardModel(TensorDictModuleBase):
         # A column of zeros behind the actions stands for joints without motor.
         self._register("edge_action", torch.where(edge_action < 0, scene.num_actions, edge_action))
         if model.joint_axes:
-            nodes, axes = joint_axes(scene)
-            self._register("joint_node", torch.as_tensor(nodes).long().repeat_interleave(2))
-            self._register("joint_axis", torch.as_tensor(axes).repeat_interleave(2, 0))
+            self._register("joint_node", torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2))
         self._register("live", torch.as_tensor(scene.live, dtype=torch.bool))
         predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
         invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
@@ -98,28 +116,34 @@ class BoundForwardModel(TensorDictModuleBase):
         pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
         self.linking = Linking(scene) if model.link and pinned else None
         self.heading = scene.heading if model.align else None
-        if self.heading is not None:
-            self._register("rest", torch.as_tensor(self.heading.rest))
-            self._register("pivot", torch.as_tensor(self.heading.pivot))
-        for part, column_names in (
-            ("nodes", "node_names"),
-            ("edges", "edge_names"),
-            ("globals_", "global_names"),
-        ):
-            values = self._select(part, getattr(scene.static, part), getattr(scene.static, column_names))
-            self._register(f"static_{part}", values)
+        for name, value in SceneValues.of(scene, model)._asdict().items():
+            self._register(f"static_{name}", value)
         self._check_unseen(strict)
 
     def _register(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
 
-    def _select(self, part: str, values, names) -> Tensor:
-        wanted = getattr(self.model.features, part)
-        missing = [name for name in wanted if name not in names]
-        if missing:
-            raise ValueError(f"Scene {self.scene.name!r} lacks the static features {missing} that the model reads.")
-        columns = [names.index(name) for name in wanted]
-        return torch.as_tensor(values, dtype=torch.float64)[..., columns]
+    @property
+    def values(self) -> SceneValues:
+        """The scene's own numbers, without batch."""
+        return SceneValues(*(getattr(self, f"static_{name}") for name in SceneValues._fields))
+
+    def static_of(self, scene: Scene) -> TensorDict:
+        """Static values of a variant of this scene, to give samples at the ``static_key``.
+
+        Stack those of several variants for a batch.
+
+        Raises:
+            ValueError: if it is another scene: other bodies, joints, motors or control step.
+        """
+        here, there = topology(self.scene), topology(scene)
+        differs = [what for what in here if here[what] != there[what]]
+        if differs:
+            raise ValueError(
+                f"Scene {scene.name!r} is no variant of {self.scene.name!r}: {', '.join(differs)} differ."
+                " Bind the model to it instead."
+            )
+        return SceneValues.of(scene, self.model).tensordict().to(self.live.device)
 
     def _apply(self, fn, recurse: bool = True):
         # Masks and static values keep their dtype (float64) when the network is cast; only the device follows.
@@ -133,7 +157,7 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def _check_unseen(self, strict: bool) -> None:
         unseen = []
-        for part, normalizer in self._static_normalizers():
+        for part, normalizer in self._static_normalizers() if self.model.static == "scene" else ():
             values = getattr(self, f"static_{part}")
             if values.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
                 continue
@@ -172,16 +196,46 @@ class BoundForwardModel(TensorDictModuleBase):
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the predicted next state into ``tensordict`` and return it."""
-        state, action = (tensordict[key] for key in self.in_keys)
-        tensordict.set(self.out_keys[0], self.step(state, action))
+        state, action = (tensordict[key] for key in self.in_keys[:2])
+        tensordict.set(self.out_keys[0], self.step(state, action, self.static_in(tensordict)))
         return tensordict
 
-    def step(self, state: Tensor, action: Tensor) -> Tensor:
+    def static_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        """The static values that samples bring; None where they are the scene's own.
+
+        Raises:
+            KeyError: if the model reads them and they are missing.
+            ValueError: if the model does not read them and they are not its scene's.
+        """
+        static = tensordict.get("static" if self.static_key is None else self.static_key, None)
+        if self.static_key is not None:
+            if static is None:
+                raise KeyError(
+                    f"The model reads each sample's static values at {self.static_key!r}; give static_of(scene),"
+                    " or bind without static_key."
+                )
+            return static
+        if isinstance(static, TensorDictBase):
+            self._refuse_others(static)
+        return None
+
+    def _refuse_others(self, static: TensorDictBase) -> None:
+        for name, own in self.values._asdict().items():
+            given = static.get(name, None)
+            if given is None or bool((given - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
+                continue
+            raise ValueError(
+                f"Samples have other static {name!r} than scene {self.scene.name!r}, which the model is bound to."
+                " Bind it with static_key='static' to predict variants of the scene."
+            )
+
+    def step(self, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> Tensor:
         """Next state.
 
         Args:
             state: ``[*B, N, 13]``.
             action: ``[*B, A]``.
+            static: static values of every sample, or without batch; by default the scene's.
 
         Returns:
             ``[*B, N, 13]``.
@@ -189,15 +243,16 @@ class BoundForwardModel(TensorDictModuleBase):
         Raises:
             ValueError: if a shape does not fit the scene.
         """
-        self._check_shapes(state, action)
-        return self._advance(state, action, self.fold())
+        self._check_shapes(state, action, static)
+        return self._advance(state, action, self.fold(static))
 
-    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+    def rollout(self, state: Tensor, actions: Tensor, static: TensorDictBase | None = None) -> Tensor:
         """States from a start state under a sequence of actions.
 
         Args:
             state: ``[*B, N, 13]`` start states.
             actions: ``[*B, T, A]``; ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``.
+            static: static values of every rollout, or without batch; by default the scene's.
 
         Returns:
             ``[*B, T + 1, N, 13]``; the first is the start state itself.
@@ -206,59 +261,70 @@ class BoundForwardModel(TensorDictModuleBase):
             ValueError: if a shape does not fit the scene.
         """
         for action in actions.unbind(-2)[:1]:
-            self._check_shapes(state, action)
-        states, folded = [state], self.fold()
+            self._check_shapes(state, action, static)
+        states, folded = [state], self.fold(static)
         for action in actions.unbind(-2):
             states.append(self._advance(states[-1], action, folded))
         return torch.stack(states, dim=-3)
 
-    def _advance(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
+    def _advance(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         return self.layout.apply(state, self._delta(state, action, folded))
 
-    def fold(self) -> FoldedCore | None:
-        """The network for this scene, to pass to :meth:`delta` where many steps share the weights."""
-        return None if self.plain else self.model.fold(self.static_graph(), self.predicted_nodes)
+    def fold(self, static: TensorDictBase | None = None) -> Folded:
+        """What predictions of the same bodies share, to pass to :meth:`delta` for many steps.
 
-    def delta(self, state: Tensor, action: Tensor, folded: FoldedCore | None = None) -> Tensor:
+        Args:
+            static: static values of every sample, by default the scene's.
+        """
+        values = self.values if static is None else SceneValues.read(static, self.values)
+        core = None if self.plain else self.model.fold(self.static_graph(values), self.predicted_nodes)
+        return Folded(core, values)
+
+    def delta(self, state: Tensor, action: Tensor, folded: Folded | None = None) -> Tensor:
         """Predicted change of the state ``[*B, N, 12]``, exactly zero in dead components."""
         self._check_shapes(state, action)
         return self._delta(state, action, folded or self.fold())
 
-    def _delta(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
-        residual = self._residual(state, action, folded).to(state.dtype)
-        turn = self._turn(state)
+    def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
+        residual, values = self._residual(state, action, folded).to(state.dtype), folded.values
+        turn = self._turn(state, values)
         if turn is not None:
             residual = self.layout.turn_delta(residual, turn)
         if self.model.integrate:
             residual = self.layout.integrate(state, residual, self.timestep)
         delta = residual * self.live
         if self.linking is not None:
-            delta = self.linking(state, delta, self.model.delta_normalizer.std)
+            spread = self.model.delta_normalizer.std
+            delta = self.linking(state, delta, spread, values.parent_arm, values.arm)
         return delta
 
-    def _residual(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
+    def _residual(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         """What the network predicts ``[*B, N, 12]``, in the local frame."""
-        dynamic = self.dynamic_graph(state, action)
-        if folded is not None:
-            return self.model(dynamic, folded)
-        normalized = self.model.core(graph_concat(dynamic, self.static_graph())).nodes
+        dynamic = self.dynamic_graph(state, action, folded.values)
+        if folded.core is not None:
+            return self.model(dynamic, folded.core)
+        normalized = self.model.core(graph_concat(dynamic, self.static_graph(folded.values))).nodes
         return self.model.residual_normalizer.inverse(normalized)
 
-    def dynamic_graph(self, state: Tensor, action: Tensor) -> Graph:
+    def dynamic_graph(self, state: Tensor, action: Tensor, values: SceneValues | None = None) -> Graph:
         """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
         self._check_shapes(state, action)
         dtype, model = self.network_dtype, self.model
-        encoded, controls = self._encode(state, action)
+        encoded, controls = self._encode(state, action, values or self.values)
         globals_ = encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype)
         nodes, edges = model.node_normalizer(encoded, dtype), model.edge_normalizer(controls, dtype)
         return Graph(nodes, edges, globals_, self.edge_index)
 
-    def static_graph(self, dtype: torch.dtype | None = None) -> Graph:
-        """Normalised static graph (no batch), by default in the network's dtype."""
-        nodes, edges, globals_ = (
-            normalizer(getattr(self, f"static_{part}"), dtype or self.network_dtype)
-            for part, normalizer in self._static_normalizers()
-        )
+    def static_graph(self, values: SceneValues | None = None, dtype: torch.dtype | None = None) -> Graph:
+        """Normalised static graph, of the scene by default (no batch), in the network's dtype by default."""
+        values, dtype = values or self.values, dtype or self.network_dtype
+        if self.model.static == "inferred":  # comes from a network already
+            nodes, edges, globals_ = (part.to(dtype) for part in values[:3])
+        else:
+            normalizers = self._static_normalizers()
+            nodes, edges, globals_ = (
+                normalizer(part, dtype) for part, (_, normalizer) in zip(values[:3], normalizers, strict=True)
+            )
         return Graph(nodes, edges, globals_, self.edge_index)
 
     def recentered(self, state: Tensor) -> Tensor:
@@ -275,7 +341,7 @@ class BoundForwardModel(TensorDictModuleBase):
         moved = state[..., position] - center * self.shifted.to(state.dtype)
         return torch.cat((state[..., : position.start], moved, state[..., position.stop :]), dim=-1)
 
-    def local(self, state: Tensor) -> Tensor:
+    def local(self, state: Tensor, values: SceneValues | None = None) -> Tensor:
         """State ``[*B, N, 13]`` as the network sees it: recentred, and turned to heading 0.
 
         Where the dynamics do not depend on how the scene is turned
@@ -283,39 +349,40 @@ class BoundForwardModel(TensorDictModuleBase):
         predicted changes are turned back, so that nothing is learned twice. The world stays;
         where parts can touch it, it is turned with the rest and so shows the heading.
         """
-        state, turn = self.recentered(state), self._turn(state)
+        values = values or self.values
+        state, turn = self.recentered(state), self._turn(state, values)
         if self.heading is None or turn is None:
             return state
-        pivot = torch.cat((self.pivot, self.pivot.new_zeros(self.layout.size - 3))).to(state.dtype)
+        pivot = torch.nn.functional.pad(values.pivot.to(state.dtype), (0, self.layout.size - 3)).unsqueeze(-2)
         turned = self.layout.turn(state - pivot, quaternion.conjugate(turn)) + pivot
         return torch.cat((state[..., :1, :], turned[..., 1:, :]), dim=-2) if self.heading.exact else turned
 
-    def _turn(self, state: Tensor) -> Tensor | None:
+    def _turn(self, state: Tensor, values: SceneValues) -> Tensor | None:
         """Rotation ``[*B, 4]`` from heading 0 to the root's heading; None where there is none."""
         if self.heading is None:
             return None
         orientation = state[..., self.heading.node, self.layout.slices["orientation"]]
-        rest = self.rest.to(state.dtype)
+        rest = values.rest.to(state.dtype)
         turn = quaternion.product(orientation, quaternion.conjugate(rest))
         kept = torch.zeros(4, dtype=state.dtype, device=state.device)
         kept[0] = kept[1 + self.heading.axis] = 1
         return quaternion.normalize(turn * kept)
 
-    def _encode(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        state = self.local(state)
+    def _encode(self, state: Tensor, action: Tensor, values: SceneValues) -> tuple[Tensor, Tensor]:
+        state = self.local(state, values)
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
         controls = padded[..., self.edge_action].unsqueeze(-1)  # [*B, E, 1]
         if self.model.joint_axes:
-            axes = self._joint_axes(state)
+            axes = self._joint_axes(state, values)
             controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]
         return self.layout.encode(state, self.model.encoding), controls
 
-    def _joint_axes(self, state: Tensor) -> Tensor:
+    def _joint_axes(self, state: Tensor, values: SceneValues) -> Tensor:
         """Axes of the joints ``[*B, E, 3]`` in the frame of the state."""
         orientation = state[..., self.joint_node, self.layout.slices["orientation"]]
-        return quaternion.rotate(orientation, self.joint_axis.to(state.dtype))
+        return quaternion.rotate(orientation, values.joint_axis.to(state.dtype))
 
-    def _check_shapes(self, state: Tensor, action: Tensor) -> None:
+    def _check_shapes(self, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> None:
         item = (self.scene.num_nodes, self.layout.size)
         if tuple(state.shape[-2:]) != item:
             raise ValueError(
@@ -326,28 +393,38 @@ class BoundForwardModel(TensorDictModuleBase):
                 f"Action of scene {self.scene.name!r} must be {[*state.shape[:-2], self.scene.num_actions]} to go with"
                 f" a state {list(state.shape)}, got {list(action.shape)}."
             )
+        if static is not None and static.shape not in ((), state.shape[:-2]):
+            raise ValueError(
+                f"Static values must have no batch or that of the state, {list(state.shape[:-2])},"
+                f" got {list(static.shape)}."
+            )
 
-    def update_static_normalizers(self) -> None:
-        """Take this scene's static graph into the model's statistics: once a scene, before training."""
-        for part, normalizer in self._static_normalizers():
-            normalizer.update(getattr(self, f"static_{part}"))
+    def update_static_normalizers(self, static: TensorDictBase | None = None) -> None:
+        """Take static values, by default this scene's, into the model's statistics: once, before training."""
+        values = self.values if static is None else SceneValues.read(static, self.values)
+        for part, (_, normalizer) in zip(values, self._static_normalizers(), strict=False):
+            normalizer.update(part)
 
-    def update_dynamic_normalizers(self, state: Tensor, action: Tensor, next_state: Tensor) -> None:
+    def update_dynamic_normalizers(
+        self, state: Tensor, action: Tensor, next_state: Tensor, static: TensorDictBase | None = None
+    ) -> None:
         """Take transitions into the model's statistics (paper, "One step of the training algorithm").
 
         Args:
             state: ``[*B, N, 13]``, with the input noise that training adds.
             action: ``[*B, A]``.
             next_state: ``[*B, N, 13]``, clean.
+            static: static values of every sample, by default the scene's.
         """
-        self._check_shapes(state, action)
-        encoded, controls = self._encode(state, action)
+        self._check_shapes(state, action, static)
+        values = self.values if static is None else SceneValues.read(static, self.values)
+        encoded, controls = self._encode(state, action, values)
         self.model.node_normalizer.update(encoded)
         self.model.edge_normalizer.update(controls)
         delta = self.layout.delta(state, next_state)
         self.model.delta_normalizer.update(delta, self.live)
         residual = self.layout.residual(state, delta, self.timestep) if self.model.integrate else delta
-        turn = self._turn(state)
+        turn = self._turn(state, values)
         if turn is not None:
             residual = self.layout.turn_delta(residual, quaternion.conjugate(turn))
         self.model.residual_normalizer.update(residual, self.live)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_gn.modules.core import GNCore
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from torchrl_gn.modules.bound_forward_model import BoundForwardModel
     from torchrl_gn.scenes import Scene
 
-Static = Literal["none", "scene"]
+Static = Literal["none", "scene", "inferred"]
 
 # Spreads below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 _DYNAMIC_FLOOR = 1e-9
@@ -55,7 +56,9 @@ class ForwardModel(nn.Module):
 
     Args:
         features: static features that the model reads, see :meth:`FeatureSet.of`.
-        static: ``"scene"`` reads the true static parameters, ``"none"`` none of them.
+        static: ``"scene"`` reads the true static parameters, ``"none"`` none of them, ``"inferred"`` a graph that
+            another network makes instead, with features as they are.
+        inferred: numbers of node, edge and global features of the inferred graph.
         layout: what the state's channels mean.
         encoding: how the network sees an orientation: as the entries of its rotation
             ``"matrix"`` or (paper) as the ``"quaternion"``.
@@ -84,6 +87,7 @@ class ForwardModel(nn.Module):
         features: FeatureSet,
         *,
         static: Static = "scene",
+        inferred: Sequence[int] = (10, 10, 10),
         layout: StateLayout = BODY_STATE,
         encoding: Encoding = "matrix",
         integrate: bool = True,
@@ -107,6 +111,7 @@ class ForwardModel(nn.Module):
         self.recenter, self.align, self.link = recenter, align, link
         self.options = {
             "static": static,
+            "inferred": list(inferred),
             "encoding": encoding,
             "integrate": integrate,
             "joint_axes": joint_axes,
@@ -120,18 +125,22 @@ class ForwardModel(nn.Module):
         }
 
         encoded = layout.encoded_size(encoding)
-        static_size = GraphSize(len(self.features.nodes), len(self.features.edges), len(self.features.globals_))
+        names = self.features
+        if static == "inferred":
+            self.static_size = GraphSize(*inferred)
+        else:
+            self.static_size = GraphSize(len(names.nodes), len(names.edges), len(names.globals_))
         self.node_normalizer = Normalizer(encoded, floor=_DYNAMIC_FLOOR)
         self.dynamic_size = GraphSize(encoded, 7 if joint_axes else 1, 0)
         self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=_DYNAMIC_FLOOR)
-        self.static_node_normalizer = Normalizer(static_size.nodes)
-        self.static_edge_normalizer = Normalizer(static_size.edges)
-        self.static_global_normalizer = Normalizer(static_size.globals_)
+        self.static_node_normalizer = Normalizer(self.static_size.nodes)
+        self.static_edge_normalizer = Normalizer(self.static_size.edges)
+        self.static_global_normalizer = Normalizer(self.static_size.globals_)
         # The network's output has the residual's scale; errors are weighed by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.core = GNCore(
-            self.dynamic_size + static_size,
+            self.dynamic_size + self.static_size,
             layout.delta_size,
             latent=latent,
             edge_hidden=edge_hidden,
@@ -139,7 +148,9 @@ class ForwardModel(nn.Module):
             global_hidden=global_hidden,
         )
 
-    def bind(self, scene: Scene, *, strict: bool = False, plain: bool = False) -> BoundForwardModel:
+    def bind(
+        self, scene: Scene, *, strict: bool = False, plain: bool = False, static_key: NestedKey | None = None
+    ) -> BoundForwardModel:
         """Join these weights to a scene.
 
         Args:
@@ -147,13 +158,15 @@ class ForwardModel(nn.Module):
             strict: refuse, instead of warning, a scene with a value that training never saw
                 in a feature that never varied.
             plain: evaluate the core as the paper writes it, slowly: the reference for all that is faster.
+            static_key: where each sample has its own static values (a variant's, or inferred); None: all have the
+                scene's.
 
         Returns:
             TensorDict module ``state, action -> ("next", "state")`` that shares these weights.
         """
         from torchrl_gn.modules.bound_forward_model import BoundForwardModel
 
-        return BoundForwardModel(self, scene, strict=strict, plain=plain)
+        return BoundForwardModel(self, scene, strict=strict, plain=plain, static_key=static_key)
 
     def fold(self, static: Graph, predicted: Tensor) -> FoldedCore:
         """The core for one scene, differentiable in the weights.

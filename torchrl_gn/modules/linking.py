@@ -36,8 +36,6 @@ class Linking(Float64Buffers):
     """
 
     parent: Tensor
-    parent_arm: Tensor
-    arm: Tensor
     chain: Tensor
     mean: Tensor
     root: Tensor
@@ -52,8 +50,6 @@ class Linking(Float64Buffers):
         together = linkage.root[:, None] == linkage.root
         values = {
             "parent": linkage.parent,
-            "parent_arm": linkage.parent_arm,
-            "arm": linkage.arm,
             "chain": linkage.chain,
             "mean": together / together.sum(1, keepdims=True),
             "root": np.eye(scene.num_nodes)[linkage.root],
@@ -65,19 +61,21 @@ class Linking(Float64Buffers):
             self.register_buffer(name, torch.as_tensor(value), persistent=False)
         self.register_buffer("levers", self._levers(), persistent=False)
 
-    def forward(self, state: Tensor, delta: Tensor, std: Tensor) -> Tensor:
+    def forward(self, state: Tensor, delta: Tensor, std: Tensor, parent_arm: Tensor, arm: Tensor) -> Tensor:
         """The nearest change that keeps pins together.
 
         Args:
             state: ``[*B, N, 13]``.
             delta: ``[*B, N, 12]`` predicted change.
             std: ``[12]`` how much each channel of a change varies.
+            parent_arm: ``[N, 3]`` or ``[*B, N, 3]`` each node's pin in its parent's frame.
+            arm: the same in the node's own frame.
 
         Returns:
             ``[*B, N, 12]``, zero in dead components; ``delta`` itself where nothing is apart.
         """
         shift, turn, push, spin = delta.split(3, dim=-1)
-        places, speeds, arms = self.pins(state, turn, spin)
+        places, speeds, arms = self.pins(state, turn, spin, parent_arm, arm)
         # [*B, 3 N, L]: how turning moves the bodies of a linkage, linear in the arms.
         moves = (arms.flatten(-3) @ self.levers.to(state.dtype)).unflatten(-1, (-1, len(self.turning)))
         apart = self._gap(state, _PARTS[0], shift, places)
@@ -90,18 +88,22 @@ class Linking(Float64Buffers):
         better = self._spread(solved)
         turn, spin = turn + better[..., 0], spin + better[..., 1]
 
-        places, speeds, _ = self.pins(state, turn, spin)
+        places, speeds, _ = self.pins(state, turn, spin, parent_arm, arm)
         shift = shift - self._gap(state, _PARTS[0], shift, places)
         push = push - self._gap(state, _PARTS[2], push, speeds)
         return torch.cat((shift, turn, push, spin), dim=-1) * self.live
 
-    def pins(self, state: Tensor, turn: Tensor, spin: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def pins(
+        self, state: Tensor, turn: Tensor, spin: Tensor, parent_arm: Tensor, arm: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Where pins put the bodies after a change of orientations and angular velocities.
 
         Args:
             state: ``[*B, N, 13]``.
             turn: ``[*B, N, 3]`` rotation vectors.
             spin: ``[*B, N, 3]`` changes of angular velocity.
+            parent_arm: as in :meth:`forward`.
+            arm: as in :meth:`forward`.
 
         Returns:
             Places and speeds ``[*B, N, 3]`` relative to each linkage's root, and the arms
@@ -111,8 +113,8 @@ class Linking(Float64Buffers):
         orientation = quaternion.product(quaternion.exp(turn), state[..., at["orientation"]])
         frame = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
         speed = state[..., at["angular_velocity"]] + spin
-        upper = (frame[..., self.parent, :, :] @ self.parent_arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
-        lower = (frame @ self.arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
+        upper = (frame[..., self.parent, :, :] @ parent_arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
+        lower = (frame @ arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
         slip = torch.linalg.cross(speed[..., self.parent, :], upper) - torch.linalg.cross(speed, lower)
         chain = self.chain.to(state.dtype)
         return chain @ (upper - lower), chain @ slip, torch.stack((upper, lower), dim=-3)

@@ -7,13 +7,15 @@ import warnings
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from torchrl_gn.modules.bound_forward_model import BoundForwardModel, UnseenFeatureWarning
+from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded, UnseenFeatureWarning
 from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
-from torchrl_gn.modules.folded_core import FoldedCore, copy_into, fold_core
+from torchrl_gn.modules.folded_core import copy_into, fold_core
 from torchrl_gn.modules.graph import Graph, graph_concat
+from torchrl_gn.modules.scene_values import SceneValues
 
 
 class _Source:
@@ -29,7 +31,17 @@ class _Source:
         now = self.owner.get(self.name)
         if now is not self.tensor or now is None:
             return now is self.tensor
-        return now._version == self.version and now.data_ptr() == self.address
+        return self.same(now)
+
+    def same(self, now: Tensor) -> bool:
+        """Whether a tensor, perhaps another view, shows the same numbers."""
+        kept = self.kept
+        return (
+            kept is not None
+            and now.data_ptr() == self.address
+            and now._version == self.version
+            and (now.shape, now.stride(), now.dtype) == (kept.shape, kept.stride(), kept.dtype)
+        )
 
 
 class SpecializedForwardModel(BoundForwardModel):
@@ -42,44 +54,58 @@ class SpecializedForwardModel(BoundForwardModel):
     PyTorch does not count, goes unseen.) Differentiable in states and actions, never in
     weights. Reads and writes the same keys as the bound model and stands in for it in
     environments, planners and rollouts. ``print`` shows what was skipped.
+
+    Where samples bring static values of their own (``static_key``), what depends on them is folded
+    once for them, and again when others come: give a rollout's steps the same tensors.
+    No gradient flows to them.
     """
 
     def __init__(self, bound: BoundForwardModel, *, dtype: torch.dtype | None = None, compile: bool = False) -> None:
-        state_key, action_key = bound.in_keys
+        state_key, action_key = bound.in_keys[:2]
         with warnings.catch_warnings():  # the bound model has warned
             warnings.simplefilter("ignore", UnseenFeatureWarning)
-            super().__init__(bound.model, bound.scene, state_key=state_key, action_key=action_key)
+            super().__init__(
+                bound.model, bound.scene, state_key=state_key, action_key=action_key, static_key=bound.static_key
+            )
         self.to(bound.live.device)
         if compile and bound.live.device.type == "cpu":
             check_compiler()
         self._dtype, self.compile_steps = dtype, compile
-        self._folded: FoldedCore | None = None
+        self._folded: Folded | None = None
         self._folds = 0
         self._sources: list[_Source] = []
+        self._given: dict[str, _Source] = {}
         self._compiled: CompiledStep | None = None
 
     def __getstate__(self) -> dict:
         # A copy folds and compiles for itself.
-        return {**super().__getstate__(), "_folded": None, "_sources": [], "_compiled": None}
+        return {**super().__getstate__(), "_folded": None, "_sources": [], "_given": {}, "_compiled": None}
 
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the products."""
         return self._dtype or self.network_dtype
 
-    def fold(self) -> FoldedCore:
+    def fold(self, static: TensorDictBase | None = None) -> Folded:
         """The snapshot, made again if anything it came from has changed."""
-        if self._folded is None or not all(source.unchanged() for source in self._sources):
-            folded = self._fold()
+        if self._folded is None or not self._same(static) or not all(s.unchanged() for s in self._sources):
+            folded = self._fold(self.values if static is None else SceneValues.read(static, self.values))
             if self._folded is None or not copy_into(self._folded, folded):
                 self._folded, self._compiled = folded, None
             self._folds += 1
             owners = [module._parameters for module in self.model.modules()]
             owners += [module._buffers for module in (*self.model.modules(), self)]
             self._sources = [_Source(owner, name) for owner in owners for name in owner]
+            given = {} if static is None else {str(name): value for name, value in static.items()}
+            self._given = {name: _Source(given, name) for name in given}
         return self._folded
 
-    def _advance(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
+    def _same(self, static: TensorDictBase | None) -> bool:
+        """Whether static values are those of the snapshot."""
+        given = {} if static is None else dict(static.items())
+        return given.keys() == self._given.keys() and all(self._given[name].same(given[name]) for name in given)
+
+    def _advance(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         if not self.compile_steps:
             return super()._advance(state, action, folded)
         if self._compiled is None:
@@ -88,7 +114,7 @@ class SpecializedForwardModel(BoundForwardModel):
         return self._compiled(state, action)
 
     @torch.no_grad()
-    def _fold(self) -> FoldedCore:
+    def _fold(self, values: SceneValues) -> Folded:
         model = self.model
         nodes, edges, residual = model.node_normalizer, model.edge_normalizer, model.residual_normalizer
         self.node_columns = (~nodes.constant).nonzero().flatten()
@@ -97,7 +123,7 @@ class SpecializedForwardModel(BoundForwardModel):
         self._runs = _runs(self.rows.tolist(), self.layout.delta_size)
         # In float64, so that folding loses nothing.
         core = copy.deepcopy(model.core).double()
-        static = self.static_graph(torch.float64)
+        static = self.static_graph(values, torch.float64)
         full = fold_core(core, model.dynamic_size, self.predicted_nodes, static)
         small = full.reduced(
             (self.node_columns, nodes.inverse_std[self.node_columns]),
@@ -105,23 +131,25 @@ class SpecializedForwardModel(BoundForwardModel):
             (self.rows, residual.std[self.rows]),
             residual.mean[self.rows],
         )
-        return small.snapshot(self.dtype)
+        return Folded(small.snapshot(self.dtype), SceneValues(*(value.detach().clone() for value in values)))
 
-    def _residual(self, state: Tensor, action: Tensor, folded: FoldedCore | None) -> Tensor:
-        assert folded is not None
-        encoded, controls = self._encode(state, action)
+    def _residual(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
+        core = folded.core
+        assert core is not None
+        encoded, controls = self._encode(state, action, folded.values)
         nodes = _centered(encoded, self.model.node_normalizer.mean, self.node_columns)
         edges = _centered(controls, self.model.edge_normalizer.mean, self.edge_columns)
-        dtype = folded.out[0].dtype
+        dtype = core.out[0].dtype
         globals_ = nodes.new_zeros((*state.shape[:-2], 0), dtype=dtype)
-        predicted = folded.predict(Graph(nodes.to(dtype), edges.to(dtype), globals_, self.edge_index)).to(state.dtype)
+        predicted = core.predict(Graph(nodes.to(dtype), edges.to(dtype), globals_, self.edge_index)).to(state.dtype)
         # Channels that never varied are predicted as what they were.
         constant = self.model.residual_normalizer.mean.to(state.dtype).expand(*predicted.shape[:-1], -1)
         return torch.cat([(predicted if varies else constant)[..., where] for varies, where in self._runs], dim=-1)
 
     def skipped(self) -> dict[str, tuple[float, float]]:
         """What a prediction of one state handles in the plain model, and here."""
-        core, size, folded = self.model.core, self.model.dynamic_size, self.fold()
+        core, size, folded = self.model.core, self.model.dynamic_size, self.fold().core
+        assert folded is not None
         nodes, edges = self.scene.num_nodes, self.scene.num_edges
         static = self.static_graph()
 

@@ -41,7 +41,8 @@ class ForwardModelLoss(LossModule):
         generator: source of the noise; the global one if None (a run then cannot resume bit for bit).
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` steps in a row,
-    ``action`` ``[B, (H,) A]``, ``("next", "state")`` like ``state``.
+    ``action`` ``[B, (H,) A]``, ``("next", "state")`` like ``state``; with a model that reads them the
+    static values ``[B, (H)]`` of every sample, the same for a whole window.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
     """
@@ -83,8 +84,8 @@ class ForwardModelLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys that the loss reads."""
-        state, action = self.tensor_keys.state, self.tensor_keys.action
-        return [state, action, _next(state)]
+        state, action, static = self.tensor_keys.state, self.tensor_keys.action, self.model.static_key
+        return [state, action, _next(state), *([] if static is None else [static])]
 
     @property
     def out_keys(self) -> list[str]:
@@ -107,8 +108,9 @@ class ForwardModelLoss(LossModule):
             if component.kind == "add":
                 scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]].cpu()
         self.noise_scale.copy_(scale)
-        model.update_static_normalizers()
-        model.update_dynamic_normalizers(self._perturb(state), action, next_state)
+        static = model.static_in(tensordict)
+        model.update_static_normalizers(static)
+        model.update_dynamic_normalizers(self._perturb(state), action, next_state, static)
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -119,13 +121,16 @@ class ForwardModelLoss(LossModule):
             ValueError: if an entry has a wrong shape, or holds NaN or Inf.
         """
         state, action, next_state = self._read(tensordict)
+        static = self.model.static_in(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
         if state.ndim == 3:
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
+        elif static is not None:
+            static = static[:, 0]
         layout, steps = self.model.layout, state.shape[1]
         current = self._perturb(state[:, 0])
-        errors, folded = state.new_zeros(len(layout.components)), self.model.fold()
+        errors, folded = state.new_zeros(len(layout.components)), self.model.fold(static)
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
             delta = self.model.delta(current, action[:, step], folded)
@@ -141,8 +146,8 @@ class ForwardModelLoss(LossModule):
         return TensorDict({"loss_forward_model": loss, **out}, [])
 
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        state, action, next_state = (tensordict.get(key) for key in self.in_keys)
-        for key, value in zip(self.in_keys, (state, action, next_state), strict=True):
+        state, action, next_state = (tensordict.get(key) for key in self.in_keys[:3])
+        for key, value in zip(self.in_keys[:3], (state, action, next_state), strict=True):
             if value is None:
                 raise KeyError(
                     f"ForwardModelLoss needs {key!r}, the batch has {sorted(map(str, tensordict.keys(True)))}."

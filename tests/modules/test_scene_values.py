@@ -1,0 +1,207 @@
+"""Samples with static values of their own: variants of a scene, and inferred graphs."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.envs import ModelEnv
+from torchrl_gn.modules import FeatureSet, ForwardModel, specialize
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.scenes import load_scene
+
+SIZES = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8, 8), "global_hidden": (8,)}
+
+
+def arm(length: float = 0.3, size: float = 0.05, turned: float = 0.0, slide: str = ""):
+    """An arm of two links that turns about the vertical, in variants."""
+    return load_scene(f"""
+      <mujoco model="arm">
+        <worldbody>
+          <body pos=".1 .2 {1 + length}" euler="180 0 {turned}">
+            <joint axis="0 0 1"/><geom type="capsule" size="{size} .2" pos=".1 0 0"/>
+            <body pos="{length} 0 0">{slide or '<joint name="elbow" axis="0 1 0" damping=".1"/>'}
+              <geom size=".1" pos=".2 .1 0"/>
+            </body>
+          </body>
+        </worldbody>
+        <actuator><motor joint="elbow" ctrlrange="-1 1"/></actuator>
+      </mujoco>
+    """)
+
+
+@pytest.fixture(scope="module")
+def variants():
+    return [arm(), arm(0.5, 0.07, 30), arm(0.2, 0.04, -70)]
+
+
+@pytest.fixture(scope="module")
+def samples(variants):
+    """Trajectories of every variant, [3, 2, ...]."""
+    return torch.stack([collect_trajectories(scene, 2, 4, seed) for seed, scene in enumerate(variants)])
+
+
+@pytest.fixture
+def model(variants, samples):
+    torch.manual_seed(0)
+    model = ForwardModel(FeatureSet.of(variants[0]), **SIZES).double()
+    bound = model.bind(variants[0], static_key="static")
+    statics = torch.stack([bound.static_of(scene) for scene in variants])
+    for index in range(3):
+        loss = ForwardModelLoss(bound)
+        one = samples[index].clone().set("static", statics[index].expand(2))
+        loss.fit_normalizers(trajectory_buffer(one, batch_size=64, seed=0).sample())
+    return model
+
+
+def inputs(samples, bound, variants):
+    """One state and action of every variant, and its static values."""
+    static = torch.stack([bound.static_of(scene) for scene in variants])
+    return samples["state"][:, 0, 0], samples["action"][:, 0, 0], static
+
+
+@pytest.mark.parametrize("way", ["plain", "folded", "specialised"])
+def test_every_sample_is_predicted_as_its_own_scene(variants, samples, model, way):
+    bound = model.bind(variants[0], static_key="static", plain=way == "plain")
+    assert bound.in_keys == ["state", "action", "static"]
+    state, action, static = inputs(samples, bound, variants)
+    model.requires_grad_(False)
+    module = specialize(bound) if way == "specialised" else bound
+    state.requires_grad_()
+    action.requires_grad_()
+    ours = module.step(state, action, static)
+    theirs = torch.stack([model.bind(s, plain=True).step(*x) for s, *x in zip(variants, state, action, strict=True)])
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-10)
+    assert (ours - bound.step(state, action, static[0])).abs().max() > 1e-4
+    weight = torch.randn(ours.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    gradients = [torch.autograd.grad((out * weight).sum(), (state, action)) for out in (ours, theirs)]
+    for got, expected in zip(*gradients, strict=True):
+        assert (got - expected).norm() <= 1e-10 * expected.norm()
+    written = module(TensorDict({"state": state, "action": action, "static": static}, [3]))["next", "state"]
+    assert torch.equal(written, ours)
+
+
+@pytest.mark.parametrize("special", [False, True])
+def test_rollouts_of_variants(variants, samples, model, special):
+    bound = model.requires_grad_(False).bind(variants[0], static_key="static")
+    module = specialize(bound) if special else bound
+    state, _, static = inputs(samples, bound, variants)
+    actions = samples["action"][:, 0]
+    states = module.rollout(state, actions, static)
+    for index, scene in enumerate(variants):
+        expected = model.bind(scene).rollout(state[index], actions[index])
+        torch.testing.assert_close(states[index], expected, rtol=0, atol=1e-10)
+
+
+def test_a_snapshot_is_kept_for_the_same_values_and_never_used_for_others(variants, samples, model):
+    bound = model.requires_grad_(False).bind(variants[0], static_key="static")
+    quick = specialize(bound)
+    state, action, static = inputs(samples, bound, variants)
+    quick.step(state, action, static)
+    core = quick.fold(static).core
+    sample = TensorDict({"state": state, "action": action, "static": static}, [3])
+    quick(sample.select("state", "action", "static"))
+    assert quick.fold(static).core is core and quick._folds == 1
+    static["arm"].mul_(1.01)  # in place
+    torch.testing.assert_close(quick.step(state, action, static), bound.step(state, action, static))
+    assert quick._folds == 2
+    static["nodes"] = static["nodes"] * 1.5  # another tensor
+    torch.testing.assert_close(quick.step(state, action, static), bound.step(state, action, static))
+    turned = static[[1, 2, 0]]
+    torch.testing.assert_close(quick.step(state, action, turned), bound.step(state, action, turned))
+    torch.testing.assert_close(quick.step(state, action), bound.step(state, action))  # back to the scene's own
+
+
+def test_a_model_of_one_scene_refuses_samples_of_another(variants, samples, model):
+    bound = model.requires_grad_(False).bind(variants[0])
+    state, action = samples["state"][0, :, 0], samples["action"][0, :, 0]
+    for module in (bound, specialize(bound)):
+        sample = TensorDict({"state": state, "action": action, "static": bound.static_of(variants[0]).expand(2)}, [2])
+        assert ("next", "state") in module(sample).keys(True)
+        sample["static"] = bound.static_of(variants[1]).expand(2)
+        with pytest.raises(ValueError, match="other static 'nodes' than scene 'arm'.*static_key='static'"):
+            module(sample)
+    sample.set(("next", "state"), state)
+    with pytest.raises(ValueError, match="other static 'nodes'"):
+        ForwardModelLoss(bound)(sample)
+
+
+def test_what_is_no_variant_is_refused(variants, model):
+    bound = model.bind(variants[0], static_key="static")
+    with pytest.raises(ValueError, match="no variant of 'arm': components that move, pins differ"):
+        bound.static_of(arm(slide='<joint name="elbow" type="slide" axis="0 1 0"/>'))
+    with pytest.raises(ValueError, match="'swimmer3' is no variant of 'arm': number of nodes, edges"):
+        bound.static_of(load_scene("swimmer3"))
+
+
+def test_bad_static_values_are_named(variants, samples, model):
+    bound = model.bind(variants[0], static_key="static")
+    state, action, static = inputs(samples, bound, variants)
+    with pytest.raises(KeyError, match="reads each sample's static values at 'static'"):
+        bound(TensorDict({"state": state, "action": action}, [3]))
+    with pytest.raises(ValueError, match=r"no batch or that of the state, \[3\], got \[2\]"):
+        bound.step(state, action, static[:2])
+    with pytest.raises(KeyError, match=r"\['mass'\] are not known; use some of \['nodes'"):
+        bound.step(state, action, static.set("mass", torch.zeros(3)))
+    with pytest.raises(ValueError, match=r"'arm' must be \[3, 3, 3\], got \[3, 3, 2\]"):
+        bound.step(state, action, static.exclude("mass").set("arm", torch.zeros(3, 3, 2)))
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_the_loss_reads_every_samples_values(variants, samples, model, window):
+    bound = model.bind(variants[0], static_key="static")
+    loss = ForwardModelLoss(bound)
+    assert loss.in_keys == ["state", "action", ("next", "state"), "static"]
+    static = torch.stack([bound.static_of(scene) for scene in variants])
+    every = samples.clone().set("static", static.unsqueeze(1).expand(3, 2)).flatten()
+    batch = trajectory_buffer(every, batch_size=12, window=window, seed=0).sample()
+    total = loss(batch)["loss_forward_model"]
+    total.backward()
+    assert all(p.grad is not None for p in model.core.first.parameters())
+    alone = []
+    for sample in batch:
+        which = int(sample["index"].flatten()[0]) // 2
+        own = ForwardModelLoss(model.bind(variants[which]))
+        alone.append(own(sample.exclude("static").unsqueeze(0))["loss_forward_model"])
+    torch.testing.assert_close(total, torch.stack(alone).mean())
+
+
+def test_a_model_env_of_variants(variants, samples, model):
+    bound = model.requires_grad_(False).bind(variants[0], static_key="static")
+    state, _, static = inputs(samples, bound, variants)
+    start = TensorDict({"state": state, "static": static}, [3])
+    for module in (bound, specialize(bound)):
+        env = ModelEnv(module, seed=0)
+        played = env.rollout(4, tensordict=env.reset(start.clone(), set_state=True), auto_reset=False)
+        expected = bound.rollout(state, played["action"], static)
+        torch.testing.assert_close(played["next", "state"], expected[:, 1:])
+    assert module._folds == 1  # not at every step
+    # Without values of its own a start has the scene's.
+    played = env.rollout(3, tensordict=TensorDict(batch_size=[2]))
+    expected = model.bind(variants[0]).rollout(played["state"][:, 0], played["action"])
+    torch.testing.assert_close(played["next", "state"], expected[:, 1:])
+
+
+def test_an_inferred_graph_is_read_as_it_is_and_gets_gradients(variants, samples):
+    torch.manual_seed(0)
+    scene = variants[0]
+    model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=(4, 3, 2), **SIZES).double()
+    bounds = [model.bind(scene, static_key="static", plain=plain) for plain in (True, False)]
+    ForwardModelLoss(model.bind(scene)).fit_normalizers(trajectory_buffer(samples[0], batch_size=64, seed=0).sample())
+    state, action = samples["state"][:, 0, 0], samples["action"][:, 0, 0]
+    shapes = {"nodes": (scene.num_nodes, 4), "edges": (scene.num_edges, 3), "globals_": (2,)}
+    leaves = {name: torch.randn(3, *shape, dtype=torch.float64, requires_grad=True) for name, shape in shapes.items()}
+    static = TensorDict(leaves, [3])
+    outs = [bound.step(state, action, static) for bound in bounds]
+    torch.testing.assert_close(*outs, rtol=0, atol=1e-12)
+    gradients = [torch.autograd.grad(out.square().sum(), list(leaves.values())) for out in outs]
+    for plain, folded in zip(*gradients, strict=True):
+        assert plain.norm() > 0
+        torch.testing.assert_close(plain, folded)
+    quick = specialize(bounds[1]).step(state, action, static)
+    torch.testing.assert_close(quick, outs[0], rtol=0, atol=1e-12)
+    assert not quick.requires_grad
+    nothing = model.bind(scene).step(state, action)  # without a graph: zeros
+    assert (nothing - outs[0]).abs().max() > 1e-6

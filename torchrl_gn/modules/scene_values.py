@@ -1,0 +1,113 @@
+"""The numbers of a scene that a forward model reads; what is left is topology."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.scenes.joint_axes import joint_axes
+
+if TYPE_CHECKING:
+    from torchrl_gn.modules.forward_model import ForwardModel
+    from torchrl_gn.scenes import Scene
+
+
+class SceneValues(NamedTuple):
+    """Numbers that differ between variants of a scene (lengths, masses, ...), float64, each with or without a batch.
+
+    Attributes:
+        nodes: ``[*B, N, F_n]`` static node features that the model reads, in SI units; or inferred ones.
+        edges: ``[*B, E, F_e]``.
+        globals_: ``[*B, F_g]``.
+        joint_axis: ``[*B, E, 3]`` axis of each edge's joint, in the frame of the node that carries it.
+        rest: ``[*B, 4]`` the root's orientation at heading 0.
+        pivot: ``[*B, 3]`` where the heading's axis is, metres.
+        parent_arm: ``[*B, N, 3]`` where each node is pinned to its parent, in the parent's frame, metres.
+        arm: ``[*B, N, 3]`` the same in the node's own frame.
+    """
+
+    nodes: Tensor
+    edges: Tensor
+    globals_: Tensor
+    joint_axis: Tensor
+    rest: Tensor
+    pivot: Tensor
+    parent_arm: Tensor
+    arm: Tensor
+
+    @classmethod
+    def of(cls, scene: Scene, model: ForwardModel) -> SceneValues:
+        """What a model reads of a scene.
+
+        Raises:
+            ValueError: if the scene lacks features that the model reads.
+        """
+        heading = scene.heading
+        values = {
+            "nodes": _columns(scene, model, "nodes", scene.static.nodes, scene.static.node_names),
+            "edges": _columns(scene, model, "edges", scene.static.edges, scene.static.edge_names),
+            "globals_": _columns(scene, model, "globals_", scene.static.globals_, scene.static.global_names),
+            "joint_axis": joint_axes(scene)[1].repeat(2, axis=0),
+            "rest": np.array([1.0, 0.0, 0.0, 0.0]) if heading is None else heading.rest,
+            "pivot": np.zeros(3) if heading is None else heading.pivot,
+            "parent_arm": scene.linkage.parent_arm,
+            "arm": scene.linkage.arm,
+        }
+        return cls(**{name: torch.as_tensor(value, dtype=torch.float64) for name, value in values.items()})
+
+    @classmethod
+    def read(cls, static: TensorDictBase, own: SceneValues) -> SceneValues:
+        """Take the entries that a TensorDict has; the rest are a scene's ``own``.
+
+        Raises:
+            KeyError: if it has entries that are none of these.
+            ValueError: if an entry has a wrong shape.
+        """
+        unknown = sorted(set(map(str, static.keys())) - set(cls._fields))
+        if unknown:
+            raise KeyError(f"Static entries {unknown} are not known; use some of {list(cls._fields)}.")
+        values = {}
+        for name, usual in own._asdict().items():
+            value = static.get(name, None)
+            if value is None:
+                value = usual
+            elif value.shape[len(static.shape) :] != usual.shape:
+                shape = [*static.shape, *usual.shape]
+                raise ValueError(f"Static entry {name!r} must be {shape}, got {list(value.shape)}.")
+            values[name] = value
+        return cls(**values)
+
+    def tensordict(self) -> TensorDict:
+        """As entries of a TensorDict without batch."""
+        return TensorDict(self._asdict())
+
+
+def topology(scene: Scene) -> dict[str, object]:
+    """What variants of one scene have in common, as comparable values by what it is."""
+    heading, linkage = scene.heading, scene.linkage
+    turn = None if heading is None else (heading.exact, heading.node, heading.axis)
+    return {
+        "number of nodes": scene.num_nodes,
+        "edges": (scene.senders.tolist(), scene.receivers.tolist()),
+        "motors": (scene.num_actions, scene.edge_action.tolist()),
+        "components that move": scene.live.tolist(),
+        "invariant axes": scene.translation_invariant.tolist(),
+        "control step": round(scene.timestep, 9),
+        "heading": turn,
+        "pins": (linkage.parent.tolist(), linkage.root.tolist(), linkage.chain.tolist()),
+        "joint axes": joint_axes(scene)[0].tolist(),
+    }
+
+
+def _columns(scene: Scene, model: ForwardModel, part: str, values, names) -> np.ndarray:
+    if model.static == "inferred":
+        return np.zeros((*np.shape(values)[:-1], getattr(model.static_size, part)))
+    wanted = getattr(model.features, part)
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")
+    return np.asarray(values)[..., [names.index(name) for name in wanted]]
