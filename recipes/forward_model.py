@@ -24,7 +24,7 @@ from torchrl_gn.data import create_dataset, trajectory_buffer
 from torchrl_gn.evaluation import evaluate_errors, plot_training_curve, report
 from torchrl_gn.modules import FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import (
     Budget,
     RunFolder,
@@ -43,6 +43,12 @@ MAY_CHANGE = ("minutes", "steps", "threads", "logger", "run_dir", "checkpoint_se
 def options(cfg: DictConfig) -> dict[str, Any]:
     """Options as plain values."""
     return cast(dict[str, Any], OmegaConf.to_container(cfg))
+
+
+def make_model(cfg: DictConfig, scene: Scene) -> ForwardModel:
+    """A model with fresh weights."""
+    items = (scene.num_nodes, scene.num_edges) if cfg.model.core == "mlp" else None
+    return ForwardModel(FeatureSet.of(scene), items=items, **options(cfg.model))
 
 
 def make_trainer(cfg: DictConfig, model: ForwardModel, scene, dataset) -> Trainer:
@@ -137,7 +143,7 @@ def main(cfg: DictConfig) -> None:
             seed=cfg.data.seed,
             progress=show,
         )
-    model = begun.model if begun else ForwardModel(FeatureSet.of(scene), **options(cfg.model))
+    model = begun.model if begun else make_model(cfg, scene)
     trainer = make_trainer(cfg, model, scene, dataset)
     if begun:
         trainer.load_state_dict(begun.training)

@@ -78,11 +78,12 @@ def test_levers_are_the_derivative_of_places(make_model, name):
     turn = torch.randn(2, scene.num_nodes, 3, generator=generator, dtype=torch.float64) * live[:, 9:]
     still = torch.zeros_like(turn)
 
+    arms = bound.linking.arms(state, *bound.values[-2:])
+
     def apart(turn):
-        places, _, _ = bound.linking.pins(state, turn, still, *bound.values[-2:])
+        places = bound.linking.pins(state, arms, turn, still)[1][..., :3]
         return places - torch.where(bound.linking.root_moves, bound.linking.mean @ places, still)
 
-    arms = bound.linking.pins(state, still, still, *bound.values[-2:])[2]
     moves = (arms.flatten(1) @ bound.linking.levers).unflatten(-1, (-1, len(bound.linking.turning)))
     moved = (moves @ turn.flatten(1)[:, bound.linking.turning].unsqueeze(-1)).view_as(turn)
     torch.testing.assert_close((apart(1e-6 * turn) - apart(-1e-6 * turn)) / 2e-6, moved, rtol=1e-6, atol=1e-8)

@@ -84,7 +84,13 @@ def test_every_sample_is_predicted_as_its_own_scene(variants, samples, model, wa
 
 
 @pytest.mark.parametrize("special", [False, True])
-def test_rollouts_of_variants(variants, samples, model, special):
+@pytest.mark.parametrize("core", ["gn", "mlp"])
+def test_rollouts_of_variants(variants, samples, model, special, core):
+    if core == "mlp":
+        items = (variants[0].num_nodes, variants[0].num_edges)
+        mlp = ForwardModel(FeatureSet.of(variants[0]), core="mlp", mlp_hidden=(8, 8), items=items).double()
+        mlp.load_state_dict({**mlp.state_dict(), **{k: v for k, v in model.state_dict().items() if "core" not in k}})
+        model = mlp
     bound = model.requires_grad_(False).bind(variants[0], static_key="static")
     module = specialize(bound) if special else bound
     state, _, static = inputs(samples, bound, variants)

@@ -49,6 +49,18 @@ def test_every_scene_is_predicted_as_by_the_plain_model(scenes, make_model, rand
     compare(model.to(dtype), scene, state, action, 1e-10 if dtype == torch.float64 else 1e-5)
 
 
+@pytest.mark.parametrize("options", [{"activation": name} for name in ("silu", "gelu", "tanh")] + [{"core": "mlp"}])
+@pytest.mark.parametrize("name", ["swimmer3", "jaco"])
+def test_other_cores_are_predicted_as_by_the_plain_model(
+    scenes, make_model, random_states, random_actions, name, options
+):
+    scene = scenes[name] if name in scenes else load_scene(name)
+    items = (scene.num_nodes, scene.num_edges)
+    model = make_model(scene, items=items, mlp_hidden=(16, 12), **options)
+    state, action = random_states(scene, 16, seed=3), random_actions(scene, 16, seed=3)
+    compare(model.double(), scene, state, action, 1e-10)
+
+
 @st.composite
 def trees(draw) -> str:
     """MJCF of a random tree of bodies with random joints and motors."""

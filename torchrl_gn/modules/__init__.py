@@ -10,6 +10,7 @@ from torchrl_gn.modules.gn_block import GraphSize as GraphSize
 from torchrl_gn.modules.graph import Graph as Graph
 from torchrl_gn.modules.graph import graph_concat as graph_concat
 from torchrl_gn.modules.graph import graph_split as graph_split
+from torchrl_gn.modules.mlp_core import MLPCore as MLPCore
 from torchrl_gn.modules.normalizer import Normalizer as Normalizer
 from torchrl_gn.modules.precision import fast_matmul as fast_matmul
 from torchrl_gn.modules.scene_values import SceneValues as SceneValues

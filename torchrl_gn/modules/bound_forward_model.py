@@ -21,6 +21,7 @@ from torchrl_gn.scenes.joint_axes import joint_axes
 if TYPE_CHECKING:
     from torchrl_gn.modules.folded_core import FoldedCore
     from torchrl_gn.modules.forward_model import ForwardModel
+    from torchrl_gn.modules.mlp_core import FoldedMLP
     from torchrl_gn.scenes import Scene
 
 
@@ -36,7 +37,7 @@ class Folded(NamedTuple):
         values: the numbers of the scene, or of every sample's.
     """
 
-    core: FoldedCore | None
+    core: FoldedCore | FoldedMLP | None
     values: SceneValues
 
 
@@ -95,6 +96,12 @@ class BoundForwardModel(TensorDictModuleBase):
             self.in_keys.append(static_key)
         next_key = ("next", state_key) if isinstance(state_key, str) else ("next", *state_key)
         self.out_keys: list[NestedKey] = [next_key]
+        items = model.options["items"]
+        if items is not None and tuple(items) != (scene.num_nodes, scene.num_edges):
+            raise ValueError(
+                f"The model is an MLP for graphs of {items[0]} nodes and {items[1]} edges; scene {scene.name!r} has"
+                f" {scene.num_nodes} and {scene.num_edges}. Train another, or a graph network."
+            )
         self.model, self.scene, self.layout = model, scene, model.layout
         self.timestep, self.plain = float(scene.timestep), plain
 

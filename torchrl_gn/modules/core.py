@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torch import nn
+from torch import Tensor, nn
 
+from torchrl_gn.modules.folded_core import FoldedCore, fold_core
 from torchrl_gn.modules.gn_block import GNBlock, GraphSize
 from torchrl_gn.modules.graph import Graph, graph_concat
+from torchrl_gn.modules.linear import ACTIVATIONS
 
 
 class GNCore(nn.Module):
@@ -24,9 +26,10 @@ class GNCore(nn.Module):
         edge_hidden: hidden sizes of both edge MLPs.
         node_hidden: hidden sizes of both node MLPs.
         global_hidden: hidden sizes of the global MLP.
+        activation: between the layers of all MLPs.
 
     Raises:
-        ValueError: if an MLP has no hidden layer.
+        ValueError: if an MLP has no hidden layer, or the activation is not known.
     """
 
     def __init__(
@@ -38,8 +41,12 @@ class GNCore(nn.Module):
         edge_hidden: Sequence[int] = (128, 128),
         node_hidden: Sequence[int] = (128, 128),
         global_hidden: Sequence[int] = (128, 128),
+        activation: str = "relu",
     ) -> None:
         super().__init__()
+        if activation not in ACTIVATIONS:
+            raise ValueError(f"activation={activation!r} is not known; use one of {list(ACTIVATIONS)}.")
+        self.activation = activation
         if not (edge_hidden and node_hidden and global_hidden):
             raise ValueError(
                 "Every MLP of the core needs a hidden layer, got"
@@ -47,9 +54,13 @@ class GNCore(nn.Module):
             )
         between = GraphSize(latent, latent, latent)
         hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
-        self.first = GNBlock(in_size, between, **hidden)
-        self.second = GNBlock(in_size + between, GraphSize(out_nodes, latent, 0), **hidden)
+        self.first = GNBlock(in_size, between, activation=activation, **hidden)
+        self.second = GNBlock(in_size + between, GraphSize(out_nodes, latent, 0), activation=activation, **hidden)
 
     def forward(self, graph: Graph) -> Graph:
         """Graph with ``in_size`` features in, graph with ``out_nodes`` node features out."""
         return self.second(graph_concat(graph, self.first(graph)))
+
+    def fold(self, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedCore:
+        """The same function for graphs of one topology with all that is constant folded, see :func:`fold_core`."""
+        return fold_core(self, size, predicted, static)

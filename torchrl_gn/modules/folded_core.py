@@ -1,6 +1,6 @@
 """The core's function computed with fewer operations, exactly, for one scene.
 
-Between two ReLUs everything is linear, so for a batch of graphs of one scene
+Between two activations everything is linear, so for a batch of graphs of one scene
 
 - a first layer's weight is split by its inputs: nodes are projected once a node, globals
   once a graph, and what is the same for every sample (static features, biases) once a batch;
@@ -22,16 +22,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.gn_block import GraphSize
 from torchrl_gn.modules.graph import Graph
 from torchrl_gn.modules.linear import linear, product
+
+if TYPE_CHECKING:
+    from torchrl_gn.modules.core import GNCore
 
 _CACHED = 2**20  # numbers
 
@@ -76,6 +78,7 @@ class FoldedCore:
         second_node: inputs: received hidden, node, first node hidden.
         last_globals: as ``second_globals``, into nodes.
         out: weight ``[F_out, h]`` and bias ``[F_out]``.
+        activation: after every hidden layer.
     """
 
     ends: Tensor
@@ -93,6 +96,7 @@ class FoldedCore:
     second_node: Factors
     last_globals: tuple[Tensor, Tensor]
     out: tuple[Tensor, Tensor]
+    activation: str
 
     def __call__(self, nodes: Tensor, edges: Tensor, globals_: Tensor) -> Tensor:
         """Output of the predicted nodes.
@@ -109,12 +113,12 @@ class FoldedCore:
         ends = torch.cat((*product(self.ends, nodes).split((count_e, count_e)), edges), dim=-1)
         everywhere = globals_.expand(count_e, -1, -1)
 
-        edge_hidden = _hidden(self.first_edge, (ends, everywhere))
+        edge_hidden = self._hidden(self.first_edge, (ends, everywhere))
         received, summed = product(self.reduce, edge_hidden).split((count_n, 1))
         everywhere = globals_.expand(count_n, -1, -1)
-        node_hidden = _hidden(self.first_node, (received, nodes, everywhere))
+        node_hidden = self._hidden(self.first_node, (received, nodes, everywhere))
         summed = (node_hidden.sum(0, keepdim=True), summed, globals_)
-        global_hidden = _hidden(self.first_global, summed)
+        global_hidden = self._hidden(self.first_global, summed)
 
         # Projected once a node or graph, then gathered by one product: senders, receivers, graph.
         projected = torch.cat(
@@ -124,15 +128,24 @@ class FoldedCore:
             )
         )
         inputs = (edge_hidden[self.kept], ends[self.kept])
-        edge_hidden = _hidden(self.second_edge, inputs, self.gather, projected)
+        edge_hidden = self._hidden(self.second_edge, inputs, self.gather, projected)
         received = product(self.reduce_last, edge_hidden)
 
         graph = linear(tuple(zip((global_hidden, globals_), self.last_globals, strict=True)))
         moving, moving_hidden = nodes[self.predicted], node_hidden[self.predicted]
         ones = graph.new_ones(len(received), 1)
-        hidden = _hidden(self.second_node, (received, moving, moving_hidden), ones, graph)
+        hidden = self._hidden(self.second_node, (received, moving, moving_hidden), ones, graph)
         weight, bias = self.out
         return F.linear(hidden, weight, bias)
+
+    def _hidden(self, factors: Factors, inputs, matrix=None, items=None) -> Tensor:
+        """Last hidden activation of an MLP whose first layer is given by its factors."""
+        pairs = tuple(zip(inputs, factors.weights, strict=True))
+        hidden = linear(pairs, factors.table, matrix, items, self.activation)
+        for weight, bias in factors.hidden:
+            table = bias.expand(hidden.shape[0], 1, -1)
+            hidden = linear(((hidden, weight),), table, activation=self.activation)
+        return hidden
 
     def predict(self, dynamic: Graph) -> Tensor:
         """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, zero if not predicted."""
@@ -187,7 +200,7 @@ class FoldedCore:
 
     def snapshot(self, dtype: torch.dtype) -> FoldedCore:
         """Copy that shares no memory and passes no gradient to the weights."""
-        return _map(self, lambda tensor: tensor.detach().to(dtype).clone(memory_format=torch.contiguous_format))
+        return map_tensors(self, lambda tensor: tensor.detach().to(dtype).clone(memory_format=torch.contiguous_format))
 
 
 def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedCore:
@@ -277,16 +290,8 @@ def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -
         second_node=_factors(second.node_mlp, (wa @ edge_out, wn, wln @ node_out), table),
         last_globals=(wlg @ global_out, wg),
         out=_last_layer(second.node_mlp),
+        activation=core.activation,
     )
-
-
-def _hidden(factors: Factors, inputs, matrix=None, items=None) -> Tensor:
-    """Last hidden activation of an MLP whose first layer is given by its factors."""
-    pairs = tuple(zip(inputs, factors.weights, strict=True))
-    hidden = linear(pairs, factors.table, matrix, items, relu=True)
-    for weight, bias in factors.hidden:
-        hidden = linear(((hidden, weight),), bias.expand(hidden.shape[0], 1, -1), relu=True)
-    return hidden
 
 
 def _factors(mlp: nn.Sequential, weights: tuple[Tensor, ...], table: Tensor) -> Factors:
@@ -299,14 +304,14 @@ def _columns(weight: Tensor, columns: Columns) -> Tensor:
     return weight[:, index] * factor
 
 
-def _map(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
+def map_tensors(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
     """The same nested tuples and dataclasses with ``function`` on every floating-point tensor."""
     if isinstance(value, Tensor):
         return function(value) if value.is_floating_point() else value
     if isinstance(value, tuple):
-        return tuple(_map(entry, function) for entry in value)
+        return tuple(map_tensors(entry, function) for entry in value)
     if is_dataclass(value) and not isinstance(value, type):
-        changed = {field.name: _map(getattr(value, field.name), function) for field in fields(value)}
+        changed = {field.name: map_tensors(getattr(value, field.name), function) for field in fields(value)}
         return replace(value, **changed)
     return value
 

@@ -10,9 +10,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_gn.modules.core import GNCore
-from torchrl_gn.modules.folded_core import FoldedCore, fold_core
+from torchrl_gn.modules.folded_core import FoldedCore
 from torchrl_gn.modules.gn_block import GraphSize
 from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.mlp_core import FoldedMLP, MLPCore
 from torchrl_gn.modules.normalizer import Normalizer
 from torchrl_gn.modules.state_layout import BODY_STATE, Component, Encoding, StateLayout
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
 
 Static = Literal["none", "scene", "inferred"]
+CoreKind = Literal["gn", "mlp"]
 
 # Spreads below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 _DYNAMIC_FLOOR = 1e-9
@@ -73,13 +75,18 @@ class ForwardModel(nn.Module):
         link: keep bodies that joints pin together together: of the predicted positions and
             velocities only those of each linkage as a whole are used, the rest follows
             from the orientations and angular velocities. The paper lets bodies drift apart.
+        core: ``"gn"``, two graph networks, or their rival ``"mlp"``, one MLP over the flattened graph
+            (paper, SM "MLP baseline architectures").
         latent: features of the graph between the two GN blocks.
         edge_hidden: hidden sizes of the edge MLPs.
         node_hidden: hidden sizes of the node MLPs.
         global_hidden: hidden sizes of the global MLP.
+        mlp_hidden: hidden sizes of the rival.
+        items: numbers of nodes and edges of the only graphs that the rival can read.
+        activation: between the layers: ``"relu"`` (paper), ``"silu"``, ``"gelu"`` or ``"tanh"``.
 
     Raises:
-        ValueError: if ``static`` or ``encoding`` is none of the choices.
+        ValueError: if an option is none of its choices, or the rival lacks ``items``.
     """
 
     def __init__(
@@ -95,13 +102,21 @@ class ForwardModel(nn.Module):
         recenter: bool = True,
         align: bool = True,
         link: bool = True,
+        core: CoreKind = "gn",
         latent: int = 128,
         edge_hidden: Sequence[int] = (128, 128),
         node_hidden: Sequence[int] = (128, 128),
         global_hidden: Sequence[int] = (128, 128),
+        mlp_hidden: Sequence[int] = (256, 256, 256, 256, 256),
+        items: Sequence[int] | None = None,
+        activation: str = "relu",
     ) -> None:
         super().__init__()
-        for name, value, choices in (("static", static, Static), ("encoding", encoding, Encoding)):
+        for name, value, choices in (
+            ("static", static, Static),
+            ("encoding", encoding, Encoding),
+            ("core", core, CoreKind),
+        ):
             if value not in get_args(choices):
                 raise ValueError(f"{name}={value!r} is not known; use one of {list(get_args(choices))}.")
         self.features = features if static == "scene" else FeatureSet()
@@ -118,10 +133,14 @@ class ForwardModel(nn.Module):
             "recenter": recenter,
             "align": align,
             "link": link,
+            "core": core,
             "latent": latent,
             "edge_hidden": list(edge_hidden),
             "node_hidden": list(node_hidden),
             "global_hidden": list(global_hidden),
+            "mlp_hidden": list(mlp_hidden),
+            "items": None if items is None else list(items),
+            "activation": activation,
         }
 
         encoded = layout.encoded_size(encoding)
@@ -139,14 +158,16 @@ class ForwardModel(nn.Module):
         # The network's output has the residual's scale; errors are weighed by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
-        self.core = GNCore(
-            self.dynamic_size + self.static_size,
-            layout.delta_size,
-            latent=latent,
-            edge_hidden=edge_hidden,
-            node_hidden=node_hidden,
-            global_hidden=global_hidden,
-        )
+        in_size, out = self.dynamic_size + self.static_size, layout.delta_size
+        self.core: GNCore | MLPCore
+        if core == "gn":
+            hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
+            self.core = GNCore(in_size, out, latent=latent, activation=activation, **hidden)
+        elif items is None:
+            raise ValueError("core='mlp' needs items, the numbers of nodes and edges of its scene.")
+        else:
+            nodes, edges = items
+            self.core = MLPCore(in_size, out, items=(nodes, edges), hidden=mlp_hidden, activation=activation)
 
     def bind(
         self, scene: Scene, *, strict: bool = False, plain: bool = False, static_key: NestedKey | None = None
@@ -168,16 +189,16 @@ class ForwardModel(nn.Module):
 
         return BoundForwardModel(self, scene, strict=strict, plain=plain, static_key=static_key)
 
-    def fold(self, static: Graph, predicted: Tensor) -> FoldedCore:
+    def fold(self, static: Graph, predicted: Tensor) -> FoldedCore | FoldedMLP:
         """The core for one scene, differentiable in the weights.
 
         Args:
             static: normalised static graph.
             predicted: ``[P]`` indices of the nodes that move.
         """
-        return fold_core(self.core, self.dynamic_size, predicted, static)
+        return self.core.fold(self.dynamic_size, predicted, static)
 
-    def forward(self, dynamic: Graph, folded: FoldedCore) -> Tensor:
+    def forward(self, dynamic: Graph, folded: FoldedCore | FoldedMLP) -> Tensor:
         """Predicted residual change, in SI units.
 
         Args:

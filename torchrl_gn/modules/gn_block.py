@@ -11,6 +11,7 @@ from torch_geometric.nn import MessagePassing
 from torchrl.modules import MLP
 
 from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.linear import ACTIVATIONS
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class GNBlock(MessagePassing):
         n^*_i &= f_n(g, n_i, \textstyle\sum_{j: r_j = i} e^*_j) \\
         g^*   &= f_g(g, \textstyle\sum_i n^*_i, \textstyle\sum_j e^*_j)
 
-    with MLPs for the three functions, ReLU between layers and none after the last.
+    with MLPs for the three functions, an activation between layers and none after the last.
 
     Args:
         in_size: features of the input graph.
@@ -42,6 +43,7 @@ class GNBlock(MessagePassing):
         edge_hidden: hidden sizes of the edge MLP.
         node_hidden: hidden sizes of the node MLP.
         global_hidden: hidden sizes of the global MLP.
+        activation: ``"relu"`` (paper), ``"silu"``, ``"gelu"`` or ``"tanh"``.
     """
 
     def __init__(
@@ -52,15 +54,16 @@ class GNBlock(MessagePassing):
         edge_hidden: Sequence[int] = (128, 128),
         node_hidden: Sequence[int] = (128, 128),
         global_hidden: Sequence[int] = (128, 128),
+        activation: str = "relu",
     ) -> None:
         super().__init__(aggr="sum", node_dim=-2)
         self.in_size, self.out_size = in_size, out_size
         g, n, e = in_size.globals_, in_size.nodes, in_size.edges
-        self.edge_mlp = _mlp(g + 2 * n + e, edge_hidden, out_size.edges)
-        self.node_mlp = _mlp(g + n + out_size.edges, node_hidden, out_size.nodes)
+        self.edge_mlp = _mlp(g + 2 * n + e, edge_hidden, out_size.edges, activation)
+        self.node_mlp = _mlp(g + n + out_size.edges, node_hidden, out_size.nodes, activation)
         self.global_mlp = None
         if out_size.globals_:
-            self.global_mlp = _mlp(g + out_size.nodes + out_size.edges, global_hidden, out_size.globals_)
+            self.global_mlp = _mlp(g + out_size.nodes + out_size.edges, global_hidden, out_size.globals_, activation)
 
     def forward(self, graph: Graph) -> Graph:
         """``[*B, N, F]``, ``[*B, E, F]``, ``[*B, F]`` features in, the same shapes out."""
@@ -85,8 +88,8 @@ class GNBlock(MessagePassing):
         return edges
 
 
-def _mlp(in_features: int, hidden: Sequence[int], out_features: int) -> MLP:
-    return MLP(in_features, out_features, num_cells=list(hidden), activation_class=torch.nn.ReLU)
+def _mlp(in_features: int, hidden: Sequence[int], out_features: int, activation: str) -> MLP:
+    return MLP(in_features, out_features, num_cells=list(hidden), activation_class=ACTIVATIONS[activation])
 
 
 def _per_item(globals_: Tensor, count: int) -> Tensor:

@@ -7,29 +7,34 @@ the products: :class:`_Layer` accumulates them into one buffer.
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
+ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
 
-def linear(pairs, table=None, matrix=None, items=None, relu: bool = False) -> Tensor:
-    """``relu(table + matrix @ items + sum_k x_k @ W_k.T)``; any part may be missing.
+
+def linear(pairs, table=None, matrix=None, items=None, activation: str | None = None) -> Tensor:
+    """``activation(table + matrix @ items + sum_k x_k @ W_k.T)``; any part may be missing.
 
     Args:
         pairs: ``x_k`` ``[I, B, F_k]`` with ``W_k`` ``[h, F_k]``; those without features are left out.
         table: ``[I, 1 or B, h]``.
         matrix: ``[I, J]``.
         items: ``[J, B, h]``.
-        relu: whether to apply a ReLU.
+        activation: one of :data:`ACTIVATIONS`, or none.
 
     Returns:
         ``[I, B, h]``.
     """
+    relu = activation == "relu"
     used = [tensor for pair in pairs if pair[0].shape[-1] for tensor in pair]
     if not used and items is None and table is not None:  # nothing varies
         out = table.expand(-1, pairs[0][0].shape[1], -1)
-        return F.relu(out) if relu else out
-    layer = _plain_layer if torch.compiler.is_compiling() else _Layer.apply
-    return layer(relu, table, matrix, items, *used)
+        out = F.relu(out) if relu else out
+    else:
+        layer = _plain_layer if torch.compiler.is_compiling() else _Layer.apply
+        out = layer(relu, table, matrix, items, *used)
+    return out if relu or activation is None else ACTIVATIONS[activation]()(out)
 
 
 def product(matrix: Tensor, items: Tensor) -> Tensor:

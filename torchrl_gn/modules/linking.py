@@ -16,8 +16,6 @@ from torchrl_gn.modules.state_layout import BODY_STATE
 if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
 
-_PARTS = ("position", "orientation", "linear_velocity", "angular_velocity")
-
 
 class Linking(Float64Buffers):
     """Settle what is predicted for bodies that are pinned together.
@@ -42,6 +40,7 @@ class Linking(Float64Buffers):
     root_moves: Tensor
     turning: Tensor
     levers: Tensor
+    spread: Tensor
     live: Tensor
 
     def __init__(self, scene: Scene) -> None:
@@ -55,6 +54,7 @@ class Linking(Float64Buffers):
             "root": np.eye(scene.num_nodes)[linkage.root],
             "root_moves": scene.live[linkage.root, :3],
             "turning": scene.live[:, 9:].ravel().nonzero()[0],
+            "spread": np.eye(3 * scene.num_nodes)[:, scene.live[:, 9:].ravel()],
             "live": scene.live,
         }
         for name, value in values.items():
@@ -74,56 +74,59 @@ class Linking(Float64Buffers):
         Returns:
             ``[*B, N, 12]``, zero in dead components; ``delta`` itself where nothing is apart.
         """
-        shift, turn, push, spin = delta.split(3, dim=-1)
-        places, speeds, arms = self.pins(state, turn, spin, parent_arm, arm)
+        at, to = BODY_STATE.slices, BODY_STATE.delta_slices
+        turn, spin = delta[..., to["orientation"]], delta[..., to["angular_velocity"]]
+        here = torch.cat((state[..., at["position"]], state[..., at["linear_velocity"]]), dim=-1)
+        moved = here + torch.cat((delta[..., to["position"]], delta[..., to["linear_velocity"]]), dim=-1)
+        before = self.arms(state, parent_arm, arm)
+
+        arms, along = self.pins(state, before, turn, spin)
         # [*B, 3 N, L]: how turning moves the bodies of a linkage, linear in the arms.
         moves = (arms.flatten(-3) @ self.levers.to(state.dtype)).unflatten(-1, (-1, len(self.turning)))
-        apart = self._gap(state, _PARTS[0], shift, places)
-        misses = torch.stack((apart, self._gap(state, _PARTS[2], push, speeds)), -1)
+        misses = self._gap(moved, along).unflatten(-1, (2, 3)).movedim(-2, -1).flatten(-3, -2)
         ratio = (std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)).to(state.dtype)
         pull = ratio * moves.mT
         normal = pull @ moves + torch.eye(moves.shape[-1], dtype=state.dtype, device=state.device)
         # At least the identity: never singular, so nothing needs to be checked.
-        solved, _ = torch.linalg.solve_ex(normal, pull @ misses.flatten(-3, -2))
-        better = self._spread(solved)
+        solved, _ = torch.linalg.solve_ex(normal, pull @ misses)
+        better = (self.spread.to(state.dtype) @ solved).unflatten(-2, (-1, 3))  # [*B, N, 3, 2]
         turn, spin = turn + better[..., 0], spin + better[..., 1]
 
-        places, speeds, _ = self.pins(state, turn, spin, parent_arm, arm)
-        shift = shift - self._gap(state, _PARTS[0], shift, places)
-        push = push - self._gap(state, _PARTS[2], push, speeds)
+        _, along = self.pins(state, before, turn, spin)
+        shift, push = (moved - here - self._gap(moved, along)).split(3, dim=-1)
         return torch.cat((shift, turn, push, spin), dim=-1) * self.live
 
-    def pins(
-        self, state: Tensor, turn: Tensor, spin: Tensor, parent_arm: Tensor, arm: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def arms(self, state: Tensor, parent_arm: Tensor, arm: Tensor) -> Tensor:
+        """From each pin's upper and lower body to it, ``[*B, 2, N, 3]``, in the world frame."""
+        frame = quaternion.to_matrix(state[..., BODY_STATE.slices["orientation"]]).unflatten(-1, (3, 3))
+        upper = frame[..., self.parent, :, :] @ parent_arm.to(state.dtype).unsqueeze(-1)
+        lower = frame @ arm.to(state.dtype).unsqueeze(-1)
+        return torch.stack((upper, lower), dim=-4).squeeze(-1)
+
+    def pins(self, state: Tensor, arms: Tensor, turn: Tensor, spin: Tensor) -> tuple[Tensor, Tensor]:
         """Where pins put the bodies after a change of orientations and angular velocities.
 
         Args:
             state: ``[*B, N, 13]``.
+            arms: ``[*B, 2, N, 3]`` before the change.
             turn: ``[*B, N, 3]`` rotation vectors.
             spin: ``[*B, N, 3]`` changes of angular velocity.
-            parent_arm: as in :meth:`forward`.
-            arm: as in :meth:`forward`.
 
         Returns:
-            Places and speeds ``[*B, N, 3]`` relative to each linkage's root, and the arms
-            ``[*B, 2, N, 3]`` from each pin's upper and lower body to it, all in the world frame.
+            Arms after it, and places and speeds ``[*B, N, 6]`` relative to each linkage's root.
         """
-        at = BODY_STATE.slices
-        orientation = quaternion.product(quaternion.exp(turn), state[..., at["orientation"]])
-        frame = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
-        speed = state[..., at["angular_velocity"]] + spin
-        upper = (frame[..., self.parent, :, :] @ parent_arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
-        lower = (frame @ arm.to(state.dtype).unsqueeze(-1)).squeeze(-1)
-        slip = torch.linalg.cross(speed[..., self.parent, :], upper) - torch.linalg.cross(speed, lower)
-        chain = self.chain.to(state.dtype)
-        return chain @ (upper - lower), chain @ slip, torch.stack((upper, lower), dim=-3)
+        speed = state[..., BODY_STATE.slices["angular_velocity"]] + spin
+        both = torch.cat((turn, speed), dim=-1)
+        turn, speed = torch.stack((both[..., self.parent, :], both), dim=-3).split(3, dim=-1)
+        arms = quaternion.rotate_by(turn, arms)
+        upper, lower = torch.cat((arms, torch.linalg.cross(speed, arms)), dim=-1).unbind(-3)
+        return arms, _mix(self.chain, upper - lower)
 
-    def _gap(self, state: Tensor, name: str, change: Tensor, along: Tensor) -> Tensor:
-        """How far a predicted position or velocity ``[*B, N, 3]`` is from where its linkage has it."""
-        start = state[..., BODY_STATE.slices[name]] + change - along  # every body's opinion of its root's
-        mean, root = self.mean.to(state.dtype), self.root.to(state.dtype)
-        return start - torch.where(self.root_moves, mean @ start, root @ start)
+    def _gap(self, moved: Tensor, along: Tensor) -> Tensor:
+        """How far predicted positions and velocities ``[*B, N, 6]`` are from where their linkages have them."""
+        start = moved - along  # every body's opinion of its root's
+        moves = torch.cat((self.root_moves, self.root_moves), dim=-1)
+        return start - torch.where(moves, _mix(self.mean, start), _mix(self.root, start))
 
     def _levers(self) -> Tensor:
         """``[6 N, 3 N L]``: velocities of bodies about their linkage's own for each live angular velocity, by arm."""
@@ -138,10 +141,10 @@ class Linking(Float64Buffers):
         bodies = bodies - self.root_moves.double()[:, :, None, None] * means
         return bodies.flatten(-2).flatten(-3, -2)[..., self.turning].flatten(1)
 
-    def _spread(self, values: Tensor) -> Tensor:
-        """``[*B, L, R]`` values of live angular components as ``[*B, N, 3, R]``."""
-        full = values.new_zeros(*values.shape[:-2], 3 * len(self.parent), values.shape[-1])
-        return full.index_copy(-2, self.turning, values).unflatten(-2, (-1, 3))
+
+def _mix(matrix: Tensor, values: Tensor) -> Tensor:
+    """``[N, N]`` times ``[*B, N, F]``, as one product and not one for every sample."""
+    return F.linear(values.mT.contiguous(), matrix.to(values.dtype)).mT
 
 
 def _cross(v: Tensor) -> Tensor:

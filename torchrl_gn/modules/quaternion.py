@@ -152,3 +152,24 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
         ``[..., 3]`` vectors.
     """
     return (to_matrix(q).unflatten(-1, (3, 3)) @ v.unsqueeze(-1)).squeeze(-1)
+
+
+def rotate_by(rotation_vector: Tensor, v: Tensor) -> Tensor:
+    """Vectors turned by rotation vectors (Rodrigues' formula), the same as ``rotate(exp(rotation_vector), v)``.
+
+    Args:
+        rotation_vector: ``[..., 3]``, radians.
+        v: ``[..., 3]`` vectors, broadcast against it.
+
+    Returns:
+        ``[..., 3]`` vectors.
+    """
+    square = rotation_vector.square().sum(-1, keepdim=True)
+    small = square < 1e-8
+    # As in exp: nothing divides by zero, not even in the branch that is not taken.
+    angle = torch.where(small, torch.ones_like(square), square).sqrt()
+    half = (0.5 * angle).sin() / angle
+    sinc = torch.where(small, 1 - square / 6, angle.sin() / angle)
+    versine = torch.where(small, 0.5 - square / 24, 2 * half.square())
+    across = torch.linalg.cross(rotation_vector.expand_as(v), v)
+    return v + sinc * across + versine * torch.linalg.cross(rotation_vector.expand_as(v), across)

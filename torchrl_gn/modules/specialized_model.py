@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded, UnseenFeatureWarning
 from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
-from torchrl_gn.modules.folded_core import copy_into, fold_core
+from torchrl_gn.modules.folded_core import FoldedCore, copy_into
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.scene_values import SceneValues
 
@@ -124,7 +124,7 @@ class SpecializedForwardModel(BoundForwardModel):
         # In float64, so that folding loses nothing.
         core = copy.deepcopy(model.core).double()
         static = self.static_graph(values, torch.float64)
-        full = fold_core(core, model.dynamic_size, self.predicted_nodes, static)
+        full = core.fold(model.dynamic_size, self.predicted_nodes, static)
         small = full.reduced(
             (self.node_columns, nodes.inverse_std[self.node_columns]),
             (self.edge_columns, edges.inverse_std[self.edge_columns]),
@@ -163,14 +163,17 @@ class SpecializedForwardModel(BoundForwardModel):
             core(graph_concat(graph(size.nodes, size.edges, self.network_dtype), static))
         with FlopCounterMode(display=False) as quick, torch.no_grad():
             folded.predict(graph(len(self.node_columns), len(self.edge_columns), self.dtype))
-        first = core.first.in_size
+        first = self.model.dynamic_size + self.model.static_size
+        second = (
+            {"edges of the second block": (edges, folded.gather.shape[0])} if isinstance(folded, FoldedCore) else {}
+        )
         return {
             "node features": (first.nodes, len(self.node_columns)),
             "edge features": (first.edges, len(self.edge_columns)),
             "global features": (first.globals_, 0),
             "nodes predicted": (nodes, len(self.predicted_nodes)),
             "channels predicted": (self.layout.delta_size, len(self.rows)),
-            "edges of the second block": (edges, folded.gather.shape[0]),
+            **second,
             "kFLOP": (plain.get_total_flops() / 1e3, quick.get_total_flops() / 1e3),
         }
 
