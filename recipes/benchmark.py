@@ -1,9 +1,9 @@
 """Run time against error of learned models and of MuJoCo itself, for one system.
 
-    python recipes/benchmark.py [system=swimmer6] [minutes=4] [sizes=[64,128,256]] [batches=[1,128,4096]]
+    python recipes/benchmark.py [system=swimmer6] [minutes=4] [sizes=[64,128,256]] [mlps=[[512,512,512]]]
 
 Every contestant predicts the same rollouts (starts and random controls of the dataset's kind) and is compared with
-a finely stepped MuJoCo: GN forward models of several sizes, trained here for `minutes` each (or
+a finely stepped MuJoCo: GN forward models of several sizes and MLPs, trained here for `minutes` each (or
 `checkpoints=[FOLDER,...]`), evaluated plain, specialised (with `fast_matmul`) and in bfloat16; and MuJoCo at its own
 and at coarser time steps and solver settings. Errors are relative to the constant prediction, over equal simulated
 time. Run time is wall time per simulated second of one trajectory, on `threads` threads, at every batch size:
@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
@@ -58,17 +59,26 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[Path]:
     """Run folders of the models to measure, training those that are not there."""
     if cfg.checkpoints:
         return [Path(folder) for folder in cfg.checkpoints]
-    folders = []
+    variants = {}
     for size in cfg.sizes:
-        folder = run.path / "models" / str(size)
-        folders.append(folder)
-        hidden = f"[{size},{size}]"
+        sizes = [f"model.{part}_hidden=[{size},{size}]" for part in ("edge", "node", "global")]
+        variants[f"gn_{size}"] = [f"model.latent={size}", *sizes]
+    for hidden in cfg.mlps:
+        variants[f"mlp_{len(hidden)}x{hidden[0]}"] = ["model.core=mlp", f"model.mlp_hidden={list(hidden)}"]
+    for name, sizes in variants.items():
+        folder = run.path / "models" / name
         options = [f"system={cfg.system}", f"run_dir={folder}", f"data.folder={run.path / 'data'}", f"seed={cfg.seed}"]
-        options += [f"model.latent={size}", *(f"model.{part}_hidden={hidden}" for part in ("edge", "node", "global"))]
-        options += [f"minutes={cfg.minutes}", *cfg.training]
-        print(f"training size {size}", flush=True)
+        options += [*sizes, f"minutes={cfg.minutes}", *cfg.training]
+        print(f"training {name}", flush=True)
         subprocess.run([sys.executable, RECIPES / "forward_model.py", *options], check=True, stdout=subprocess.DEVNULL)
-    return folders
+    return [run.path / "models" / name for name in variants]
+
+
+def title(options: dict[str, Any]) -> tuple[str, str]:
+    """Kind and size of a model."""
+    if options["core"] == "mlp":
+        return "MLP", f"MLP {len(options['mlp_hidden'])} x {options['mlp_hidden'][0]}"
+    return "GN", f"GN {len(options['edge_hidden'])} x {options['edge_hidden'][0]}"
 
 
 def learned(folders: list[Path], scene: Scene) -> list[Contestant]:
@@ -76,7 +86,9 @@ def learned(folders: list[Path], scene: Scene) -> list[Contestant]:
     contestants = []
     for folder in folders:
         model = load_checkpoint(folder).model.requires_grad_(False)
-        bound, size = model.bind(scene), model.options["latent"]
+        bound, (kind, name) = model.bind(scene), title(model.options)
+        if any(other.name.startswith(f"{name},") for other in contestants):
+            name = f"{name} ({folder.name})"
         ways = {
             "plain": (model.bind(scene, plain=True), False),
             "specialised": (specialize(bound), True),
@@ -88,7 +100,7 @@ def learned(folders: list[Path], scene: Scene) -> list[Contestant]:
                 with torch.no_grad(), fast_matmul() if fast else contextlib.nullcontext():
                     return module.rollout(state, actions)
 
-            contestants.append(Contestant(f"GN {size}, {way}", f"GN, {way}", rollout))
+            contestants.append(Contestant(f"{name}, {way}", f"{kind}, {way}", rollout))
     return contestants
 
 

@@ -86,3 +86,25 @@ def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path):
     code, _, errors = run(*options, "system=cartpole", "strict=true", recipe="evaluate")
     assert code == 1
     assert "never saw" in errors
+
+
+def test_comparing_goes_on_past_a_failed_run_and_keeps_finished_ones(tmp_path):
+    small = ["data.train=20", "data.validation=5", "data.test=5"]
+    options = ["systems=[pendulum]", "minutes=0.01", f"run_dir={tmp_path}", f"overrides={small}"]
+    bad = "+variants.bad=['model.latent=zero']"
+    code, output, errors = run(*options, bad, "only=[default,bad]", recipe="compare")
+    assert code == 1 and "1 of 2 runs failed" in errors
+    rows = {line.split("|")[1].strip(): line for line in output.splitlines() if line.startswith("|")}
+    assert rows["bad"].count(" - ") == 2 and rows["default"].endswith("| 1.00 |")
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["failed"] == 1 and 0 < metrics["pendulum/default/one_step_error"] < 2
+
+    finished = tmp_path / "pendulum" / "default" / "seed0" / "metrics.json"
+    before = finished.stat().st_mtime_ns
+    code, output, errors = run(*options, "only=[default]", recipe="compare")
+    assert code == 0, errors
+    assert finished.stat().st_mtime_ns == before
+    assert (tmp_path / "table.md").read_text().splitlines()[-1] in output
+
+    code, _, errors = run(*options, "only=[defualt]", recipe="compare")
+    assert code == 1 and "['defualt'] are not known; use some of ['default'" in errors
