@@ -98,7 +98,13 @@ def all_runs(cfg: DictConfig, folder: Path) -> list[Run]:
         raise ValueError(f"Variants {unknown} are not known; use some of {list(variants)}.")
     runs = []
     for seed, system, name in itertools.product(cfg.seeds, cfg.systems, chosen):
-        shared = [f"system={system}", f"seed={seed}", f"minutes={cfg.minutes}", f"threads={cfg.threads}"]
+        shared = [
+            f"system={system}",
+            f"seed={seed}",
+            f"minutes={cfg.minutes}",
+            f"clock={cfg.clock}",
+            f"threads={cfg.threads}",
+        ]
         shared += [f"data.folder={Path(cfg.data_dir) / system}", *cfg.overrides]
         path = folder / system / name.replace(" ", "_") / f"seed{seed}"
         runs.append(Run(system, name, seed, (*shared, *variants[name]), path))

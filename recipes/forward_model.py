@@ -37,7 +37,7 @@ from torchrl_gn.training import (
 )
 
 # A run may go on with more time, another logger or other threads, and nothing else.
-MAY_CHANGE = ("minutes", "steps", "threads", "logger", "run_dir", "checkpoint_seconds", "patience")
+MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds", "patience")
 
 
 def options(cfg: DictConfig) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, scene, dataset) -> Traine
         loss,
         buffer,
         make_optimizer(model.core, cfg.optimizer, lr=cfg.lr),
-        Budget(steps=cfg.steps, minutes=cfg.minutes),
+        Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
         unroll_fraction=cfg.unroll_fraction,
         validate=validate,
@@ -119,7 +119,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
     scene = load_scene(cfg.system, timestep=cfg.timestep)
-    Budget(steps=cfg.steps, minutes=cfg.minutes)  # refuse a bad budget before anything is written
+    Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)  # refuse a bad budget before anything is written
     run = RunFolder(cfg.run_dir, "forward_model")
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:

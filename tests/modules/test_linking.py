@@ -13,7 +13,7 @@ LINKED = ["pendulum", "cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", 
 
 
 def link(bound, state, delta):
-    return bound.linking(state, delta, bound.model.delta_normalizer.std, *bound.values[-2:])
+    return bound.linking(state, delta, bound.model.delta_normalizer.std, bound.values.parent_arm, bound.values.arm)
 
 
 def gaps(scene, state):
@@ -78,7 +78,7 @@ def test_levers_are_the_derivative_of_places(make_model, name):
     turn = torch.randn(2, scene.num_nodes, 3, generator=generator, dtype=torch.float64) * live[:, 9:]
     still = torch.zeros_like(turn)
 
-    arms = bound.linking.arms(state, *bound.values[-2:])
+    arms = bound.linking.arms(state, bound.values.parent_arm, bound.values.arm)
 
     def apart(turn):
         places = bound.linking.pins(state, arms, turn, still)[1][..., :3]

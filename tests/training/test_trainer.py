@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 
 import pytest
 import torch
@@ -48,14 +49,23 @@ def test_a_budget_of_minutes_ends_by_time(make_trainer):
     assert next(trainer.run()).step == last.step + 1
 
 
+def test_the_processors_clock_stands_still_while_others_work(make_trainer):
+    trainer = make_trainer(Budget(minutes=0.2 / 60, clock="processor"))
+    started = time.process_time()
+    for _ in trainer.run():
+        time.sleep(0.01)  # takes no time of the processor
+    assert 0.2 <= trainer.seconds <= time.process_time() - started + 0.01
+    with pytest.raises(ValueError, match=r"clock='sun' is not known; use one of \['wall', 'processor'\]"):
+        Budget(steps=1, clock="sun")
+
+
 def test_the_callers_time_counts(make_trainer):
     """Saving and logging between steps is part of the budget and of the share outside the model."""
     trainer = make_trainer(Budget(steps=3))
     clock = itertools.count(step=1.0)
-    import torchrl_gn.training.trainer as module
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module.time, "perf_counter", lambda: next(clock))
+        patch.setattr(Budget, "now", lambda self: next(clock))
         for _ in trainer.run():
             next(clock)  # one second of the caller's own
     assert trainer.spent["caller"] > 0 and trainer.spent["sampling"] > 0

@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_gn.modules import quaternion
+from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.linking import Linking
 from torchrl_gn.modules.scene_values import SceneValues, topology
@@ -123,6 +124,7 @@ class BoundForwardModel(TensorDictModuleBase):
         pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
         self.linking = Linking(scene) if model.link and pinned else None
         self.heading = scene.heading if model.align else None
+        self.contacts = Contacts(scene) if model.contacts else None
         for name, value in SceneValues.of(scene, model)._asdict().items():
             self._register(f"static_{name}", value)
         self._check_unseen(strict)
@@ -382,7 +384,11 @@ class BoundForwardModel(TensorDictModuleBase):
         if self.model.joint_axes:
             axes = self._joint_axes(state, values)
             controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]
-        return self.layout.encode(state, self.model.encoding), controls
+        features = self.layout.encode(state, self.model.encoding)
+        if self.contacts is not None:
+            touching = self.contacts(state, values.contact_offset, values.contact_radius)
+            features = torch.cat((features, touching), dim=-1)
+        return features, controls
 
     def _joint_axes(self, state: Tensor, values: SceneValues) -> Tensor:
         """Axes of the joints ``[*B, E, 3]`` in the frame of the state."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.folded_core import FoldedCore
 from torchrl_gn.modules.gn_block import GraphSize
@@ -68,6 +69,8 @@ class ForwardModel(nn.Module):
             (trapezoidal rule); the paper predicts the whole change.
         joint_axes: show the network each joint's axis in the frame of the positions and the control along
             it, so that it need not learn to turn them; the paper shows the control alone.
+        contacts: show the network how far each body's points are from the plane that they can touch, and
+            how they move, so that it need not compute that; the paper shows it positions alone.
         recenter: make the prediction independent of where a translation-invariant scene
             is (paper: on for single systems, off when several train together).
         align: make the prediction independent of how a rotation-invariant scene is turned
@@ -99,6 +102,7 @@ class ForwardModel(nn.Module):
         encoding: Encoding = "matrix",
         integrate: bool = True,
         joint_axes: bool = True,
+        contacts: bool = True,
         recenter: bool = True,
         align: bool = True,
         link: bool = True,
@@ -123,6 +127,7 @@ class ForwardModel(nn.Module):
         self.static, self.layout = static, layout
         self.encoding: Encoding = encoding
         self.integrate, self.joint_axes = integrate, joint_axes
+        self.contacts = contacts
         self.recenter, self.align, self.link = recenter, align, link
         self.options = {
             "static": static,
@@ -130,6 +135,7 @@ class ForwardModel(nn.Module):
             "encoding": encoding,
             "integrate": integrate,
             "joint_axes": joint_axes,
+            "contacts": contacts,
             "recenter": recenter,
             "align": align,
             "link": link,
@@ -143,7 +149,7 @@ class ForwardModel(nn.Module):
             "activation": activation,
         }
 
-        encoded = layout.encoded_size(encoding)
+        encoded = layout.encoded_size(encoding) + (Contacts.size if contacts else 0)
         names = self.features
         if static == "inferred":
             self.static_size = GraphSize(*inferred)

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.modules.contacts import slots
 from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ class SceneValues(NamedTuple):
         pivot: ``[*B, 3]`` where the heading's axis is, metres.
         parent_arm: ``[*B, N, 3]`` where each node is pinned to its parent, in the parent's frame, metres.
         arm: ``[*B, N, 3]`` the same in the node's own frame.
+        contact_offset: ``[*B, N, 4, 3]`` points that can touch the plane, in the node's frame, metres.
+        contact_radius: ``[*B, N, 4]`` radii about them, metres.
     """
 
     nodes: Tensor
@@ -38,6 +41,8 @@ class SceneValues(NamedTuple):
     pivot: Tensor
     parent_arm: Tensor
     arm: Tensor
+    contact_offset: Tensor
+    contact_radius: Tensor
 
     @classmethod
     def of(cls, scene: Scene, model: ForwardModel) -> SceneValues:
@@ -46,7 +51,7 @@ class SceneValues(NamedTuple):
         Raises:
             ValueError: if the scene lacks features that the model reads.
         """
-        heading = scene.heading
+        heading, (offset, radius, _) = scene.heading, slots(scene)
         values = {
             "nodes": _columns(scene, model, "nodes", scene.static.nodes, scene.static.node_names),
             "edges": _columns(scene, model, "edges", scene.static.edges, scene.static.edge_names),
@@ -56,6 +61,8 @@ class SceneValues(NamedTuple):
             "pivot": np.zeros(3) if heading is None else heading.pivot,
             "parent_arm": scene.linkage.parent_arm,
             "arm": scene.linkage.arm,
+            "contact_offset": offset,
+            "contact_radius": radius,
         }
         return cls(**{name: torch.as_tensor(value, dtype=torch.float64) for name, value in values.items()})
 
@@ -100,6 +107,7 @@ def topology(scene: Scene) -> dict[str, object]:
         "heading": turn,
         "pins": (linkage.parent.tolist(), linkage.root.tolist(), linkage.chain.tolist()),
         "joint axes": joint_axes(scene)[0].tolist(),
+        "contact points": slots(scene)[2].tolist(),
     }
 
 

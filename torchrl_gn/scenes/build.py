@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.contact_points import find_contact_points
 from torchrl_gn.scenes.errors import SceneError, UnsupportedSceneError
 from torchrl_gn.scenes.heading import find_heading
 from torchrl_gn.scenes.invariance import translation_invariant
@@ -72,6 +73,7 @@ def build_scene(
         translation_invariant=invariant,
         linkage=find_linkage(model, graph),
         heading=find_heading(model, graph, live, invariant),
+        contact_points=find_contact_points(model, graph),
         action_low=model.actuator_ctrlrange[:, 0].copy(),
         action_high=model.actuator_ctrlrange[:, 1].copy(),
         substeps=substeps,

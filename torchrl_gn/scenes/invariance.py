@@ -103,7 +103,6 @@ def touches_world(model: mujoco.MjModel, graph: Topology, axis: np.ndarray | Non
     if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
         return False
     fixed = graph.node_of_body[model.geom_bodyid] == 0
-    pairs = set(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for still in np.flatnonzero(fixed):
@@ -111,15 +110,21 @@ def touches_world(model: mujoco.MjModel, graph: Topology, axis: np.ndarray | Non
         plane = model.geom_type[still] == mujoco.mjtGeom.mjGEOM_PLANE
         if plane and axis is not None and abs(normal @ axis) < _TOLERANCE:
             continue
-        for moving in np.flatnonzero(~fixed):
-            if (
-                model.geom_contype[still] & model.geom_conaffinity[moving]
-                or model.geom_contype[moving] & model.geom_conaffinity[still]
-                or (still, moving) in pairs
-                or (moving, still) in pairs
-            ):
-                return True
+        if any(can_collide(model, int(still), int(moving)) for moving in np.flatnonzero(~fixed)):
+            return True
     return False
+
+
+def can_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
+    """Whether two geoms' masks, or an explicit pair, let them touch."""
+    if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
+        return False
+    pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+    return bool(
+        model.geom_contype[first] & model.geom_conaffinity[second]
+        or model.geom_contype[second] & model.geom_conaffinity[first]
+        or any({first, second} == set(pair) for pair in pairs)
+    )
 
 
 def tied(model: mujoco.MjModel, graph: Topology, shifted: set[int]) -> Iterator[bool]:

@@ -9,6 +9,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.errors import SceneError
 from torchrl_gn.scenes.heading import Heading
 from torchrl_gn.scenes.linkage import Linkage
@@ -78,6 +79,7 @@ class Scene:
             depend on where the scene is.
         linkage: where joints pin the nodes together.
         heading: how the whole scene is turned, if the dynamics do not depend on it.
+        contact_points: where bodies can touch a plane that is fixed in the world.
         action_low: ``[A]`` lower bounds of the controls.
         action_high: ``[A]`` upper bounds of the controls.
         substeps: physics steps in one control step.
@@ -101,6 +103,7 @@ class Scene:
     translation_invariant: np.ndarray
     heading: Heading | None
     linkage: Linkage
+    contact_points: ContactPoints | None
     action_low: np.ndarray
     action_high: np.ndarray
     substeps: int

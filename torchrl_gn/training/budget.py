@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
+
+_CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
 
 @dataclass(frozen=True)
@@ -11,16 +14,21 @@ class Budget:
 
     Attributes:
         steps: optimiser steps.
-        minutes: wall-clock minutes of training, over all resumed runs together.
+        minutes: minutes of training, over all resumed runs together.
+        clock: which minutes: ``"wall"``, or the ``"processor"``'s, which do not pass faster on a busy
+            machine (count one thread: threads add up).
 
     Raises:
-        ValueError: if both or none are given, or the limit is not positive.
+        ValueError: if both or none are given, the limit is not positive, or there is no such clock.
     """
 
     steps: int | None = None
     minutes: float | None = None
+    clock: str = "wall"
 
     def __post_init__(self) -> None:
+        if self.clock not in _CLOCKS:
+            raise ValueError(f"clock={self.clock!r} is not known; use one of {list(_CLOCKS)}.")
         if (self.steps is None) == (self.minutes is None):
             raise ValueError(f"Give either steps or minutes, not steps={self.steps} and minutes={self.minutes}.")
         if not self.limit > 0:
@@ -30,6 +38,10 @@ class Budget:
     def limit(self) -> float:
         """Steps or minutes."""
         return self.steps if self.steps is not None else self.minutes or 0.0
+
+    def now(self) -> float:
+        """Seconds of the clock, from any start."""
+        return _CLOCKS[self.clock]()
 
     def fraction(self, step: int, seconds: float) -> float:
         """Share of the budget that is spent, 0 to 1."""

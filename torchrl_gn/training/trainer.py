@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -90,18 +89,18 @@ class Trainer:
                 weight is touched by it.
         """
         while self.fraction < 1 and not self._patience_is_over():
-            start = time.perf_counter()
+            start = self.budget.now()
             with fast_matmul():
                 loss = self._update()
             self._add("", start)
             validation = self._validation()
-            start = time.perf_counter()
+            start = self.budget.now()
             yield Progress(self.step, self.seconds, self.fraction, loss, validation)
             self._add("caller", start)
 
     def _update(self) -> float:
         fraction = self.fraction
-        clock = time.perf_counter()
+        clock = self.budget.now()
         buffer = self.buffer
         if self.unroll is not None and fraction >= 1 - self.unroll_fraction:
             buffer = self.unroll
@@ -122,7 +121,7 @@ class Trainer:
         due = math.floor(self.fraction * self.validations)
         if self.validate is None or due <= self.validated:
             return None
-        start = time.perf_counter()
+        start = self.budget.now()
         error = self.validate()
         self.validated = due
         self.since_best += 1
@@ -136,12 +135,12 @@ class Trainer:
         return self.patience is not None and self.since_best >= self.patience
 
     def _lap(self, part: str, since: float) -> float:
-        now = time.perf_counter()
+        now = self.budget.now()
         self.spent[part] += now - since
         return now
 
     def _add(self, part: str, since: float) -> None:
-        elapsed = time.perf_counter() - since
+        elapsed = self.budget.now() - since
         self.seconds += elapsed
         if part:
             self.spent[part] += elapsed

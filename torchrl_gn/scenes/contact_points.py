@@ -1,0 +1,75 @@
+"""Where bodies can touch a plane that is fixed in the world."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.invariance import can_collide
+from torchrl_gn.scenes.topology import Topology
+
+_GEOM = mujoco.mjtGeom
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPoints:
+    """Centres of spheres whose lowest point a body touches the plane with, by node.
+
+    Attributes:
+        node: ``[C]`` node that each point is fixed to.
+        offset: ``[C, 3]`` the sphere's centre in the node's frame, metres.
+        radius: ``[C]`` metres; 0 for a corner.
+        normal: ``[3]`` the plane's normal, in the world's frame.
+        origin: ``[3]`` a point on the plane, metres.
+    """
+
+    node: np.ndarray
+    offset: np.ndarray
+    radius: np.ndarray
+    normal: np.ndarray
+    origin: np.ndarray
+
+
+def find_contact_points(model: mujoco.MjModel, graph: Topology) -> ContactPoints | None:
+    """The points that can touch a scene's plane; None without a plane, or if nothing can touch it.
+
+    Spheres, ends of capsules, corners of boxes and ends of an ellipsoid's axes; of cylinders and meshes
+    nothing is known. With several planes the first that can be touched is taken.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    of_geom = graph.node_of_body[model.geom_bodyid]
+    for plane in np.flatnonzero((model.geom_type == _GEOM.mjGEOM_PLANE) & (of_geom == 0)):
+        nodes, offsets, radii = [], [], []
+        for geom in np.flatnonzero(of_geom > 0):
+            if not can_collide(model, int(plane), int(geom)):
+                continue
+            node = int(of_geom[geom])
+            root = graph.body[node]
+            rotation, frame = data.geom_xmat[geom].reshape(3, 3), data.xmat[root].reshape(3, 3)
+            for point, radius in _spheres(int(model.geom_type[geom]), model.geom_size[geom]):
+                nodes.append(node)
+                offsets.append(frame.T @ (data.geom_xpos[geom] + rotation @ point - data.xpos[root]))
+                radii.append(radius)
+        if nodes:
+            normal = data.geom_xmat[plane].reshape(3, 3)[:, 2]
+            return ContactPoints(
+                np.array(nodes), np.array(offsets), np.array(radii), normal.copy(), data.geom_xpos[plane].copy()
+            )
+    return None
+
+
+def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
+    """Centres and radii in the geom's frame."""
+    if kind == _GEOM.mjGEOM_SPHERE:
+        return [(np.zeros(3), float(size[0]))]
+    if kind == _GEOM.mjGEOM_CAPSULE:
+        return [(np.array([0.0, 0.0, sign * size[1]]), float(size[0])) for sign in (1, -1)]
+    if kind == _GEOM.mjGEOM_BOX:
+        return [(np.array(signs) * size, 0.0) for signs in itertools.product((1, -1), repeat=3)]
+    if kind == _GEOM.mjGEOM_ELLIPSOID:
+        return [(sign * size * axis, 0.0) for axis in np.eye(3) for sign in (1, -1)]
+    return []
