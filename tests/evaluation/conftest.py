@@ -4,9 +4,11 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from torchrl_gn.modules import quaternion
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, quaternion
 from torchrl_gn.scenes import load_scene
 
 SYSTEMS = ("pendulum", "swimmer6", "cheetah")
@@ -27,8 +29,6 @@ def random_states(scene, *shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def random_trajectories(scene, number: int, steps: int, seed: int = 0):
-    from tensordict import TensorDict
-
     action = torch.randn(number, steps, scene.num_actions, dtype=torch.float64)
     state = random_states(scene, number, steps + 1, seed=seed)
     return TensorDict({"state": state, "action": action}, batch_size=[number])
@@ -49,3 +49,21 @@ def moving_states(scene, steps: int) -> torch.Tensor:
     position = position + live[:, :3] * 0.2 * torch.arange(scene.num_nodes, dtype=torch.float64)[:, None]
     turn = quaternion.exp(live[:, 3:6] * torch.sin(2 * math.pi * time))
     return torch.cat((position, turn, live[:, 6:] * time), dim=-1)
+
+
+@pytest.fixture(scope="session")
+def simulated(scenes) -> TensorDict:
+    """Six trajectories of the swimmer, 60 steps each."""
+    return collect_trajectories(scenes["swimmer6"], 6, 60, seed=0)
+
+
+@pytest.fixture
+def swimmer(scenes, simulated) -> BoundForwardModel:
+    """A small untrained model of the swimmer that knows how its states vary."""
+    torch.manual_seed(0)
+    small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+    bound = ForwardModel(FeatureSet.of(scenes["swimmer6"]), **small).double().bind(scenes["swimmer6"])
+    bound.update_static_normalizers()
+    state = simulated["state"]
+    bound.update_dynamic_normalizers(state[:, :-1], simulated["action"], state[:, 1:])
+    return bound

@@ -173,6 +173,9 @@ def test_the_encoding_is_the_matrix_and_blind_to_the_sign():
     assert encoded.shape[-1] == BODY_STATE.encoded_size("matrix") == 18
     assert torch.equal(encoded, BODY_STATE.encode(flipped, "matrix"))
     assert torch.equal(encoded[..., 3:12], quaternion.to_matrix(state[..., 3:7]))
+    for encoding in ("matrix", "quaternion"):
+        where = BODY_STATE.encoded_slices(encoding)["linear_velocity"]
+        assert torch.equal(BODY_STATE.encode(state, encoding)[..., where], state[..., 7:10])
     assert torch.equal(encoded[..., [0, 1, 2, *range(12, 18)]], state[..., [0, 1, 2, *range(7, 13)]])
 
 

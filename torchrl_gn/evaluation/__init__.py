@@ -10,6 +10,8 @@ from torchrl_gn.evaluation.figures import plot_errors as plot_errors
 from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve
 from torchrl_gn.evaluation.report import report as report
+from torchrl_gn.evaluation.rollout import GuardedRollout as GuardedRollout
+from torchrl_gn.evaluation.rollout import guarded_rollout as guarded_rollout
 from torchrl_gn.evaluation.rollout import rollout as rollout
 from torchrl_gn.evaluation.video import rollout_frames as rollout_frames
 from torchrl_gn.evaluation.video import rollout_video as rollout_video

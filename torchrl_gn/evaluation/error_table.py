@@ -21,7 +21,8 @@ class PredictionError:
         baselines: the same of predicting the initial state unchanged.
         left_out: components without a relative error because the truth never moves there.
         sequences: number of sequences that the means are taken over.
-        diverged: number of them in which the model predicted something that is not a state.
+        diverged: number of them in which the model predicted something that is not a state, or is absurdly
+            far out of the range of its training.
     """
 
     name: str

@@ -19,8 +19,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
-from torchrl_gn.evaluation.rollout import predict
-from torchrl_gn.modules import quaternion
+from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout, predict
+from torchrl_gn.modules import BoundForwardModel, quaternion
 from torchrl_gn.modules.state_layout import BODY_STATE, StateLayout
 
 if TYPE_CHECKING:
@@ -77,13 +77,15 @@ def evaluate_errors(
 
     A component that never moves in the truth (Pendulum's position) is left out and
     named. A sequence diverges where the model predicts something that is not a state
-    (NaN, infinity, a zero quaternion, or errors too large to square): its error counts
-    as infinite, it is counted, and no more time is spent once a whole batch diverged.
+    (NaN, infinity, a zero quaternion, or errors too large to square), and in a rollout also where the
+    state is absurdly far out of the range of the training (:func:`~torchrl_gn.evaluation.guarded_rollout`).
+    From there on its error counts as infinite, and so does the mean over sequences: no number would be the
+    model's, and leaving the sequence out would flatter it. It is counted, and no more time is spent on it.
 
     Args:
         model: bound forward model (``in_keys`` state and action, ``out_keys`` next state).
-        trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]`` and ``"action"``
-            ``[M, T, A]``; may lie on disk (memory-mapped).
+        trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]``, ``"action"`` ``[M, T, A]`` and, if
+            the model reads them, static values ``[M]`` at its ``static_key``; may lie on disk (memory-mapped).
         horizons: lengths of the rollouts to measure, at most ``T``.
         batch_size: number of states that the model gets in one call.
         keep: number of predicted rollouts to return in the table.
@@ -94,8 +96,9 @@ def evaluate_errors(
         Table with ``"one_step_error"`` and one ``"rollout_error_<H>"`` for each horizon.
 
     Raises:
-        ValueError: if shapes do not fit, trajectories are too short, empty or contain
-            values that are not finite, or nothing moves in them.
+        KeyError: if the model reads static values that the trajectories lack.
+        ValueError: if shapes do not fit, trajectories are too short, empty, of another scene than the model's or
+            contain values that are not finite, or nothing moves in them.
     """
     if scene is None:
         scene = cast("Scene", model.scene)
@@ -107,17 +110,20 @@ def evaluate_errors(
     predicted = torch.as_tensor(scene.predicted, device=device or states.device)
     one_step = _Sums(1, layout, predicted)
     rollouts = _Sums(horizon, layout, predicted)
+    static = model.static_in(trajectories) if isinstance(model, BoundForwardModel) else None
     kept: list[Tensor] = []
 
     with torch.no_grad(), _evaluation_mode(model):
-        for state, action in _batches(states, actions, max(1, batch_size // steps), device, layout):
+        for state, action, own in _batches(states, actions, static, max(1, batch_size // steps), device, layout):
             flat = state[:, :-1].flatten(0, 1)
-            prediction = predict(model, flat, action.flatten(0, 1))
+            each = None if own is None else own.unsqueeze(1).expand(len(state), steps).reshape(-1)
+            prediction = predict(model, flat, action.flatten(0, 1), each)
             valid = one_step.add(0, prediction, state[:, 1:].flatten(0, 1), flat)
             one_step.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
-        for state, action in _batches(states, actions, batch_size, device, layout) if horizons else ():
+        for state, action, own in _batches(states, actions, static, batch_size, device, layout) if horizons else ():
             wanted = max(0, min(keep - sum(map(len, kept)), len(state)))
-            kept.append(_add_rollouts(model, state, action[:, :horizon], rollouts, wanted))
+            guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own)
+            kept.append(_add_rollouts(guarded, state, rollouts, wanted))
 
     dead = _dead_components(scene, layout)
     errors = {"one_step_error": one_step.error("one_step_error", 1, len(states), steps, dead)}
@@ -168,32 +174,36 @@ class _Sums:
         return PredictionError(name, components, squared, baselines, left_out, sequences, self.diverged[steps - 1])
 
 
-def _add_rollouts(model: TensorDictModuleBase, state: Tensor, action: Tensor, sums: _Sums, keep: int) -> Tensor:
-    """Roll out from state 0, add the errors to ``sums``, return the first ``keep`` predictions."""
-    initial = current = state[:, 0]
-    alive = torch.ones(len(state), dtype=torch.bool, device=state.device)
+def _add_rollouts(guarded: GuardedRollout, truth: Tensor, sums: _Sums, keep: int) -> Tensor:
+    """Add the errors of rollouts to ``sums``, return the first ``keep`` of them, NaN from where they diverged."""
+    initial = truth[:, 0]
+    alive = torch.ones(len(truth), dtype=torch.bool, device=truth.device)
     kept = [initial[:keep]]
-    for step in range(action.shape[1]):
-        if alive.any():
-            current = predict(model, current, action[:, step])
-        alive = sums.add(step, current, state[:, step + 1], initial, alive)
-        sums.diverged[step] += int((~alive).sum())
+    for step in range(1, guarded.states.shape[1]):
+        current = guarded.states[:, step]
+        alive = sums.add(step - 1, current, truth[:, step], initial, alive & (guarded.good_steps >= step))
+        sums.diverged[step - 1] += int((~alive).sum())
         kept.append(torch.where(alive[:keep, None, None], current[:keep], torch.nan))
-        # Diverged sequences go on from their start: huge values would only slow the others down.
-        current = torch.where(alive[:, None, None], current, initial)
     return torch.stack(kept, dim=1).cpu()
 
 
 def _batches(
-    states: Tensor, actions: Tensor, size: int, device: torch.device | str | None, layout: StateLayout
-) -> Iterator[tuple[Tensor, Tensor]]:
+    states: Tensor,
+    actions: Tensor,
+    static: TensorDictBase | None,
+    size: int,
+    device: torch.device | str | None,
+    layout: StateLayout,
+) -> Iterator[tuple[Tensor, Tensor, TensorDictBase | None]]:
     for start in range(0, len(states), size):
-        state = torch.as_tensor(states[start : start + size]).to(device or states.device)
+        rows = slice(start, start + size)
+        state = torch.as_tensor(states[rows]).to(device or states.device)
         good = state.isfinite().all(-1) & ~_without_angle(state, layout)
         if not bool(good.all()):
             bad = start + int((~good.flatten(1).all(1)).nonzero()[0])
             raise ValueError(f"Trajectory {bad} contains states that are not finite or have a zero quaternion.")
-        yield state, torch.as_tensor(actions[start : start + size]).to(state.device)
+        own = None if static is None else static[rows].to(state.device)
+        yield state, torch.as_tensor(actions[rows]).to(state.device), own
 
 
 def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:

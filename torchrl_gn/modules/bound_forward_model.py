@@ -231,7 +231,7 @@ class BoundForwardModel(TensorDictModuleBase):
     def _refuse_others(self, static: TensorDictBase) -> None:
         for name, own in self.values._asdict().items():
             given = static.get(name, None)
-            if given is None or bool((given - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
+            if given is None or bool((given.to(own.device) - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
                 continue
             raise ValueError(
                 f"Samples have other static {name!r} than scene {self.scene.name!r}, which the model is bound to."

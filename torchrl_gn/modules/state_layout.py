@@ -254,7 +254,12 @@ class StateLayout:
 
     def encoded_size(self, encoding: Encoding = "matrix") -> int:
         """Number of features that :meth:`encode` gives."""
-        return sum(9 if c.kind == "rotation" and encoding == "matrix" else c.size for c in self.components)
+        return sum(where.stop - where.start for where in self.encoded_slices(encoding).values())
+
+    def encoded_slices(self, encoding: Encoding = "matrix") -> dict[str, slice]:
+        """Where each component lies in the features that :meth:`encode` gives."""
+        turned = 9 if encoding == "matrix" else 4
+        return _slices((c.name, turned if c.kind == "rotation" else c.size) for c in self.components)
 
 
 def _slices(sizes) -> dict[str, slice]:
