@@ -25,7 +25,7 @@ ALLOWED = {
     "evaluation": {"scenes", "data", "modules", "rewards", "objectives", "envs", "planners"},
     "training": {"scenes", "data", "modules", "rewards", "objectives", "envs", "planners", "evaluation"},
 }
-ANYWHERE = {"atomic"}  # modules beside the folders
+ANYWHERE = {"atomic", "finite"}  # modules beside the folders
 
 
 def imports(tree: ast.AST) -> list[str]:

@@ -49,7 +49,7 @@ def test_equal_seeds_equal_signals(swimmer: Scene) -> None:
 def test_bad_arguments(swimmer: Scene) -> None:
     assert spline_controls(swimmer, 0, 5, 0).shape == (0, 5, 5)
     assert spline_controls(swimmer, 3, 1, 0).shape == (3, 1, 5)
-    with pytest.raises(ValueError, match="knot_interval must be above 0, got 0"):
+    with pytest.raises(ValueError, match="knot_interval must be above 0 and finite, got 0"):
         spline_controls(swimmer, 1, 1, 0, knot_interval=0)
     with pytest.raises(ValueError, match="steps=-1"):
         spline_controls(swimmer, 1, -1, 0)

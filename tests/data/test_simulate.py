@@ -132,14 +132,6 @@ def test_scene_without_actuators() -> None:
 def test_bad_input_is_refused_and_named(swimmer: Scene) -> None:
     simulator = Simulator(swimmer, 1)
     physics, actions = _inputs(swimmer, 2, 3)
-    bad = actions.copy()
-    bad[1, 2, 4] = np.nan
-    with pytest.raises(ValueError, match=r"actions has nan at index \(1, 2, 4\)"):
-        simulator.rollout(physics, bad)
-    bad = physics.copy()
-    bad[1, 3] = -np.inf
-    with pytest.raises(ValueError, match=r"physics has -inf at index \(1, 3\)"):
-        simulator.rollout(bad, actions)
     with pytest.raises(TypeError, match="physics must be float64.*float32"):
         simulator.observe(physics.astype(np.float32))
     with pytest.raises(TypeError, match="actions must be floating point, got int64"):

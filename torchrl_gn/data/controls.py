@@ -35,12 +35,11 @@ def spline_controls(
         ``[num, T, A]`` float64, in the actuators' units.
 
     Raises:
-        ValueError: ``num`` or ``steps`` is negative or ``knot_interval`` not above 0.
+        ValueError: ``num`` or ``steps`` is negative or ``knot_interval`` not above 0 and finite.
     """
     if num < 0 or steps < 0:
         raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")
-    if not (knot_interval > 0 and math.isfinite(knot_interval)):
-        raise ValueError(f"knot_interval must be above 0, got {knot_interval}")
+    check_knot_interval(knot_interval)
     rng = np.random.default_rng(rng)
     if num == 0 or steps == 0 or scene.num_actions == 0:
         return np.zeros((num, steps, scene.num_actions))
@@ -57,3 +56,13 @@ def spline_controls(
     cubic = spline.c[:, segment, np.arange(num)[:, None]]  # [4, num, T, A]
     controls = ((cubic[0] * x + cubic[1]) * x + cubic[2]) * x + cubic[3]
     return np.clip(controls, scene.action_low, scene.action_high)
+
+
+def check_knot_interval(knot_interval: float) -> None:
+    """Refuse what is no time between knots.
+
+    Raises:
+        ValueError: it is not above 0 and finite.
+    """
+    if not 0 < knot_interval < math.inf:
+        raise ValueError(f"knot_interval must be above 0 and finite, got {knot_interval}")

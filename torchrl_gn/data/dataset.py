@@ -11,6 +11,7 @@ from pathlib import Path
 from tensordict import TensorDict
 
 from torchrl_gn.data.collect import CHUNK, collect_chunk, collect_trajectories
+from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, package_versions
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
@@ -79,7 +80,7 @@ def create_dataset(
         progress: called with sequences done and wanted, after every chunk.
 
     Raises:
-        ValueError: a size or ``steps`` is below one, or ``seed`` below zero.
+        ValueError: a size or ``steps`` is below one, ``seed`` below zero or ``knot_interval`` not above 0 and finite.
         DatasetError: the folder holds something else, another or a damaged data set; nothing of it
             is changed.
         UnstableSimulationError: more than a tenth of a chunk's simulations become unstable.
@@ -90,6 +91,7 @@ def create_dataset(
     for name, value in {**sizes, "steps": steps}.items():
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+    check_knot_interval(knot_interval)
     files = DatasetFiles(Path(path))
     request = {
         "scene": scene.name,

@@ -13,6 +13,7 @@ from mujoco.rollout import Rollout
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
@@ -102,7 +103,7 @@ class Simulator:
                 f"actions of {scene.name!r} must be [{wanted}] to fit physics {list(start.shape)}, "
                 f"got {list(controls.shape)}"
             )
-        _check_finite(controls, "actions")
+        require_finite(controls, "actions")
         steps, count = controls.shape[-2], int(np.prod(batch, dtype=np.int64))
         which = self._variants(variant, batch)
         start = start.reshape(count, scene.physics_size)
@@ -212,7 +213,7 @@ class Simulator:
             raise ValueError(
                 f"physics of {self.scene.name!r} must be [*B, {self.scene.physics_size}], got {list(array.shape)}"
             )
-        _check_finite(array, "physics")
+        require_finite(array, "physics")
         return array
 
     def _variants(self, variant: Tensor | np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
@@ -233,12 +234,6 @@ def _as_array(value: Tensor | np.ndarray, name: str) -> np.ndarray:
     if isinstance(value, np.ndarray):
         return value
     raise TypeError(f"{name} must be a tensor or an array, got {type(value).__name__}")
-
-
-def _check_finite(array: np.ndarray, name: str) -> None:
-    if not np.isfinite(array).all():
-        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name} has {array[index]} at index {index}")
 
 
 def _check_topology(scenes: tuple[Scene, ...]) -> None:

@@ -12,8 +12,9 @@ from torch import nn
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.envs.specs import RewardFunction, read, set_specs, step_reward
+from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, set_specs, step_reward
 from torchrl_gn.envs.starts import StartSampler, StartStates
+from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
 
@@ -53,7 +54,8 @@ class ModelEnv(ModelBasedEnvBase):
 
     Raises:
         TypeError: the model lacks these keys or the scene.
-        ValueError: start states, or when stepping ``state`` or ``action``, of a wrong shape.
+        ValueError: start states, or when stepping ``state`` or ``action``, of a wrong shape; an
+            ``unstable_reward``, or when resetting a ``state`` or static values, that are not finite.
         KeyError: when stepping, no ``state`` or ``action``.
     """
 
@@ -84,7 +86,7 @@ class ModelEnv(ModelBasedEnvBase):
         super().__init__(cast(TensorDictModule, model), device=device, allow_done_after_reset=True)
         self.scene = cast(Scene, model.scene)
         self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
-        self.unstable_reward = float(unstable_reward)
+        self.unstable_reward = finite_reward(unstable_reward)
         self.starts = StartSampler(self.scene, start_states, seed)
         set_specs(self, self.scene, physics=False)
 
@@ -94,6 +96,7 @@ class ModelEnv(ModelBasedEnvBase):
         shape = tensordict.shape
         if set_state:
             state = read(tensordict, "state", (self.scene.num_nodes, 13), self).to(torch.float64, copy=True)
+            require_finite(state, f"{self}: 'state'")
         else:
             physics = self.starts.draw(shape, tensordict.get("_reset", None))
             state = Simulator(self.scene, num_threads=1).observe(physics)
@@ -101,7 +104,10 @@ class ModelEnv(ModelBasedEnvBase):
         key = getattr(self.world_model, "static_key", None)
         if key is not None:
             own = cast(TensorDictBase, self.world_model.values.tensordict())
-            reset.set(key, tensordict.get(key, own.expand(shape)))
+            static = tensordict.get(key, None)
+            if static is not None:
+                require_finite(static, f"{self}: {key!r}")
+            reset.set(key, own.expand(shape) if static is None else static)
         return reset.to(self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:

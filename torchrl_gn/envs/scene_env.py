@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.envs import EnvBase
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.envs.specs import RewardFunction, read, set_specs, step_reward
+from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, set_specs, step_reward
 from torchrl_gn.envs.starts import StartSampler, StartStates
+from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
 
@@ -56,8 +57,8 @@ class SceneEnv(EnvBase):
         device: where TensorDicts live; the simulation runs on the CPU.
 
     Raises:
-        ValueError: start states of a wrong shape; when stepping, an action or physics that
-            is not finite or of a wrong shape.
+        ValueError: start states of a wrong shape, or an ``unstable_reward`` that is not finite; when
+            stepping or resetting, an action or physics that is not finite or of a wrong shape.
         KeyError: when stepping, no ``physics`` or ``action``.
 
     Example:
@@ -90,7 +91,7 @@ class SceneEnv(EnvBase):
         self.scene = scene
         self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
         self.num_threads = num_threads
-        self.unstable_reward = float(unstable_reward)
+        self.unstable_reward = finite_reward(unstable_reward)
         self.starts = StartSampler(scene, start_states, seed)
         self._simulator: Simulator | None = None
         set_specs(self, scene, physics=True)
@@ -108,16 +109,18 @@ class SceneEnv(EnvBase):
         shape = tensordict.shape
         if set_state:
             physics = read(tensordict, "physics", (self.scene.physics_size,), self)
-            physics = self._finite(physics, "physics").cpu().to(torch.float64, copy=True)
+            require_finite(physics, f"{self}: 'physics'")
+            physics = physics.cpu().to(torch.float64, copy=True)
         else:
             physics = self.starts.draw(shape, tensordict.get("_reset", None))
         entries = {"state": self.simulator.observe(physics), "physics": physics}
         return TensorDict(entries, batch_size=shape).to(self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        physics = self._finite(read(tensordict, "physics", (self.scene.physics_size,), self), "physics")
-        action = self._finite(read(tensordict, "action", (self.scene.num_actions,), self), "action")
-        action = action.detach()
+        physics = read(tensordict, "physics", (self.scene.physics_size,), self)
+        action = read(tensordict, "action", (self.scene.num_actions,), self).detach()
+        require_finite(physics, f"{self}: 'physics'")
+        require_finite(action, f"{self}: 'action'")
         controls = action.unsqueeze(-2).cpu().to(torch.float64)
         simulated = self.simulator.rollout(physics.detach().cpu(), controls)
         # Entry by entry: TensorDict.to costs as much as a small simulation.
@@ -134,12 +137,6 @@ class SceneEnv(EnvBase):
             "terminated": ~stable,
         }
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
-
-    def _finite(self, value: Tensor, name: str) -> Tensor:
-        if not bool(value.isfinite().all()):
-            where = tuple((~value.isfinite()).nonzero()[0].tolist())
-            raise ValueError(f"{self}: {name!r} is {value[where].item()} at index {where}")
-        return value
 
     def _set_seed(self, seed: int | None) -> None:
         self.starts.seed(seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -72,6 +73,17 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
         expected = [*tensordict.shape, *shape]
         raise ValueError(f"{env}: {key!r} must be {expected}, got {list(value.shape)}")
     return value
+
+
+def finite_reward(value: float) -> float:
+    """Reward of an unstable step, checked.
+
+    Raises:
+        ValueError: it is not finite: returns and averages would not be either.
+    """
+    if not math.isfinite(value):
+        raise ValueError(f"unstable_reward must be finite, got {value}; give a large negative number")
+    return float(value)
 
 
 def step_reward(

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
 from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout, predict
+from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import BoundForwardModel, quaternion
 from torchrl_gn.modules.state_layout import BODY_STATE, StateLayout
 
@@ -111,6 +112,8 @@ def evaluate_errors(
     one_step = _Sums(1, layout, predicted)
     rollouts = _Sums(horizon, layout, predicted)
     static = model.static_in(trajectories) if isinstance(model, BoundForwardModel) else None
+    if static is not None:
+        require_finite(static, "static of the trajectories")
     kept: list[Tensor] = []
 
     with torch.no_grad(), _evaluation_mode(model):
@@ -198,12 +201,18 @@ def _batches(
     for start in range(0, len(states), size):
         rows = slice(start, start + size)
         state = torch.as_tensor(states[rows]).to(device or states.device)
-        good = state.isfinite().all(-1) & ~_without_angle(state, layout)
-        if not bool(good.all()):
-            bad = start + int((~good.flatten(1).all(1)).nonzero()[0])
-            raise ValueError(f"Trajectory {bad} contains states that are not finite or have a zero quaternion.")
+        action = torch.as_tensor(actions[rows]).to(state.device)
         own = None if static is None else static[rows].to(state.device)
-        yield state, torch.as_tensor(actions[rows]).to(state.device), own
+        checks = {
+            "states that are not finite": state.isfinite(),
+            "states with a zero quaternion": ~_without_angle(state, layout),
+            "actions that are not finite": action.isfinite(),
+        }
+        for what, good in checks.items():
+            if not bool(good.all()):
+                bad = start + int((~good.flatten(1).all(1)).nonzero()[0])
+                raise ValueError(f"Trajectory {bad} contains {what}.")
+        yield state, action, own
 
 
 def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import BoundForwardModel
 
 
@@ -41,8 +42,8 @@ def rollout(
     """States that a model predicts from a start state under a sequence of actions.
 
     Differentiable in the state, the actions and the model's weights, through
-    every step; open :func:`torch.no_grad` around it where no gradient is wanted. Predictions are
-    not looked at: see :func:`guarded_rollout`.
+    every step; open :func:`torch.no_grad` around it where no gradient is wanted. What goes in is
+    checked, what is predicted is not: see :func:`guarded_rollout`.
 
     Args:
         model: bound forward model (``in_keys`` state and action, ``out_keys`` next state).
@@ -54,9 +55,13 @@ def rollout(
         ``[*B, T + 1, N, 13]``; the first is the start state itself.
 
     Raises:
-        ValueError: if the batch shapes of ``state`` and ``actions`` differ.
+        ValueError: if the batch shapes of ``state`` and ``actions`` differ, or a number is not finite.
     """
-    _check_batch(state, actions)
+    _check(state, actions, static)
+    return _unchecked(model, state, actions, static)
+
+
+def _unchecked(model: TensorDictModuleBase, state: Tensor, actions: Tensor, static: TensorDictBase | None) -> Tensor:
     if isinstance(model, BoundForwardModel):
         return model.rollout(state, actions, static)
     states = [state]
@@ -117,9 +122,10 @@ def guarded_rollout(
         The states, and how many predictions of each rollout were good.
 
     Raises:
-        ValueError: if the batch shapes of ``state`` and ``actions`` differ, or ``limit`` or ``every`` is not positive.
+        ValueError: if the batch shapes of ``state`` and ``actions`` differ, a number is not finite, or ``limit`` or
+            ``every`` is not positive.
     """
-    _check_batch(state, actions)
+    _check(state, actions, static)
     if not (limit > 0 and every >= 1):
         raise ValueError(f"limit must be positive and every at least 1, got limit={limit} and every={every}.")
     if not isinstance(model, BoundForwardModel):
@@ -135,7 +141,7 @@ def guarded_rollout(
     states = current.new_empty(size, steps + 1, *current.shape[1:])
     states[:, 0] = current
     for first in range(0, steps, every):
-        predicted = rollout(model, current, actions[:, first : first + every], static)[:, 1:]
+        predicted = _unchecked(model, current, actions[:, first : first + every], static)[:, 1:]
         current, count = predicted[:, -1], predicted.shape[1]
         states[rows, first + 1 : first + 1 + count] = predicted
         fine = _good(model, predicted, ranges)
@@ -181,9 +187,12 @@ def _good(model: TensorDictModuleBase, states: Tensor, ranges: list[tuple[slice,
     return good
 
 
-def _check_batch(state: Tensor, actions: Tensor) -> None:
+def _check(state: Tensor, actions: Tensor, static: TensorDictBase | None) -> None:
     if state.ndim < 2 or actions.ndim < 2 or state.shape[:-2] != actions.shape[:-2]:
         raise ValueError(
             f"rollout needs a state [*B, N, 13] and actions [*B, T, A] with the same *B,"
             f" got {list(state.shape)} and {list(actions.shape)}."
         )
+    for what, given in (("state", state), ("actions", actions), ("static", static)):
+        if given is not None:
+            require_finite(given, what)

@@ -67,8 +67,8 @@ def rollout_video(
     path = Path(path)
     if path.suffix not in (".gif", ".mp4"):
         raise ValueError(f"A video's name must end in .gif or .mp4, got {path.name!r}.")
-    if not speed > 0:
-        raise ValueError(f"speed must be positive, got {speed}.")
+    if not 0 < speed < math.inf:
+        raise ValueError(f"speed must be positive and finite, got {speed}.")
     every = frame_stride(scene.timestep / speed)
     frames = rollout_frames(scene, truth, prediction, every=every, size=size, engine=engine, labels=labels)
     seconds = every * scene.timestep / speed

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.modules.graph import Graph, graph_concat
@@ -413,7 +414,13 @@ class BoundForwardModel(TensorDictModuleBase):
             )
 
     def update_static_normalizers(self, static: TensorDictBase | None = None) -> None:
-        """Take static values, by default this scene's, into the model's statistics: once, before training."""
+        """Take static values, by default this scene's, into the model's statistics: once, before training.
+
+        Raises:
+            ValueError: if one is not finite; no statistic is changed.
+        """
+        if static is not None:
+            require_finite(static, "static")
         values = self.values if static is None else SceneValues.read(static, self.values)
         for part, (_, normalizer) in zip(values, self._static_normalizers(), strict=False):
             normalizer.update(part)
@@ -428,8 +435,14 @@ class BoundForwardModel(TensorDictModuleBase):
             action: ``[*B, A]``.
             next_state: ``[*B, N, 13]``, clean.
             static: static values of every sample, by default the scene's.
+
+        Raises:
+            ValueError: if a shape does not fit or a number is not finite; no statistic is changed.
         """
         self._check_shapes(state, action, static)
+        for what, given in (("state", state), ("action", action), ("next state", next_state), ("static", static)):
+            if given is not None:
+                require_finite(given, what)
         values = self.values if static is None else SceneValues.read(static, self.values)
         encoded, controls = self._encode(state, action, values)
         self.model.node_normalizer.update(encoded)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -24,6 +26,9 @@ class Normalizer(Float64Buffers):
         size: number of features ``F``.
         floor: standard deviations up to this are rounding noise: the feature counts as
             constant. (Spreads below 1e-7 of the mean always do.)
+
+    Raises:
+        ValueError: if the floor is negative or not finite.
     """
 
     count: Tensor
@@ -34,6 +39,8 @@ class Normalizer(Float64Buffers):
 
     def __init__(self, size: int, *, floor: float = 0.0) -> None:
         super().__init__()
+        if not 0 <= floor < math.inf:
+            raise ValueError(f"floor={floor} must be a finite standard deviation, 0 or above.")
         self.size, self.floor = size, floor
         for name in ("count", "mean", "m2"):
             self.register_buffer(name, torch.zeros(size, dtype=torch.float64))

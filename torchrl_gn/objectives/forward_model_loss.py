@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import BoundForwardModel, Normalizer, SpecializedForwardModel, quaternion
 
 
@@ -69,8 +71,8 @@ class ForwardModelLoss(LossModule):
         self, model: BoundForwardModel, *, noise: float = 0.0, generator: torch.Generator | None = None
     ) -> None:
         super().__init__()
-        if noise < 0:
-            raise ValueError(f"noise={noise} must not be negative.")
+        if not 0 <= noise < math.inf:
+            raise ValueError(f"noise={noise} must not be negative, NaN or infinite.")
         if isinstance(model, SpecializedForwardModel):
             raise TypeError("A specialised model passes no gradient to the weights; train the bound model.")
         self.model = model
@@ -101,6 +103,7 @@ class ForwardModelLoss(LossModule):
         """
         model, layout = self.model, self.model.layout
         state, action, next_state = self._read(tensordict)
+        static = self._read_static(tensordict)
         clean = Normalizer(layout.size, floor=1e-9)
         clean.update(self.model.recentered(state)[..., model.predicted_nodes, :])
         scale = torch.ones(layout.delta_size, dtype=torch.float64)
@@ -108,7 +111,6 @@ class ForwardModelLoss(LossModule):
             if component.kind == "add":
                 scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]].cpu()
         self.noise_scale.copy_(scale)
-        static = model.static_in(tensordict)
         model.update_static_normalizers(static)
         model.update_dynamic_normalizers(self._perturb(state), action, next_state, static)
 
@@ -121,13 +123,11 @@ class ForwardModelLoss(LossModule):
             ValueError: if an entry has a wrong shape, or holds NaN or Inf.
         """
         state, action, next_state = self._read(tensordict)
-        static = self.model.static_in(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
+        static = self._read_static(tensordict, windows=state.ndim == 4)
         if state.ndim == 3:
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
-        elif static is not None:
-            static = static[:, 0]
         layout, steps = self.model.layout, state.shape[1]
         current = self._perturb(state[:, 0])
         errors, folded = state.new_zeros(len(layout.components)), self.model.fold(static)
@@ -152,14 +152,19 @@ class ForwardModelLoss(LossModule):
                 raise KeyError(
                     f"ForwardModelLoss needs {key!r}, the batch has {sorted(map(str, tensordict.keys(True)))}."
                 )
-            if not bool(torch.isfinite(value).all()):
-                bad = (~torch.isfinite(value)).nonzero()[0].tolist()
-                raise ValueError(f"NaN or Inf in {key!r} at index {bad} of the batch.")
+            require_finite(value, f"{key!r} of the batch")
         if next_state.shape != state.shape:
             raise ValueError(
                 f"{self.in_keys[2]!r} must be {list(state.shape)} as {self.in_keys[0]!r}, got {list(next_state.shape)}."
             )
         return state, action, next_state
+
+    def _read_static(self, tensordict: TensorDictBase, *, windows: bool = False) -> TensorDictBase | None:
+        static = self.model.static_in(tensordict)
+        if static is not None:
+            static = static[:, 0] if windows else static
+            require_finite(static, f"{self.model.static_key!r} of the batch")
+        return static
 
     def _perturb(self, state: Tensor) -> Tensor:
         if self.noise == 0:

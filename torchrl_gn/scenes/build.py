@@ -11,7 +11,7 @@ from torchrl_gn.scenes.heading import find_heading
 from torchrl_gn.scenes.invariance import translation_invariant
 from torchrl_gn.scenes.linkage import find_linkage
 from torchrl_gn.scenes.mobility import live_channels
-from torchrl_gn.scenes.scene import Attachment, Scene
+from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import Topology, offset, topology
 
@@ -49,26 +49,31 @@ def build_scene(
         origin: what :meth:`Scene.description` tells about where the model came from.
 
     Raises:
-        SceneError: if MuJoCo cannot compile the model or ``timestep`` does not fit it.
+        SceneError: if MuJoCo cannot compile the model, a number in it is NaN or infinite, or ``timestep`` does
+            not fit it.
         UnsupportedSceneError: if the graph cannot represent an element, which it names.
     """
     model, graph = _compile(spec, name)
     actuator_of_joint = _actuator_of_joint(model)
     substeps = _substeps(model, timestep, name)
     named = _namer(model)
+    node_names = tuple(named(mujoco.mjtObj.mjOBJ_BODY, body) for body in graph.body)
+    joint_names = tuple(named(mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in range(model.njnt))
+    static = static_graph(model, graph, actuator_of_joint, substeps * model.opt.timestep)
+    _refuse_non_finite(static, name, node_names, joint_names)
     live, invariant = live_channels(model, graph.body), translation_invariant(model, graph)
     return Scene(
         name=name,
         model=model,
-        node_names=tuple(named(mujoco.mjtObj.mjOBJ_BODY, body) for body in graph.body),
-        joint_names=tuple(named(mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in range(model.njnt)),
+        node_names=node_names,
+        joint_names=joint_names,
         actuator_names=tuple(named(mujoco.mjtObj.mjOBJ_ACTUATOR, motor) for motor in range(model.nu)),
         body=graph.body,
         parent=graph.parent,
         senders=graph.senders,
         receivers=graph.receivers,
         edge_action=np.repeat(actuator_of_joint, 2),
-        static=static_graph(model, graph, actuator_of_joint, substeps * model.opt.timestep),
+        static=static,
         live=live,
         translation_invariant=invariant,
         linkage=find_linkage(model, graph),
@@ -147,6 +152,23 @@ def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
             f"Plugin {named(mujoco.mjtObj.mjOBJ_PLUGIN, 0)!r} keeps a hidden state that body frames do not show."
         )
     return actuators
+
+
+def _refuse_non_finite(
+    static: StaticGraph, name: str, node_names: tuple[str, ...], joint_names: tuple[str, ...]
+) -> None:
+    """MuJoCo compiles NaN and infinity (damping="nan") and only prints a warning."""
+    parts = (
+        (static.nodes, static.node_names, [f"body {node!r}" for node in node_names]),
+        (static.edges, static.edge_names, [f"joint {joint!r}" for joint in joint_names for _ in range(2)]),
+        (static.globals_[None], static.global_names, ["the options"]),
+    )
+    for values, features, owners in parts:
+        for row, column in np.argwhere(~np.isfinite(values)):
+            raise SceneError(
+                f"{features[column]} of {owners[row]} in scene {name!r} is {values[row, column]};"
+                " give finite numbers in the model."
+            )
 
 
 def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -19,7 +20,7 @@ class Budget:
             machine (count one thread: threads add up).
 
     Raises:
-        ValueError: if both or none are given, the limit is not positive, or there is no such clock.
+        ValueError: if both or none are given, the limit is not positive and finite, or there is no such clock.
     """
 
     steps: int | None = None
@@ -31,8 +32,9 @@ class Budget:
             raise ValueError(f"clock={self.clock!r} is not known; use one of {list(_CLOCKS)}.")
         if (self.steps is None) == (self.minutes is None):
             raise ValueError(f"Give either steps or minutes, not steps={self.steps} and minutes={self.minutes}.")
-        if not self.limit > 0:
-            raise ValueError(f"A training budget must be positive, got {self.limit}.")
+        if not 0 < self.limit < math.inf:
+            name = "steps" if self.minutes is None else "minutes"
+            raise ValueError(f"A training budget must be positive and finite, got {name}={self.limit}.")
 
     @property
     def limit(self) -> float:

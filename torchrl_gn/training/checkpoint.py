@@ -119,7 +119,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
         path: the file, or the run folder that holds it.
 
     Raises:
-        CheckpointError: if the file is missing, damaged, of a newer format or no checkpoint.
+        CheckpointError: if the file is missing, damaged, of a newer format or no checkpoint, or holds NaN or Inf.
     """
     path = Path(path)
     if path.is_dir():
@@ -141,6 +141,9 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     text = metadata["description"]
     if _digest(tensors, text) != metadata["sha256"]:
         raise CheckpointError(f"Checkpoint {path} is damaged (checksum differs); use another or train again.")
+    for name, value in tensors.items():
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            raise CheckpointError(f"Checkpoint {path} has NaN or Inf in {name!r}; use another or train again.")
     description = json.loads(text)
     model = ForwardModel.from_description(description["model"])
     weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}

@@ -20,7 +20,10 @@ class ScheduledOptimizer:
             are made with are the highest.
         schedule: factor on all learning rates from ``(step, fraction)``, where
             ``fraction`` of the training budget is spent.
-        max_norm: norm that the gradient of all parameters together is clipped to.
+        max_norm: norm that the gradient of all parameters together is clipped to; infinite: never.
+
+    Raises:
+        ValueError: if ``max_norm`` is not positive.
     """
 
     def __init__(
@@ -30,6 +33,8 @@ class ScheduledOptimizer:
         *,
         max_norm: float = 1.0,
     ) -> None:
+        if not max_norm > 0:
+            raise ValueError(f"max_norm={max_norm} must be positive.")
         self.optimizers, self.schedule, self.max_norm = optimizers, schedule, max_norm
         self._highest = [[group["lr"] for group in optimizer.param_groups] for optimizer in optimizers]
         self._parameters = [p for o in optimizers for group in o.param_groups for p in group["params"]]
@@ -86,12 +91,12 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
         lr: highest learning rate (of Muon's matrices), instead of the preset's.
 
     Raises:
-        ValueError: if the preset is unknown or the rate is not positive.
+        ValueError: if the preset is unknown or the rate is not positive and finite.
     """
     if preset not in get_args(Preset):
         raise ValueError(f"Optimiser preset {preset!r} is not known; use one of {list(get_args(Preset))}.")
-    if lr is not None and not lr > 0:
-        raise ValueError(f"lr={lr} must be positive.")
+    if lr is not None and not 0 < lr < math.inf:
+        raise ValueError(f"lr={lr} must be positive and finite.")
     parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
     if preset == "paper":
         return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-4)], _paper_decay)

@@ -51,6 +51,9 @@ class Trainer:
             seen are kept (paper: 20-step rollouts of the validation set).
         validations: how often to validate over the whole budget.
         patience: stop after so many validations without a new best. Default: never.
+
+    Raises:
+        ValueError: if ``unroll_fraction`` is no share.
     """
 
     def __init__(
@@ -66,6 +69,8 @@ class Trainer:
         validations: int = 20,
         patience: int | None = None,
     ) -> None:
+        if not 0 <= unroll_fraction <= 1:
+            raise ValueError(f"unroll_fraction={unroll_fraction} must be a share, 0 to 1.")
         self.loss, self.buffer, self.optimizer, self.budget = loss, buffer, optimizer, budget
         self.unroll, self.unroll_fraction = unroll, unroll_fraction
         self.validate, self.validations, self.patience = validate, validations, patience
