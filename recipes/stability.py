@@ -17,27 +17,55 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from torchrl_gn.data import Simulator, sample_start_states, spline_controls
-from torchrl_gn.evaluation import kinetic_energy
-from torchrl_gn.modules import BODY_STATE, BoundForwardModel, Normalizer, quaternion, specialize
+from torchrl_gn.data import Simulator, collect_trajectories, sample_start_states, spline_controls, trajectory_buffer
+from torchrl_gn.evaluation import guarded_rollout, kinetic_energy
+from torchrl_gn.modules import (
+    BODY_STATE,
+    BoundForwardModel,
+    FeatureSet,
+    ForwardModel,
+    Normalizer,
+    SpecializedForwardModel,
+    quaternion,
+    specialize,
+)
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
 
 RECIPES = Path(__file__).parent
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
 
+# Factors on each body's own, and angles in radians (paper, SM "Description of the simulated environments").
+RANGES = {
+    "pendulum": {"length": (0.2, 1.0), "mass": (0.5, 3.0)},
+    "cartpole": {"length": (0.3, 1.0), "mass": (0.2, 2.0), "thickness": (0.4, 2.2)},
+    "swimmer": {"length": (0.3, 2.0), "thickness": (0.5, 5.0)},  # of any other scene too
+    "cheetah": {"length": (0.5, 2.0), "thickness": (0.5, 2.0), "angle": (-0.1, 0.1)},
+    "jaco": {"mass": (0.5, 1.5), "gear": (0.5, 1.5)},
+}
+# One body with a motor, without, and afloat in the wind: there is no smaller scene, as something must move.
+BOB = '<body><joint name="j" axis="0 1 0"/><geom size=".1" pos="0 0 -.3"/></body>'
+BOX = '<body><freejoint/><geom type="box" size=".1 .2 .3" fluidshape="ellipsoid"/></body>'
+SMALL_SCENES = (
+    f'<mujoco><worldbody>{BOB}</worldbody><actuator><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>',
+    f"<mujoco><worldbody>{BOB}</worldbody></mujoco>",
+    f'<mujoco><option wind="3 2 1" density="50"/><worldbody>{BOX}</worldbody></mujoco>',
+)
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Setting:
     """What the checks of one dtype work on."""
 
@@ -46,14 +74,25 @@ class Setting:
     scene: Scene
     state: Tensor
     action: Tensor
+    largest: Tensor
     cfg: DictConfig
+
+    def bind(self, weights: ForwardModel, scene: Scene, **options) -> BoundForwardModel:
+        """Other weights or another scene, as this setting's model is."""
+        bound = weights.bind(scene, **options)
+        return specialize(bound, dtype=self.model.dtype) if isinstance(self.model, SpecializedForwardModel) else bound
+
+    def size(self, delta: Tensor) -> float:
+        """Largest change, relative to the largest true one of its component; infinite if not finite."""
+        sizes = delta.double().unflatten(-1, (4, 3)).norm(dim=-1).flatten(0, -2).amax(0)
+        return float((sizes / self.largest)[self.largest > 0].nan_to_num(torch.inf).max())
 
     def error(self, value: Tensor, expected: Tensor) -> float:
         """Norm of the difference over that of what is expected; infinite if not finite."""
         value = value.double()
         if not bool(torch.isfinite(value).all()):
             return torch.inf
-        return float((value - expected).norm() / expected.norm())
+        return float((value - expected).norm() / expected.norm().clamp(min=1e-300))
 
 
 @dataclass(frozen=True)
@@ -65,6 +104,7 @@ class Check:
     limits: dict[str, float]
 
 
+@cache
 def long_rollout(s: Setting) -> tuple[float, float]:
     """Largest deviation of a quaternion's length from 1, and largest kinetic energy over MuJoCo's largest."""
     scene, cfg = s.scene, s.cfg
@@ -76,39 +116,33 @@ def long_rollout(s: Setting) -> tuple[float, float]:
     state, length, energy = truth[:, 0], 0.0, 0.0
     with torch.no_grad():
         for first in range(0, cfg.steps, 100):
-            states = s.model.rollout(state, actions[:, first : first + 100])
-            state = states[:, -1]
-            if not bool(torch.isfinite(states).all()):
+            guarded = guarded_rollout(s.model, state, actions[:, first : first + 100])
+            if bool(guarded.diverged.any()):
                 return torch.inf, torch.inf
+            states, state = guarded.states, guarded.states[:, -1]
             length = max(length, float((states[..., 3:7].norm(dim=-1) - 1).abs().max()))
             energy = max(energy, float(kinetic_energy(states, scene).max()))
     return length, energy / limit
 
 
-def far_away(distance: float) -> Callable[[Setting], float]:
-    """Error of the predicted change after a shift of the whole scene."""
+def unchanged(change: Callable[[Setting, Tensor], object]) -> Callable[[Setting], float]:
+    """Error of the predicted change after a change of the states, in place, that should not matter."""
 
     def figure(s: Setting) -> float:
-        axes = torch.as_tensor(s.scene.translation_invariant, dtype=torch.float64)
-        far = s.state.clone()
-        far[:, 1:, :3] += distance * axes
-        return s.error(s.model.delta(far, s.action), s.model.delta(s.state, s.action).double())
+        other = s.state.clone()
+        change(s, other)
+        return s.error(s.model.delta(other, s.action), s.model.delta(s.state, s.action).double())
 
     return figure
 
 
-def other_sign(s: Setting) -> float:
-    """Difference of the prediction for -q."""
-    flipped = s.state.clone()
-    flipped[..., 3:7] *= -1
-    return s.error(s.model.delta(flipped, s.action), s.model.delta(s.state, s.action).double())
+def far_away(distance: float) -> Callable[[Setting], float]:
+    """The same for a shift of the whole scene."""
 
+    def shift(s: Setting, state: Tensor) -> None:
+        state[:, 1:, :3] += distance * torch.as_tensor(s.scene.translation_invariant, dtype=torch.float64)
 
-def other_length(s: Setting) -> float:
-    """Difference of the prediction for 1000 q."""
-    long = s.state.clone()
-    long[..., 3:7] *= 1000
-    return s.error(s.model.delta(long, s.action), s.model.delta(s.state, s.action).double())
+    return unchanged(shift)
 
 
 def zero_quaternion(s: Setting) -> float:
@@ -125,6 +159,89 @@ def wild_inputs(s: Setting) -> float:
     wild[:, 1:, 7:] *= 1e6
     delta = s.model.delta(wild, 1e6 * s.action)
     return float(delta.abs().nan_to_num(torch.inf).max())
+
+
+def saturated(factor: float) -> Callable[[Setting], float]:
+    """Largest change when every action is at a limit times ``factor``, in 1000 random corners."""
+
+    def figure(s: Setting) -> float:
+        generator = torch.Generator().manual_seed(0)
+        high = torch.rand(1000, s.scene.num_actions, generator=generator) < 0.5
+        bounds = torch.as_tensor(s.scene.action_low), torch.as_tensor(s.scene.action_high)
+        rows = torch.arange(1000) % len(s.state)
+        return s.size(s.model.delta(s.state[rows], factor * torch.where(high, bounds[1], bounds[0])))
+
+    return figure
+
+
+@cache
+def body_corners(s: Setting) -> tuple[float, float]:
+    """Largest change, and error against float64, with every body at a random corner of the paper's ranges."""
+    scene, names, count, nodes = s.scene, s.exact.model.features, len(s.state), s.scene.num_nodes
+    ranges = RANGES.get(scene.name.rstrip("0123456789"), RANGES["swimmer"])
+    models = s.bind(s.model.model, scene, static_key="static"), s.exact.model.bind(scene, static_key="static")
+    static, generator = models[1].static_of(scene).expand(count).clone(), torch.Generator().manual_seed(0)
+
+    def draw(what: str, size: int, usual: float = 1.0) -> Tensor:
+        low, high = ranges.get(what, (usual, usual))
+        return low + (high - low) * torch.randint(2, (count, size, 1), generator=generator).double()
+
+    def columns(part: str, feature: str) -> list[int]:
+        return [index for index, name in enumerate(getattr(names, part)) if name.split("[")[0] == feature]
+
+    length, thickness = draw("length", nodes), draw("thickness", nodes)
+    above = length[:, np.maximum(scene.parent, 0)]  # a body begins where its parent ends
+    mass = draw("mass", nodes) * length * thickness**2  # equal density
+    inertia, gear = mass * torch.maximum(length, thickness) ** 2, draw("gear", scene.num_edges // 2)
+    for feature, factor in (("pos", above), ("ipos", length), ("mass", mass), ("inertia", inertia)):
+        static["nodes"][..., columns("nodes", feature)] *= factor
+    static["edges"][..., columns("edges", "actuator_gear")] *= gear.repeat_interleave(2, 1)
+    for part, factor in (("parent_arm", above), ("arm", length), ("contact_radius", thickness)):
+        static[part] = static[part] * factor
+    static["contact_offset"] = static["contact_offset"] * length.unsqueeze(-1)
+    if quat := columns("nodes", "quat"):
+        turn = quaternion.exp(draw("angle", nodes, 0.0) * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+        static["nodes"][..., quat] = quaternion.product(static["nodes"][..., quat], turn)
+    delta, exact = (model.delta(s.state, s.action, model.fold(static)) for model in models)
+    return s.size(delta), s.error(delta, exact)
+
+
+def small_scenes(s: Setting) -> float:
+    """Difference from the plain model on the smallest graphs; infinite if a rollout or its gradient is not finite."""
+    worst = 0.0
+    for source in SMALL_SCENES:
+        scene = load_scene(source, timestep=0.02)
+        data = collect_trajectories(scene, 8, 20, s.cfg.seed)
+        for features in (FeatureSet.of(scene), FeatureSet()):  # with and without globals
+            torch.manual_seed(s.cfg.seed)
+            weights = ForwardModel(features, latent=32).to(s.model.network_dtype)
+            plain = weights.bind(scene, plain=True)
+            ForwardModelLoss(plain).fit_normalizers(trajectory_buffer(data, batch_size=100, seed=0).sample())
+            model, state, action = s.bind(weights, scene), data["state"][:, 0].clone().requires_grad_(), data["action"]
+            states = model.rollout(state, action)
+            (gradient,) = torch.autograd.grad(states[:, -1].square().sum(), state)
+            with torch.no_grad():
+                error = s.error(model.delta(state, action[:, 0]), plain.delta(state, action[:, 0]).double())
+            worst = max(worst, error if bool(states.isfinite().all() & gradient.isfinite().all()) else torch.inf)
+    return worst
+
+
+def unstable_model(s: Setting) -> float:
+    """Share of 1,000 steps that are predicted of a model that blows up; infinite if a sample is not flagged."""
+    weights, predicted = copy.deepcopy(s.model.model), []
+    with torch.no_grad():
+        for parameter in weights.core.parameters():
+            parameter *= 2
+    model = s.bind(weights, s.scene)
+    rollout = model.rollout
+
+    def counted(state: Tensor, actions: Tensor, static: TensorDictBase | None = None) -> Tensor:
+        predicted.append(actions.shape[:-1].numel())
+        return rollout(state, actions, static)
+
+    model.rollout = counted
+    guarded = guarded_rollout(model, s.state, s.action.unsqueeze(1).expand(-1, 1000, -1))
+    return sum(predicted) / (1000 * len(s.state)) if bool(guarded.diverged.all()) else torch.inf
 
 
 def one_step(s: Setting) -> float:
@@ -196,6 +313,14 @@ def shifted_features(s: Setting) -> float:
     return s.error(normalizer(clean + 1e6, s.model.network_dtype), expected)
 
 
+def constant_feature(s: Setting) -> float:
+    """What a feature that never varied becomes for an unseen value, and the relative error of the way back."""
+    normalizer, usual = Normalizer(1), torch.full((100_000, 1), 0.1, dtype=torch.float64)
+    normalizer.update(usual)
+    unseen = normalizer(50 * usual, s.model.network_dtype)
+    return max(float(unseen.abs().max()), s.error(normalizer.inverse(1 + unseen), usual))
+
+
 def many_samples(s: Setting) -> float:
     """Error of a normaliser's spread after a billion samples, merged from shards of 1 to 512 million."""
     generator = torch.Generator().manual_seed(0)
@@ -209,43 +334,37 @@ def many_samples(s: Setting) -> float:
     return s.error(total.std, values.std(correction=0))
 
 
-def memo(function: Callable[[Setting], tuple[float, ...]]) -> Callable[[int], Callable[[Setting], float]]:
-    """The entries of a figure of several, computed once a setting."""
-    seen: dict[int, tuple[float, ...]] = {}
-
-    def entry(index: int) -> Callable[[Setting], float]:
-        def figure(s: Setting) -> float:
-            if id(s) not in seen:
-                seen[id(s)] = function(s)
-            return seen[id(s)][index]
-
-        return figure
-
-    return entry
-
-
 def all_checks(steps: int) -> list[Check]:
     """The suite."""
-    rollout = memo(long_rollout)
 
     def same(limit: float) -> dict[str, float]:
         return dict.fromkeys(DTYPES, limit)
 
+    def graded(*limits: float) -> dict[str, float]:
+        return dict(zip(DTYPES, limits, strict=False))
+
     return [
-        Check(f"{steps:,} steps: quaternions off unit length", rollout(0), same(1e-6)),
-        Check(f"{steps:,} steps: kinetic energy over MuJoCo's", rollout(1), same(2.0)),
-        Check("one step against float64", one_step, {"float32": 1e-5, "float64": 1e-12, "bfloat16": 5e-2}),
-        Check("1 km from the origin", far_away(1e3), {"float32": 1e-6, "float64": 1e-9, "bfloat16": 5e-2}),
-        Check("1e6 m from the origin", far_away(1e6), {"float32": 1e-4, "float64": 1e-4, "bfloat16": 5e-2}),
-        Check("-q for q", other_sign, {"float32": 1e-6, "float64": 1e-12, "bfloat16": 5e-2}),
-        Check("1000 q for q", other_length, {"float32": 1e-5, "float64": 1e-12, "bfloat16": 5e-2}),
+        Check(f"{steps:,} steps: quaternions off unit length", lambda s: long_rollout(s)[0], same(1e-6)),
+        Check(f"{steps:,} steps: kinetic energy over MuJoCo's", lambda s: long_rollout(s)[1], same(2.0)),
+        Check("one step against float64", one_step, graded(1e-5, 1e-12, 5e-2)),
+        Check("1 km from the origin", far_away(1e3), graded(1e-6, 1e-9, 5e-2)),
+        Check("1e6 m from the origin", far_away(1e6), graded(1e-4, 1e-4, 5e-2)),
+        Check("-q for q", unchanged(lambda s, state: state[..., 3:7].mul_(-1)), graded(1e-6, 1e-12, 5e-2)),
+        Check("1000 q for q", unchanged(lambda s, state: state[..., 3:7].mul_(1000)), graded(1e-5, 1e-12, 5e-2)),
         Check("zero quaternion: length after a step off 1", zero_quaternion, same(1e-6)),
         Check("speeds and actions times 1e6: largest change", wild_inputs, same(1e12)),
-        Check("gradient through 200 steps against float64", long_gradient, {"float32": 1e-2, "float64": 1e-9}),
-        Check("gradient against differences", finite_difference, {"float32": 5e-2, "float64": 1e-5}),
-        Check("orientation loss at 1e-6 rad", orientation_loss, {"float32": 1e-5, "float64": 1e-8}),
-        Check("rotations of 0, 1e-12, ..., pi and back", rotations, {"float32": 1e-5, "float64": 1e-12}),
-        Check("features of mean / spread 1e6", shifted_features, {"float32": 1e-6, "float64": 1e-9}),
+        Check("actions at their limits: change over largest", saturated(1), same(10)),
+        Check("actions at 1000 limits: change over largest", saturated(1e3), same(1e4)),
+        Check("bodies at corners: change over largest", lambda s: body_corners(s)[0], same(1e5)),
+        Check("bodies at corners against float64", lambda s: body_corners(s)[1], graded(1e-4, 1e-12, 1.0)),
+        Check("one body, no actions, no globals: error", small_scenes, graded(1e-5, 1e-12, 5e-2)),
+        Check("unstable model: share of steps predicted", unstable_model, same(0.1)),
+        Check("gradient through 200 steps against float64", long_gradient, graded(1e-2, 1e-9)),
+        Check("gradient against differences", finite_difference, graded(5e-2, 1e-5)),
+        Check("orientation loss at 1e-6 rad", orientation_loss, graded(1e-5, 1e-8)),
+        Check("rotations of 0, 1e-12, ..., pi and back", rotations, graded(1e-5, 1e-12)),
+        Check("features of mean / spread 1e6", shifted_features, graded(1e-6, 1e-9)),
+        Check("feature without variance", constant_feature, graded(1e-6, 1e-12)),
         Check("spread after 1e9 samples in shards", many_samples, {"float64": 1e-9}),
     ]
 
@@ -258,10 +377,13 @@ def settings(cfg: DictConfig, checkpoint: Path) -> dict[str, Setting]:
     physics = torch.as_tensor(sample_start_states(scene, 64, rng))
     actions = torch.as_tensor(spline_controls(scene, 64, 20, rng))
     states = Simulator(scene).rollout(physics, actions)["state"]
+    true = BODY_STATE.delta(states[:, :-1], states[:, 1:]).unflatten(-1, (4, 3)).norm(dim=-1)
+    largest = true.flatten(0, -2).amax(0)
     exact = copy.deepcopy(loaded.model).double().requires_grad_(False).bind(scene)
     single = loaded.model.requires_grad_(False).bind(scene)
     models = {"float32": single, "float64": exact, "bfloat16": specialize(single, dtype=torch.bfloat16)}
-    return {name: Setting(model, exact, scene, states[:, -2], actions[:, -1], cfg) for name, model in models.items()}
+    inputs = scene, states[:, -2], actions[:, -1], largest, cfg
+    return {name: Setting(model, exact, *inputs) for name, model in models.items()}
 
 
 @hydra.main(config_path="config", config_name="stability", version_base="1.3")
