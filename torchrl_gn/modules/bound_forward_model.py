@@ -16,7 +16,7 @@ from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.modules.graph import Graph, graph_concat
-from torchrl_gn.modules.linking import Linking
+from torchrl_gn.modules.joint_linking import make_linking
 from torchrl_gn.modules.scene_values import SceneValues, topology
 from torchrl_gn.scenes.joint_axes import joint_axes
 
@@ -123,7 +123,7 @@ class BoundForwardModel(TensorDictModuleBase):
         # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
         self._register("shifted", predicted[:, None] * invariant)
         pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
-        self.linking = Linking(scene) if model.link and pinned else None
+        self.linking = make_linking(scene) if model.link and pinned else None
         self.heading = scene.heading if model.align else None
         self.contacts = Contacts(scene) if model.contacts else None
         for name, value in SceneValues.of(scene, model)._asdict().items():
@@ -304,8 +304,7 @@ class BoundForwardModel(TensorDictModuleBase):
             residual = self.layout.integrate(state, residual, self.timestep)
         delta = residual * self.live
         if self.linking is not None:
-            spread = self.model.delta_normalizer.std
-            delta = self.linking(state, delta, spread, values.parent_arm, values.arm)
+            delta = self.linking(state, delta, self.model.delta_normalizer.std, values)
         return delta
 
     def _residual(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:

@@ -14,6 +14,7 @@ from torchrl_gn.modules.float64_buffers import Float64Buffers
 from torchrl_gn.modules.state_layout import BODY_STATE
 
 if TYPE_CHECKING:
+    from torchrl_gn.modules.scene_values import SceneValues
     from torchrl_gn.scenes import Scene
 
 
@@ -61,15 +62,14 @@ class Linking(Float64Buffers):
             self.register_buffer(name, torch.as_tensor(value), persistent=False)
         self.register_buffer("levers", self._levers(), persistent=False)
 
-    def forward(self, state: Tensor, delta: Tensor, std: Tensor, parent_arm: Tensor, arm: Tensor) -> Tensor:
+    def forward(self, state: Tensor, delta: Tensor, std: Tensor, values: SceneValues) -> Tensor:
         """The nearest change that keeps pins together.
 
         Args:
             state: ``[*B, N, 13]``.
             delta: ``[*B, N, 12]`` predicted change.
             std: ``[12]`` how much each channel of a change varies.
-            parent_arm: ``[N, 3]`` or ``[*B, N, 3]`` each node's pin in its parent's frame.
-            arm: the same in the node's own frame.
+            values: numbers of the scene; read are where the pins are.
 
         Returns:
             ``[*B, N, 12]``, zero in dead components; ``delta`` itself where nothing is apart.
@@ -78,13 +78,12 @@ class Linking(Float64Buffers):
         turn, spin = delta[..., to["orientation"]], delta[..., to["angular_velocity"]]
         here = torch.cat((state[..., at["position"]], state[..., at["linear_velocity"]]), dim=-1)
         moved = here + torch.cat((delta[..., to["position"]], delta[..., to["linear_velocity"]]), dim=-1)
-        before = self.arms(state, parent_arm, arm)
+        before = self.arms(state, values)
 
         arms, along = self.pins(state, before, turn, spin)
-        # [*B, 3 N, L]: how turning moves the bodies of a linkage, linear in the arms.
-        moves = (arms.flatten(-3) @ self.levers.to(state.dtype)).unflatten(-1, (-1, len(self.turning)))
+        moves = self.moves(arms)
         misses = self._gap(moved, along).unflatten(-1, (2, 3)).movedim(-2, -1).flatten(-3, -2)
-        ratio = (std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)).to(state.dtype)
+        ratio = position_weight(std).to(state.dtype)
         pull = ratio * moves.mT
         normal = pull @ moves + torch.eye(moves.shape[-1], dtype=state.dtype, device=state.device)
         # At least the identity: never singular, so nothing needs to be checked.
@@ -96,12 +95,17 @@ class Linking(Float64Buffers):
         shift, push = (moved - here - self._gap(moved, along)).split(3, dim=-1)
         return torch.cat((shift, turn, push, spin), dim=-1) * self.live
 
-    def arms(self, state: Tensor, parent_arm: Tensor, arm: Tensor) -> Tensor:
+    def arms(self, state: Tensor, values: SceneValues) -> Tensor:
         """From each pin's upper and lower body to it, ``[*B, 2, N, 3]``, in the world frame."""
+        parent_arm, arm = values.parent_arm, values.arm
         frame = quaternion.to_matrix(state[..., BODY_STATE.slices["orientation"]]).unflatten(-1, (3, 3))
         upper = frame[..., self.parent, :, :] @ parent_arm.to(state.dtype).unsqueeze(-1)
         lower = frame @ arm.to(state.dtype).unsqueeze(-1)
         return torch.stack((upper, lower), dim=-4).squeeze(-1)
+
+    def moves(self, arms: Tensor) -> Tensor:
+        """``[*B, 3 N, L]``: how turning moves the bodies of a linkage about it as a whole, linear in the arms."""
+        return (arms.flatten(-3) @ self.levers.to(arms.dtype)).unflatten(-1, (-1, len(self.turning)))
 
     def pins(self, state: Tensor, arms: Tensor, turn: Tensor, spin: Tensor) -> tuple[Tensor, Tensor]:
         """Where pins put the bodies after a change of orientations and angular velocities.
@@ -120,13 +124,13 @@ class Linking(Float64Buffers):
         turn, speed = torch.stack((both[..., self.parent, :], both), dim=-3).split(3, dim=-1)
         arms = quaternion.rotate_by(turn, arms)
         upper, lower = torch.cat((arms, torch.linalg.cross(speed, arms)), dim=-1).unbind(-3)
-        return arms, _mix(self.chain, upper - lower)
+        return arms, mix(self.chain, upper - lower)
 
     def _gap(self, moved: Tensor, along: Tensor) -> Tensor:
-        """How far predicted positions and velocities ``[*B, N, 6]`` are from where their linkages have them."""
+        """How far predicted places or speeds ``[*B, N, F]`` are from where their linkages have them."""
         start = moved - along  # every body's opinion of its root's
-        moves = torch.cat((self.root_moves, self.root_moves), dim=-1)
-        return start - torch.where(moves, _mix(self.mean, start), _mix(self.root, start))
+        moves = self.root_moves.repeat(1, moved.shape[-1] // 3)
+        return start - torch.where(moves, mix(self.mean, start), mix(self.root, start))
 
     def _levers(self) -> Tensor:
         """``[6 N, 3 N L]``: velocities of bodies about their linkage's own for each live angular velocity, by arm."""
@@ -142,7 +146,12 @@ class Linking(Float64Buffers):
         return bodies.flatten(-2).flatten(-3, -2)[..., self.turning].flatten(1)
 
 
-def _mix(matrix: Tensor, values: Tensor) -> Tensor:
+def position_weight(std: Tensor) -> Tensor:
+    """What a squared metre weighs against a squared radian."""
+    return std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)
+
+
+def mix(matrix: Tensor, values: Tensor) -> Tensor:
     """``[N, N]`` times ``[*B, N, F]``, as one product and not one for every sample."""
     return F.linear(values.mT.contiguous(), matrix.to(values.dtype)).mT
 

@@ -1,0 +1,170 @@
+"""Predicted changes that turn bodies about their joints' axes alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.modules import quaternion
+from torchrl_gn.modules.linking import Linking, mix, position_weight
+from torchrl_gn.modules.state_layout import BODY_STATE
+from torchrl_gn.scenes.joint_axes import joint_axes
+
+if TYPE_CHECKING:
+    from torchrl_gn.modules.scene_values import SceneValues
+    from torchrl_gn.scenes import Scene
+
+
+def make_linking(scene: Scene) -> Linking:
+    """The linking that a scene needs: by joint rates where they are fewer than the rates of its bodies."""
+    by_joints = JointLinking(scene)
+    return by_joints if len(by_joints.dof_node) < len(by_joints.turning) else Linking(scene)
+
+
+class JointLinking(Linking):
+    """Settle predictions by the joints' own angles and rates.
+
+    As :class:`~torchrl_gn.modules.linking.Linking`, for bodies that hinges let turn about fewer axes
+    than space has (an arm of hinges about different axes): of all changes of the joint angles, and
+    then of all joint rates, the nearest to what the network predicts for the bodies is taken. What a
+    hinge cannot do cannot build up. In the plane both are the same, and the other is faster.
+
+    Args:
+        scene: whose joints these are.
+    """
+
+    dof_node: Tensor
+    dof_carrier: Tensor
+    dof_edge: Tensor
+    hinged: Tensor
+    own_axis: Tensor
+    reach: Tensor
+    first: Tensor
+    second: Tensor
+    is_root: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        dofs = _dofs(scene)
+        count, linkage = scene.num_nodes, scene.linkage
+        node, carrier, edge, axis, stage = (np.array(column) for column in zip(*dofs, strict=True))
+        # Nodes that a degree of freedom turns: its own and all that hang on it.
+        below = (linkage.chain + np.eye(count)) > 0
+        roots = node == linkage.root[node]
+        reach = np.where(roots, linkage.root[:, None] == node, below[:, node])
+        owns = np.eye(count)[:, node]
+        values = {
+            "dof_node": node,
+            "dof_carrier": carrier,
+            "dof_edge": np.maximum(edge, 0),
+            "hinged": (edge >= 0)[:, None],
+            "own_axis": axis.astype(float).reshape(-1, 3),
+            "reach": reach.astype(float),
+            "first": owns * (stage == 0),
+            "second": owns * (stage == 1),
+            "is_root": (linkage.parent == np.arange(count))[:, None],
+        }
+        for name, value in values.items():
+            self.register_buffer(name, torch.as_tensor(value), persistent=False)
+        # Parents come before their children, as in MuJoCo's trees.
+        self._order = [(int(n), int(linkage.parent[n])) for n in range(count) if linkage.parent[n] != n]
+        self._two_stages = bool((stage == 1).any())
+
+    def forward(self, state: Tensor, delta: Tensor, std: Tensor, values: SceneValues) -> Tensor:
+        """The nearest change of joint angles and rates; arguments and result as of ``Linking``."""
+        at, to = BODY_STATE.slices, BODY_STATE.delta_slices
+        weight = position_weight(std).to(state.dtype)
+        place = state[..., at["position"]] + delta[..., to["position"]]
+        velocity = state[..., at["linear_velocity"]] + delta[..., to["linear_velocity"]]
+        speed = state[..., at["angular_velocity"]] + delta[..., to["angular_velocity"]]
+        axes, arms = self._axes(state, values), self.arms(state, values)
+
+        # Angles: what each pair of bodies says about its joint, then one Gauss-Newton step of all.
+        predicted = quaternion.exp(delta[..., to["orientation"]])
+        against = torch.where(self.is_root, _none(predicted), predicted[..., self.parent, :])
+        relative = quaternion.log(quaternion.product(quaternion.conjugate(against), predicted))
+        angles = (axes * relative[..., self.dof_node, :]).sum(-1)
+        turned = self._compose(axes, angles)
+        here = self._turn(turned, axes, arms)
+        missing = quaternion.log(quaternion.product(predicted, quaternion.conjugate(turned)))
+        along = mix(self.chain, here[1][..., 0, :, :] - here[1][..., 1, :, :])
+        angles = angles + self._solve(*here, missing, self._gap(place, along), weight)
+        turned = self._compose(axes, angles)
+        axes, arms = self._turn(turned, axes, arms)
+        along = mix(self.chain, arms[..., 0, :, :] - arms[..., 1, :, :])
+        shift = place - self._gap(place, along) - state[..., at["position"]]
+
+        # Rates: linear, where the joints are now.
+        rates = self._solve(axes, arms, speed, self._gap(velocity, torch.zeros_like(velocity)), weight)
+        speed = (self._turning(axes) @ rates.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 3))
+        both = torch.stack((speed[..., self.parent, :], speed), dim=-3)
+        upper, lower = torch.linalg.cross(both, arms).unbind(-3)
+        push = velocity - self._gap(velocity, mix(self.chain, upper - lower)) - state[..., at["linear_velocity"]]
+        spin = speed - state[..., at["angular_velocity"]]
+        return torch.cat((shift, quaternion.log(turned), push, spin), dim=-1) * self.live
+
+    def _axes(self, state: Tensor, values: SceneValues) -> Tensor:
+        """Axes of all degrees of freedom ``[*B, K, 3]`` in the world frame."""
+        axis = torch.where(self.hinged, values.joint_axis[..., self.dof_edge, :], self.own_axis).to(state.dtype)
+        carried = quaternion.rotate(state[..., self.dof_carrier, BODY_STATE.slices["orientation"]], axis)
+        return torch.where(self.hinged, carried, axis)
+
+    def _turn(self, turned: Tensor, axes: Tensor, arms: Tensor) -> tuple[Tensor, Tensor]:
+        """Axes and arms after bodies have been turned by ``[*B, N, 4]``."""
+        moved = quaternion.rotate(turned[..., self.dof_carrier, :], axes)
+        both = torch.stack((turned[..., self.parent, :], turned), dim=-3)
+        return torch.where(self.hinged, moved, axes), quaternion.rotate(both, arms)
+
+    def _compose(self, axes: Tensor, angles: Tensor) -> Tensor:
+        """Rotation ``[*B, N, 4]`` of every body when joints turn by ``angles`` ``[*B, K]``."""
+        vectors = axes * angles.unsqueeze(-1)
+        own = quaternion.exp(self.first.to(axes.dtype) @ vectors)
+        if self._two_stages:
+            own = quaternion.product(own, quaternion.exp(self.second.to(axes.dtype) @ vectors))
+        turned = list(own.unbind(-2))
+        for node, parent in self._order:
+            turned[node] = quaternion.product(turned[parent], turned[node])
+        return torch.stack(turned, dim=-2)
+
+    def _turning(self, axes: Tensor) -> Tensor:
+        """``[*B, 3 N, K]``: angular velocities of all bodies for each rate."""
+        return (self.reach.to(axes.dtype).unsqueeze(-2) * axes.mT.unsqueeze(-3)).flatten(-3, -2)
+
+    def _solve(self, axes: Tensor, arms: Tensor, turns: Tensor, gaps: Tensor, weight: Tensor) -> Tensor:
+        """Rates ``[*B, K]`` whose turning ``[*B, N, 3]`` and moving ``[*B, N, 3]`` of the bodies is nearest."""
+        turning = self._turning(axes)
+        moving = self.moves(arms) @ turning[..., self.turning, :]
+        pull = torch.cat((turning.mT, weight * moving.mT), dim=-1)
+        normal = turning.mT @ turning + weight * (moving.mT @ moving)
+        # Two parallel hinges at one place would share their turn: a little of nothing settles it.
+        normal = normal + 1e-12 * torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
+        wanted = torch.cat((turns.flatten(-2), gaps.flatten(-2)), dim=-1).unsqueeze(-1)
+        return torch.linalg.solve_ex(normal, pull @ wanted)[0].squeeze(-1)
+
+
+def _none(rotation: Tensor) -> Tensor:
+    """No rotation, as quaternions of the same shape."""
+    return torch.cat((torch.ones_like(rotation[..., :1]), torch.zeros_like(rotation[..., 1:])), dim=-1)
+
+
+def _dofs(scene: Scene) -> list[tuple[int, int, int, np.ndarray, int]]:
+    """Node, carrier of the axis, edge, else an axis in the world, and place in its node's chain of hinges."""
+    model, linkage = scene.model, scene.linkage
+    carriers, _ = joint_axes(scene)
+    dofs: list[tuple[int, int, int, np.ndarray, int]] = []
+    for node in range(scene.num_nodes):
+        free = scene.live[node, 9:].nonzero()[0]
+        if linkage.parent[node] != node:
+            body = int(scene.body[node])
+            joints = model.body_jntadr[body] + np.arange(model.body_jntnum[body])
+            if (model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_HINGE)).all() and len(joints) <= 2:
+                zero = np.zeros(3)
+                dofs += [(node, int(carriers[j]), 2 * int(j), zero, stage) for stage, j in enumerate(joints)]
+                continue
+            free = np.arange(3)  # a ball, or more hinges than their axes can be told of
+        dofs += [(node, 0, -1, np.eye(3)[axis], 0) for axis in free]
+    return dofs
