@@ -206,7 +206,7 @@ def test_noise_has_the_size_of_each_channels_spread(make_loss, windows):
     assert (mean[live].abs() < 5 * expected[live] / 20000**0.5).all()
     # Radians for orientations; each state channel's own spread for the rest.
     assert torch.equal(loss.noise_scale[3:6], torch.ones(3).double())
-    moving = loss.model.recentered(windows["swimmer6"]["state"])[..., loss.model.predicted_nodes, :]
+    moving = loss.model.frame.recentered(windows["swimmer6"]["state"])[..., loss.model.predicted_nodes, :]
     position = moving[..., :3].flatten(0, -2)
     torch.testing.assert_close(loss.noise_scale[:3], position.std(0, correction=0), rtol=1e-10, atol=1e-9)
 
@@ -246,7 +246,8 @@ def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, no
     if model.integrate:
         target = BODY_STATE.residual(state, target, loss.model.timestep)
     if model.align:
-        target = BODY_STATE.turn_delta(target, quaternion.conjugate(loss.model._turn(state, loss.model.values)))
+        turn = loss.model.frame.heading_turn(state, loss.model.values)
+        target = BODY_STATE.turn_delta(target, quaternion.conjugate(turn))
     live = loss.model.live
     targets = model.residual_normalizer(target)
     for channel in live.any(0).nonzero().flatten().tolist():

@@ -181,7 +181,7 @@ def _good(model: TensorDictModuleBase, states: Tensor, ranges: list[tuple[slice,
     """Which states ``[*B, N, 13]`` are finite and in range, ``[*B]``."""
     good = states.isfinite().flatten(-2).all(-1)
     if isinstance(model, BoundForwardModel):
-        states = model.recentered(states)
+        states = model.frame.recentered(states)
     for where, largest in ranges:
         good &= (states[..., where].square().sum(-1) <= largest).all(-1)
     return good

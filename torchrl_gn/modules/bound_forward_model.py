@@ -14,11 +14,10 @@ from torch import Tensor
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import quaternion
-from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.joint_linking import make_linking
+from torchrl_gn.modules.local_frame import LocalFrame
 from torchrl_gn.modules.scene_values import SceneValues, topology
-from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
     from torchrl_gn.modules.folded_core import FoldedCore
@@ -73,12 +72,8 @@ class BoundForwardModel(TensorDictModuleBase):
 
     model: ForwardModel
     edge_index: Tensor
-    edge_action: Tensor
-    joint_node: Tensor
     live: Tensor
-    predicted: Tensor
     predicted_nodes: Tensor
-    shifted: Tensor
 
     def __init__(
         self,
@@ -109,23 +104,11 @@ class BoundForwardModel(TensorDictModuleBase):
 
         ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
         self._register("edge_index", torch.stack(ends).long())
-        edge_action = torch.as_tensor(scene.edge_action).long()
-        # A column of zeros behind the actions stands for joints without motor.
-        self._register("edge_action", torch.where(edge_action < 0, scene.num_actions, edge_action))
-        if model.joint_axes:
-            self._register("joint_node", torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2))
         self._register("live", torch.as_tensor(scene.live, dtype=torch.bool))
-        predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
-        invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
-        self._register("predicted", predicted)
-        self._register("predicted_nodes", predicted.nonzero().flatten())
-        self.recenters = bool(model.recenter and invariant.any() and predicted.any())
-        # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
-        self._register("shifted", predicted[:, None] * invariant)
+        self._register("predicted_nodes", torch.as_tensor(scene.predicted).nonzero().flatten())
+        self.frame = LocalFrame(scene, model)
         pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
         self.linking = make_linking(scene) if model.link and pinned else None
-        self.heading = scene.heading if model.align else None
-        self.contacts = Contacts(scene) if model.contacts else None
         for name, value in SceneValues.of(scene, model)._asdict().items():
             self._register(f"static_{name}", value)
         self._check_unseen(strict)
@@ -297,7 +280,7 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         residual, values = self._residual(state, action, folded).to(state.dtype), folded.values
-        turn = self._turn(state, values)
+        turn = self.frame.heading_turn(state, values)
         if turn is not None:
             residual = self.layout.turn_delta(residual, turn)
         if self.model.integrate:
@@ -319,7 +302,7 @@ class BoundForwardModel(TensorDictModuleBase):
         """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
         self._check_shapes(state, action)
         dtype, model = self.network_dtype, self.model
-        encoded, controls = self._encode(state, action, values or self.values)
+        encoded, controls = self.frame.features(state, action, values or self.values)
         globals_ = encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype)
         nodes, edges = model.node_normalizer(encoded, dtype), model.edge_normalizer(controls, dtype)
         return Graph(nodes, edges, globals_, self.edge_index)
@@ -335,65 +318,6 @@ class BoundForwardModel(TensorDictModuleBase):
                 normalizer(part, dtype) for part, (_, normalizer) in zip(values[:3], normalizers, strict=True)
             )
         return Graph(nodes, edges, globals_, self.edge_index)
-
-    def recentered(self, state: Tensor) -> Tensor:
-        """State ``[*B, N, 13]`` with the bodies' mean position moved to 0 along invariant axes.
-
-        The world stays at 0, so that it does not give the absolute position away
-        (paper, SM "System invariance").
-        """
-        if not self.recenters:
-            return state
-        position = self.layout.slices["position"]
-        weight = (self.predicted / self.predicted.sum()).to(state.dtype)
-        center = (state[..., position] * weight[:, None]).sum(-2, keepdim=True)
-        moved = state[..., position] - center * self.shifted.to(state.dtype)
-        return torch.cat((state[..., : position.start], moved, state[..., position.stop :]), dim=-1)
-
-    def local(self, state: Tensor, values: SceneValues | None = None) -> Tensor:
-        """State ``[*B, N, 13]`` as the network sees it: recentred, and turned to heading 0.
-
-        Where the dynamics do not depend on how the scene is turned
-        (:attr:`~torchrl_gn.scenes.Scene.heading`), the root faces one way always and
-        predicted changes are turned back, so that nothing is learned twice. The world stays;
-        where parts can touch it, it is turned with the rest and so shows the heading.
-        """
-        values = values or self.values
-        state, turn = self.recentered(state), self._turn(state, values)
-        if self.heading is None or turn is None:
-            return state
-        pivot = torch.nn.functional.pad(values.pivot.to(state.dtype), (0, self.layout.size - 3)).unsqueeze(-2)
-        turned = self.layout.turn(state - pivot, quaternion.conjugate(turn)) + pivot
-        return torch.cat((state[..., :1, :], turned[..., 1:, :]), dim=-2) if self.heading.exact else turned
-
-    def _turn(self, state: Tensor, values: SceneValues) -> Tensor | None:
-        """Rotation ``[*B, 4]`` from heading 0 to the root's heading; None where there is none."""
-        if self.heading is None:
-            return None
-        orientation = state[..., self.heading.node, self.layout.slices["orientation"]]
-        rest = values.rest.to(state.dtype)
-        turn = quaternion.product(orientation, quaternion.conjugate(rest))
-        kept = torch.zeros(4, dtype=state.dtype, device=state.device)
-        kept[0] = kept[1 + self.heading.axis] = 1
-        return quaternion.normalize(turn * kept)
-
-    def _encode(self, state: Tensor, action: Tensor, values: SceneValues) -> tuple[Tensor, Tensor]:
-        state = self.local(state, values)
-        padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
-        controls = padded[..., self.edge_action].unsqueeze(-1)  # [*B, E, 1]
-        if self.model.joint_axes:
-            axes = self._joint_axes(state, values)
-            controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]
-        features = self.layout.encode(state, self.model.encoding)
-        if self.contacts is not None:
-            touching = self.contacts(state, values.contact_offset, values.contact_radius)
-            features = torch.cat((features, touching), dim=-1)
-        return features, controls
-
-    def _joint_axes(self, state: Tensor, values: SceneValues) -> Tensor:
-        """Axes of the joints ``[*B, E, 3]`` in the frame of the state."""
-        orientation = state[..., self.joint_node, self.layout.slices["orientation"]]
-        return quaternion.rotate(orientation, values.joint_axis.to(state.dtype))
 
     def _check_shapes(self, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> None:
         item = (self.scene.num_nodes, self.layout.size)
@@ -443,13 +367,13 @@ class BoundForwardModel(TensorDictModuleBase):
             if given is not None:
                 require_finite(given, what)
         values = self.values if static is None else SceneValues.read(static, self.values)
-        encoded, controls = self._encode(state, action, values)
+        encoded, controls = self.frame.features(state, action, values)
         self.model.node_normalizer.update(encoded)
         self.model.edge_normalizer.update(controls)
         delta = self.layout.delta(state, next_state)
         self.model.delta_normalizer.update(delta, self.live)
         residual = self.layout.residual(state, delta, self.timestep) if self.model.integrate else delta
-        turn = self._turn(state, values)
+        turn = self.frame.heading_turn(state, values)
         if turn is not None:
             residual = self.layout.turn_delta(residual, quaternion.conjugate(turn))
         self.model.residual_normalizer.update(residual, self.live)

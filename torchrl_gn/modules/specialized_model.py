@@ -136,7 +136,7 @@ class SpecializedForwardModel(BoundForwardModel):
     def _residual(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         core = folded.core
         assert core is not None
-        encoded, controls = self._encode(state, action, folded.values)
+        encoded, controls = self.frame.features(state, action, folded.values)
         nodes = _centered(encoded, self.model.node_normalizer.mean, self.node_columns)
         edges = _centered(controls, self.model.edge_normalizer.mean, self.edge_columns)
         dtype = core.out[0].dtype

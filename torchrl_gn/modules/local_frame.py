@@ -1,0 +1,119 @@
+"""How the network sees a scene."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchrl_gn.modules import quaternion
+from torchrl_gn.modules.contacts import Contacts
+from torchrl_gn.modules.float64_buffers import Float64Buffers
+from torchrl_gn.modules.state_layout import Encoding
+from torchrl_gn.scenes.joint_axes import joint_axes
+
+if TYPE_CHECKING:
+    from torchrl_gn.modules.forward_model import ForwardModel
+    from torchrl_gn.modules.scene_values import SceneValues
+    from torchrl_gn.scenes import Scene
+
+
+class LocalFrame(Float64Buffers):
+    """Dynamic features of a scene: recentred, at heading 0, with what need not be learned worked out.
+
+    Args:
+        scene: the scene.
+        model: the model, whose options say what its network sees.
+    """
+
+    edge_action: Tensor
+    joint_node: Tensor
+    predicted: Tensor
+    shifted: Tensor
+
+    def __init__(self, scene: Scene, model: ForwardModel) -> None:
+        super().__init__()
+        self.layout, self.joint_axes = model.layout, model.joint_axes
+        self.encoding: Encoding = model.encoding
+        self.heading = scene.heading if model.align else None
+        self.contacts = Contacts(scene) if model.contacts else None
+        predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
+        invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
+        self.recenters = bool(model.recenter and invariant.any() and predicted.any())
+        edge_action = torch.as_tensor(scene.edge_action).long()
+        values = {
+            # A column of zeros behind the actions stands for joints without motor.
+            "edge_action": torch.where(edge_action < 0, scene.num_actions, edge_action),
+            "joint_node": torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2),
+            "predicted": predicted,
+            # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
+            "shifted": predicted[:, None] * invariant,
+        }
+        for name, value in values.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def recentered(self, state: Tensor) -> Tensor:
+        """State ``[*B, N, 13]`` with the bodies' mean position moved to 0 along invariant axes.
+
+        The world stays at 0, so that it does not give the absolute position away
+        (paper, SM "System invariance").
+        """
+        if not self.recenters:
+            return state
+        position = self.layout.slices["position"]
+        weight = (self.predicted / self.predicted.sum()).to(state.dtype)
+        center = (state[..., position] * weight[:, None]).sum(-2, keepdim=True)
+        moved = state[..., position] - center * self.shifted.to(state.dtype)
+        return torch.cat((state[..., : position.start], moved, state[..., position.stop :]), dim=-1)
+
+    def local(self, state: Tensor, values: SceneValues) -> Tensor:
+        """State ``[*B, N, 13]`` as the network sees it: recentred, and turned to heading 0.
+
+        Where the dynamics do not depend on how the scene is turned
+        (:attr:`~torchrl_gn.scenes.Scene.heading`), the root faces one way always and
+        predicted changes are turned back, so that nothing is learned twice. The world stays;
+        where parts can touch it, it is turned with the rest and so shows the heading.
+        """
+        state, turn = self.recentered(state), self.heading_turn(state, values)
+        if self.heading is None or turn is None:
+            return state
+        pivot = torch.nn.functional.pad(values.pivot.to(state.dtype), (0, self.layout.size - 3)).unsqueeze(-2)
+        turned = self.layout.turn(state - pivot, quaternion.conjugate(turn)) + pivot
+        return torch.cat((state[..., :1, :], turned[..., 1:, :]), dim=-2) if self.heading.exact else turned
+
+    def heading_turn(self, state: Tensor, values: SceneValues) -> Tensor | None:
+        """Rotation ``[*B, 4]`` from heading 0 to the root's heading; None where there is none."""
+        if self.heading is None:
+            return None
+        orientation = state[..., self.heading.node, self.layout.slices["orientation"]]
+        rest = values.rest.to(state.dtype)
+        turn = quaternion.product(orientation, quaternion.conjugate(rest))
+        kept = torch.zeros(4, dtype=state.dtype, device=state.device)
+        kept[0] = kept[1 + self.heading.axis] = 1
+        return quaternion.normalize(turn * kept)
+
+    def features(self, state: Tensor, action: Tensor, values: SceneValues) -> tuple[Tensor, Tensor]:
+        """Dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised.
+
+        Args:
+            state: ``[*B, N, 13]`` in the world frame.
+            action: ``[*B, A]``.
+            values: numbers of the scene.
+        """
+        state = self.local(state, values)
+        padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
+        controls = padded[..., self.edge_action].unsqueeze(-1)  # [*B, E, 1]
+        if self.joint_axes:
+            axes = self._joint_axes(state, values)
+            controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]
+        features = self.layout.encode(state, self.encoding)
+        if self.contacts is not None:
+            touching = self.contacts(state, values.contact_offset, values.contact_radius)
+            features = torch.cat((features, touching), dim=-1)
+        return features, controls
+
+    def _joint_axes(self, state: Tensor, values: SceneValues) -> Tensor:
+        """Axes of the joints ``[*B, E, 3]`` in the frame of the state."""
+        orientation = state[..., self.joint_node, self.layout.slices["orientation"]]
+        return quaternion.rotate(orientation, values.joint_axis.to(state.dtype))
