@@ -189,3 +189,22 @@ def test_matrices_of_quaternions_of_any_length():
     assert torch.equal(matrix.detach(), torch.eye(3, dtype=torch.float64).flatten())
     (gradient,) = torch.autograd.grad(matrix.sum(), zero)
     assert torch.isfinite(gradient).all()
+
+
+def test_multiplying_from_the_right_is_a_matrix():
+    generator = torch.Generator().manual_seed(0)
+    p, q = torch.randn(2, 5, 4, generator=generator, dtype=torch.float64)
+    moved = (quaternion.right_matrix(q) @ p.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(moved, quaternion.product(p, q))
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-5, 1e-3, 1.0, 3.0])
+def test_rotating_by_a_rotation_vector(scale):
+    generator = torch.Generator().manual_seed(0)
+    vector, v = torch.randn(2, 5, 3, generator=generator, dtype=torch.float64)
+    vector = (scale * vector).requires_grad_()
+    expected = quaternion.rotate(quaternion.exp(vector), v)
+    turned = quaternion.rotate_by(vector, v)
+    torch.testing.assert_close(turned, expected, rtol=0, atol=1e-14)
+    gradients = [torch.autograd.grad(out.square().sum() + out[..., 0].sum(), vector)[0] for out in (turned, expected)]
+    torch.testing.assert_close(*gradients, rtol=0, atol=1e-12)

@@ -125,10 +125,11 @@ class JointLinking(Linking):
         own = quaternion.exp(self.first.to(axes.dtype) @ vectors)
         if self._two_stages:
             own = quaternion.product(own, quaternion.exp(self.second.to(axes.dtype) @ vectors))
-        turned = list(own.unbind(-2))
+        # One product a body: p * q is linear in p.
+        turned, after = list(own.unsqueeze(-1).unbind(-3)), quaternion.right_matrix(own).unbind(-3)
         for node, parent in self._order:
-            turned[node] = quaternion.product(turned[parent], turned[node])
-        return torch.stack(turned, dim=-2)
+            turned[node] = after[node] @ turned[parent]
+        return torch.stack(turned, dim=-3).squeeze(-1)
 
     def _turning(self, axes: Tensor) -> Tensor:
         """``[*B, 3 N, K]``: angular velocities of all bodies for each rate."""

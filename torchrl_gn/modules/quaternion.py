@@ -26,6 +26,13 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     return torch.cat((w, aw * bv + bw * av + torch.linalg.cross(av, bv)), dim=-1)
 
 
+def right_matrix(q: Tensor) -> Tensor:
+    """Matrices ``[..., 4, 4]`` that multiply by quaternions ``[..., 4]`` from the right: ``M(q) p = p * q``."""
+    w, x, y, z = q.unbind(-1)
+    rows = ((w, -x, -y, -z), (x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
 def conjugate(q: Tensor) -> Tensor:
     """Inverse rotation of unit quaternions ``[..., 4]``."""
     return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
