@@ -36,7 +36,7 @@ from torchrl_gn.atomic import atomic_path
 from torchrl_gn.training import RunFolder, clean_exit
 
 RECIPE = Path(__file__).with_name("forward_model.py")
-HORIZONS = {"one_step_error": "one-step", "rollout_error_100": "100 steps"}
+COLUMNS = {"one_step_error": "one-step", "rollout_error_100": "100 steps", "steps": "updates"}
 
 
 @dataclass(frozen=True)
@@ -143,20 +143,23 @@ def summarise(runs: list[Run]) -> tuple[list[str], dict[str, float]]:
     metrics: dict[str, float] = {}
     cells: dict[str, list[str]] = {variant: [] for variant in variants}
     scores: dict[str, list[float]] = {variant: [] for variant in variants}
-    for system, horizon, variant in itertools.product(systems, HORIZONS, variants):
+    for system, column, variant in itertools.product(systems, COLUMNS, variants):
         done = [r.metrics for r in runs if (r.system, r.variant) == (system, variant)]
-        values = [float("inf") if m[horizon] is None else float(m[horizon]) for m in done if m is not None]
+        values = [math.inf if m[column] is None else float(m[column]) for m in done if m is not None]
         if not values:
             cells[variant].append("-")
             continue
         spread = (max(values) - min(values)) / 2
+        metrics[f"{system}/{variant}/{column}"] = mean(values)
+        if column == "steps":
+            cells[variant].append(f"{mean(values):,.0f}")
+            continue
         cells[variant].append(f"{mean(values):.1e}" + (f" ± {spread:.0e}" if len(values) > 1 else ""))
-        metrics[f"{system}/{variant}/{horizon}"] = mean(values)
-        metrics[f"{system}/{variant}/{horizon}/half_range"] = spread
-        base = metrics.get(f"{system}/{variants[0]}/{horizon}")
+        metrics[f"{system}/{variant}/{column}/half_range"] = spread
+        base = metrics.get(f"{system}/{variants[0]}/{column}")
         if base:
             scores[variant].append(math.log(mean(values) / base))
-    header = ["", *(f"{system}, {HORIZONS[h]}" for system in systems for h in HORIZONS), "relative"]
+    header = ["", *(f"{system}, {name}" for system in systems for name in COLUMNS.values()), "relative"]
     lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
     for variant in variants:
         relative = math.exp(mean(scores[variant])) if scores[variant] else math.nan

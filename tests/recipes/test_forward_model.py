@@ -95,7 +95,7 @@ def test_comparing_goes_on_past_a_failed_run_and_keeps_finished_ones(tmp_path):
     code, output, errors = run(*options, bad, "only=[default,bad]", recipe="compare")
     assert code == 1 and "1 of 2 runs failed" in errors
     rows = {line.split("|")[1].strip(): line for line in output.splitlines() if line.startswith("|")}
-    assert rows["bad"].count(" - ") == 2 and rows["default"].endswith("| 1.00 |")
+    assert rows["bad"].count(" - ") == 3 and rows["default"].endswith("| 1.00 |")
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["failed"] == 1 and 0 < metrics["pendulum/default/one_step_error"] < 2
 
