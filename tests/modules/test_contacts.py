@@ -7,12 +7,13 @@ import torch
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.modules import BODY_STATE, quaternion
-from torchrl_gn.modules.contacts import SLOTS, Contacts, slots
+from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes.contact_points import SLOTS, contact_slots
 
 
 def features(scene, state):
-    offset, radius, mask = (torch.as_tensor(value) for value in slots(scene))
+    offset, radius, mask = (torch.as_tensor(value) for value in contact_slots(scene))
     return Contacts(scene)(state, offset, radius).unflatten(-1, (SLOTS, 6)), mask
 
 
@@ -22,7 +23,7 @@ def test_points_are_where_the_physics_has_them(name):
     state = collect_trajectories(scene, 5, 100)["state"][:, -2:]
     seen, mask = features(scene, state)
     assert (seen[..., ~mask, :] == 0).all() and int(mask.sum()) == len(scene.contact_points.node)
-    offset, radius, _ = (torch.as_tensor(value) for value in slots(scene))
+    offset, radius, _ = (torch.as_tensor(value) for value in contact_slots(scene))
     frame = quaternion.to_matrix(state[..., 3:7]).unflatten(-1, (3, 3))
     place = state[..., None, :3] + torch.einsum("...nij,nkj->...nki", frame, offset)
     distance = (place[..., 2] - radius) * mask
@@ -65,7 +66,7 @@ def test_of_many_points_the_farthest_are_shown():
       </worldbody></mujoco>
     """)
     assert len(scene.contact_points.node) == 9
-    offset, _, mask = slots(scene)
+    offset, _, mask = contact_slots(scene)
     assert mask[1].all() and (offset[1, :, 0] == 0.2).all()
 
 

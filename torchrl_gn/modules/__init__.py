@@ -13,7 +13,6 @@ from torchrl_gn.modules.graph import graph_split as graph_split
 from torchrl_gn.modules.mlp_core import MLPCore as MLPCore
 from torchrl_gn.modules.normalizer import Normalizer as Normalizer
 from torchrl_gn.modules.precision import fast_matmul as fast_matmul
-from torchrl_gn.modules.scene_values import SceneValues as SceneValues
 from torchrl_gn.modules.specialized_model import SpecializedForwardModel as SpecializedForwardModel
 from torchrl_gn.modules.specialized_model import specialize as specialize
 from torchrl_gn.modules.state_layout import BODY_STATE as BODY_STATE

@@ -17,7 +17,7 @@ from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.joint_linking import make_linking
 from torchrl_gn.modules.local_frame import LocalFrame
-from torchrl_gn.modules.scene_values import SceneValues, topology
+from torchrl_gn.scenes.scene_values import SceneValues, topology
 
 if TYPE_CHECKING:
     from torchrl_gn.modules.folded_core import FoldedCore
@@ -53,7 +53,7 @@ class BoundForwardModel(TensorDictModuleBase):
 
     With a ``static_key`` every sample may be another variant of the scene (lengths, masses, ...):
     the module then also reads a TensorDict of the entries of
-    :class:`~torchrl_gn.modules.scene_values.SceneValues`, as :meth:`static_of` gives them or an
+    :class:`~torchrl_gn.scenes.scene_values.SceneValues`, as :meth:`static_of` gives them or an
     inference model writes them. Without one, samples that bring other values are refused.
 
     Args:
@@ -109,7 +109,7 @@ class BoundForwardModel(TensorDictModuleBase):
         self.frame = LocalFrame(scene, model)
         pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
         self.linking = make_linking(scene) if model.link and pinned else None
-        for name, value in SceneValues.of(scene, model)._asdict().items():
+        for name, value in model.values_of(scene)._asdict().items():
             self._register(f"static_{name}", value)
         self._check_unseen(strict)
 
@@ -136,7 +136,7 @@ class BoundForwardModel(TensorDictModuleBase):
                 f"Scene {scene.name!r} is no variant of {self.scene.name!r}: {', '.join(differs)} differ."
                 " Bind the model to it instead."
             )
-        return SceneValues.of(scene, self.model).tensordict().to(self.live.device)
+        return self.model.values_of(scene).tensordict().to(self.live.device)
 
     def _apply(self, fn, recurse: bool = True):
         # Masks and static values keep their dtype (float64) when the network is cast; only the device follows.

@@ -11,12 +11,11 @@ from torch import Tensor
 from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.float64_buffers import Float64Buffers
 from torchrl_gn.modules.state_layout import BODY_STATE
+from torchrl_gn.scenes.contact_points import SLOTS, contact_slots
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
 
-SLOTS = 4
-"""Points of a body that are shown, the farthest out if it has more."""
 _NEAR = 0.02  # metres: within this of the plane distances are shown finely
 
 
@@ -41,7 +40,7 @@ class Contacts(Float64Buffers):
         super().__init__()
         self.timestep = float(scene.timestep)
         points = scene.contact_points
-        _, _, mask = slots(scene)
+        _, _, mask = contact_slots(scene)
         values = {
             "mask": mask,
             "normal": np.array([0.0, 0.0, 1.0]) if points is None else points.normal,
@@ -77,20 +76,3 @@ class Contacts(Float64Buffers):
         fine = [(value / _NEAR).clamp(-1, 1) for value in (distance, soon)]
         features = torch.cat((torch.stack((distance, *fine), dim=-1), moving), dim=-1)
         return (features * self.mask.unsqueeze(-1)).flatten(-2)
-
-
-def slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Offsets ``[N, 4, 3]``, radii ``[N, 4]`` and which of them are there ``[N, 4]``."""
-    offset, radius = np.zeros((scene.num_nodes, SLOTS, 3)), np.zeros((scene.num_nodes, SLOTS))
-    mask = np.zeros((scene.num_nodes, SLOTS), dtype=bool)
-    points = scene.contact_points
-    if points is None:
-        return offset, radius, mask
-    for node in np.unique(points.node):
-        here = np.flatnonzero(points.node == node)
-        reach = np.linalg.norm(points.offset[here], axis=1) + points.radius[here]
-        chosen = here[np.argsort(-reach, kind="stable")[:SLOTS]]
-        offset[node, : len(chosen)] = points.offset[chosen]
-        radius[node, : len(chosen)] = points.radius[chosen]
-        mask[node, : len(chosen)] = True
-    return offset, radius, mask

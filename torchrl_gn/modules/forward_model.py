@@ -17,6 +17,7 @@ from torchrl_gn.modules.graph import Graph
 from torchrl_gn.modules.mlp_core import FoldedMLP, MLPCore
 from torchrl_gn.modules.normalizer import Normalizer
 from torchrl_gn.modules.state_layout import BODY_STATE, Component, Encoding, StateLayout
+from torchrl_gn.scenes.scene_values import SceneValues
 
 if TYPE_CHECKING:
     from torchrl_gn.modules.bound_forward_model import BoundForwardModel
@@ -48,6 +49,21 @@ class FeatureSet:
         """The static features that a scene has."""
         static = scene.static
         return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
+
+    def select(self, scene: Scene) -> SceneValues:
+        """The numbers of a scene, of its static features only these.
+
+        Raises:
+            ValueError: if the scene lacks one.
+        """
+        values, there = SceneValues.of(scene), asdict(FeatureSet.of(scene))
+        columns = {}
+        for part, wanted in asdict(self).items():
+            missing = [name for name in wanted if name not in there[part]]
+            if missing:
+                raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")
+            columns[part] = getattr(values, part)[..., [there[part].index(name) for name in wanted]]
+        return values._replace(**columns)
 
 
 class ForwardModel(nn.Module):
@@ -174,6 +190,21 @@ class ForwardModel(nn.Module):
         else:
             nodes, edges = items
             self.core = MLPCore(in_size, out, items=(nodes, edges), hidden=mlp_hidden, activation=activation)
+
+    def values_of(self, scene: Scene) -> SceneValues:
+        """What the model reads of a scene; zeros where it reads an inferred graph.
+
+        Raises:
+            ValueError: if the scene lacks features that the model reads.
+        """
+        values = self.features.select(scene)
+        if self.static != "inferred":
+            return values
+        zeros = {
+            part: getattr(values, part).new_zeros(*getattr(values, part).shape[:-1], size)
+            for part, size in asdict(self.static_size).items()
+        }
+        return values._replace(**zeros)
 
     def bind(
         self, scene: Scene, *, strict: bool = False, plain: bool = False, static_key: NestedKey | None = None

@@ -15,8 +15,8 @@ from torchrl_gn.modules.state_layout import BODY_STATE
 from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
-    from torchrl_gn.modules.scene_values import SceneValues
     from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes.scene_values import SceneValues
 
 
 def make_linking(scene: Scene) -> Linking:

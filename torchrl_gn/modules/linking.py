@@ -14,8 +14,8 @@ from torchrl_gn.modules.float64_buffers import Float64Buffers
 from torchrl_gn.modules.state_layout import BODY_STATE
 
 if TYPE_CHECKING:
-    from torchrl_gn.modules.scene_values import SceneValues
     from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes.scene_values import SceneValues
 
 
 class Linking(Float64Buffers):

@@ -15,8 +15,8 @@ from torchrl_gn.scenes.joint_axes import joint_axes
 
 if TYPE_CHECKING:
     from torchrl_gn.modules.forward_model import ForwardModel
-    from torchrl_gn.modules.scene_values import SceneValues
     from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes.scene_values import SceneValues
 
 
 class LocalFrame(Float64Buffers):

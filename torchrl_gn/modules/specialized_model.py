@@ -15,7 +15,7 @@ from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded, Un
 from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
 from torchrl_gn.modules.folded_core import FoldedCore, copy_into
 from torchrl_gn.modules.graph import Graph, graph_concat
-from torchrl_gn.modules.scene_values import SceneValues
+from torchrl_gn.scenes.scene_values import SceneValues
 
 
 class _Source:

@@ -10,16 +10,24 @@ Example:
 from torchrl_gn.scenes.errors import SceneChangedWarning, SceneError, UnsupportedSceneError
 from torchrl_gn.scenes.load import load_scene, scene_from_description
 from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
-from torchrl_gn.scenes.systems import SYSTEMS
+from torchrl_gn.scenes.scene_values import SceneValues
+from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange
+from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters, sample_variants
 
 __all__ = [
     "SYSTEMS",
     "Attachment",
+    "ParameterRange",
     "Scene",
     "SceneChangedWarning",
     "SceneError",
+    "SceneValues",
     "StaticGraph",
     "UnsupportedSceneError",
     "load_scene",
+    "make_variants",
+    "parameter_ranges",
+    "sample_parameters",
+    "sample_variants",
     "scene_from_description",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -11,7 +12,13 @@ import numpy as np
 from torchrl_gn.scenes.invariance import can_collide
 from torchrl_gn.scenes.topology import Topology
 
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.scene import Scene
+
 _GEOM = mujoco.mjtGeom
+
+SLOTS = 4
+"""Points of a body that a model is shown, the farthest out if it has more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,3 +80,20 @@ def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
     if kind == _GEOM.mjGEOM_ELLIPSOID:
         return [(sign * size * axis, 0.0) for axis in np.eye(3) for sign in (1, -1)]
     return []
+
+
+def contact_slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets ``[N, 4, 3]``, radii ``[N, 4]`` and which of them are there ``[N, 4]``."""
+    offset, radius = np.zeros((scene.num_nodes, SLOTS, 3)), np.zeros((scene.num_nodes, SLOTS))
+    mask, points = np.zeros((scene.num_nodes, SLOTS), dtype=bool), scene.contact_points
+    if points is None:
+        return offset, radius, mask
+    for node in np.unique(points.node):
+        here = np.flatnonzero(points.node == node)
+        reach = np.linalg.norm(points.offset[here], axis=1) + points.radius[here]
+        # Rounded: points equally far out keep their order in every variant of a scene.
+        chosen = here[np.argsort(-reach.round(9), kind="stable")[:SLOTS]]
+        offset[node, : len(chosen)] = points.offset[chosen]
+        radius[node, : len(chosen)] = points.radius[chosen]
+        mask[node, : len(chosen)] = True
+    return offset, radius, mask

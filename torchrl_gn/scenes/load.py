@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,16 @@ from torchrl_gn.scenes.errors import SceneChangedWarning
 from torchrl_gn.scenes.mjcf_source import is_mjcf_text, read_mjcf, rebuild_mjcf
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
+from torchrl_gn.scenes.variants import build_variant
 
 
-def load_scene(source: str | Path | mujoco.MjSpec, *, timestep: float | None = None, name: str | None = None) -> Scene:
+def load_scene(
+    source: str | Path | mujoco.MjSpec,
+    *,
+    timestep: float | None = None,
+    name: str | None = None,
+    parameters: Mapping[str, float] | None = None,
+) -> Scene:
     """Load a scene.
 
     Args:
@@ -28,9 +36,11 @@ def load_scene(source: str | Path | mujoco.MjSpec, *, timestep: float | None = N
             default the paper's for its systems (SM "Description of the simulated
             environments"), one physics step for any other model.
         name: name of the scene; by default the system's, the file's or the model's.
+        parameters: makes it a variant of a system: some of its :func:`~torchrl_gn.scenes.parameter_ranges`, also
+            beyond them; those left out are as in the standard system.
 
     Raises:
-        ValueError: if the name is unknown.
+        ValueError: if the name is unknown, or it has no such parameters.
         FileNotFoundError: if the file does not exist.
         SceneError: if the MJCF is broken or ``timestep`` does not fit.
         UnsupportedSceneError: if the graph cannot represent an element, which it names.
@@ -39,6 +49,8 @@ def load_scene(source: str | Path | mujoco.MjSpec, *, timestep: float | None = N
         >>> load_scene("swimmer6").timestep
         0.02
     """
+    if parameters is not None and (not isinstance(source, str) or find_system(source) is None):
+        raise ValueError(f"Only the paper's systems have parameters, among {', '.join(SYSTEMS)}; not this source.")
     if isinstance(source, mujoco.MjSpec):
         spec: Any = source
         return build_scene(spec, name=name or spec.modelname, timestep=timestep)
@@ -48,6 +60,8 @@ def load_scene(source: str | Path | mujoco.MjSpec, *, timestep: float | None = N
         raise TypeError(f"load_scene takes a name, a path, MJCF text or an MjSpec, got {type(source).__name__}.")
     if isinstance(source, str) and not is_mjcf_text(source):
         system = find_system(source)
+        if system is not None and parameters is not None:
+            return build_variant(system, parameters, timestep=timestep, name=name)
         if system is not None:
             return build_scene(
                 system.build(),
@@ -73,14 +87,18 @@ def scene_from_description(description: dict) -> Scene:
     system = find_system(description["system"]) if "system" in description else None
     if system is None and "system" in description:
         raise ValueError(_unknown(description["system"]))
-    keys = ("system",) if system else ("mjcf", "assets")
-    scene = build_scene(
-        system.build() if system else rebuild_mjcf(description),
-        name=description["name"],
-        timestep=description["timestep"],
-        settle_steps=description["settle_steps"],
-        origin={key: description[key] for key in keys},
-    )
+    name, timestep = description["name"], description["timestep"]
+    if system and "parameters" in description:
+        scene = build_variant(system, description["parameters"], timestep=timestep, name=name)
+    else:
+        keys = ("system",) if system else ("mjcf", "assets")
+        scene = build_scene(
+            system.build() if system else rebuild_mjcf(description),
+            name=name,
+            timestep=timestep,
+            settle_steps=description["settle_steps"],
+            origin={key: description[key] for key in keys},
+        )
     if scene.fingerprint() != description["fingerprint"]:
         warnings.warn(
             f"Scene {scene.name!r} does not have the physics it was described with; results may differ "

@@ -6,9 +6,9 @@ import re
 
 from torchrl_gn.scenes.systems import acrobot, cartpole, cheetah, jaco, pendulum, walker2d
 from torchrl_gn.scenes.systems.swimmer import swimmer
-from torchrl_gn.scenes.systems.system import System
+from torchrl_gn.scenes.systems.system import ParameterRange, System
 
-__all__ = ["SYSTEMS", "System", "find_system", "swimmer"]
+__all__ = ["SYSTEMS", "ParameterRange", "System", "find_system", "swimmer"]
 
 _BY_NAME: dict[str, System] = {
     system.name: system

@@ -1,13 +1,29 @@
 """Cheetah: the planar half-cheetah of the suite. 10 ms, one suite physics step.
 
 The suite lets it fall for 200 physics steps after a reset, before an episode starts.
+
+Variants: the angle at which thighs, shins and feet hang on their parents where their joint is at zero,
+the length of every body (the torso's with its head), and one thickness of all of them. Masses follow
+the volume, joints move with the lengths. Motors, springs and joint limits stay. At its reference a
+variant's lowest point is as high above the ground as the standard cheetah's.
 """
 
 from __future__ import annotations
 
-import mujoco
+from collections.abc import Mapping
 
-from torchrl_gn.scenes.systems.system import System, suite_model
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.systems.resize import resize_capsule
+from torchrl_gn.scenes.systems.system import ParameterRange, System, suite_model
+
+_LIMBS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
+_RANGES = {
+    **{f"angle_{limb}": ParameterRange(-0.1, 0.1, standard=0.0) for limb in _LIMBS},
+    **{f"length_{body}": ParameterRange(0.5, 2.0) for body in ("torso", *_LIMBS)},
+    "thickness": ParameterRange(0.5, 2.0),
+}
 
 
 def _build() -> mujoco.MjSpec:
@@ -25,4 +41,29 @@ def _build() -> mujoco.MjSpec:
     return spec
 
 
-SYSTEM = System("cheetah", _build, timestep=0.01, settle_steps=200)
+def _vary(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
+    clearance = _lowest(spec)
+    for name in ("torso", *_LIMBS):
+        body, length = spec.body(name), parameters[f"length_{name}"]
+        for geom in body.geoms:
+            resize_capsule(geom, length, parameters["thickness"])
+        for child in body.bodies:
+            child.pos = length * np.asarray(child.pos)
+        if name in _LIMBS:
+            half = 0.5 * parameters[f"angle_{name}"]
+            body.quat = [np.cos(half), 0.0, np.sin(half), 0.0]
+    torso = spec.body("torso")
+    torso.pos = [*torso.pos[:2], torso.pos[2] + (clearance - _lowest(spec))]
+
+
+def _lowest(spec: mujoco.MjSpec) -> float:
+    """Height of the lowest point of the capsules, all joints at zero, metres."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    capsules = model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+    reach = np.abs(data.geom_xmat[:, 8]) * model.geom_size[:, 1] + model.geom_size[:, 0]
+    return float((data.geom_xpos[:, 2] - reach)[capsules].min())
+
+
+SYSTEM = System("cheetah", _build, timestep=0.01, settle_steps=200, ranges=_RANGES, vary=_vary)

@@ -5,18 +5,34 @@ velocity actuators are those of its ``JacoArm`` and ``JacoHand``. MuJoCo's defau
 physics step of 2 ms is what dm_control's manipulation tasks use. Base, wrist and
 hand, and the two halves of each finger, are welded: 16 bodies are 10 nodes. The
 hand's elements are named ``jaco_hand/...``.
+
+Variants: the mass of every moving body, welded ones together (wrist and hand, the halves of a finger),
+at their size, so that inertias follow the mass; and the gear of every motor, by which a servo's torque
+is multiplied and its target velocity divided. The base, fixed to the world, stays as it is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.systems.system import System, model_file
+from torchrl_gn.scenes.systems.system import ParameterRange, System, model_file
 
 _LARGE = ("joint_1", "joint_2", "joint_3")
 _SMALL = ("joint_4", "joint_5", "joint_6")
 _FINGERS = ("finger_1", "finger_2", "finger_3")
+_BODIES = {  # bodies of each node, by the name of its parameter
+    **{f"mass_b_{i}": (f"b_{i}",) for i in range(1, 6)},
+    "mass_hand": ("b_6", "jaco_hand/hand"),
+    **{f"mass_finger_{i}": (f"jaco_hand/b_finger_{i}", f"jaco_hand/b_finger_tip_{i}") for i in (1, 2, 3)},
+}
+_MOTORS = {
+    **{f"gear_{name}": name for name in (*_LARGE, *_SMALL)},
+    **{f"gear_{name}": f"jaco_hand/{name}" for name in _FINGERS},
+}
+_RANGES = {name: ParameterRange(0.5, 1.5) for name in (*_BODIES, *_MOTORS)}
 
 
 def _build() -> mujoco.MjSpec:
@@ -46,4 +62,13 @@ def _add_velocity_actuator(spec: mujoco.MjSpec, joint: str, *, gain: float, velo
     actuator.set_to_velocity(gain)
 
 
-SYSTEM = System("jaco", _build, timestep=0.1)
+def _vary(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
+    for name, bodies in _BODIES.items():
+        for geom in (geom for body in bodies for geom in spec.body(body).geoms):
+            geom.mass *= parameters[name]
+    for name, motor in _MOTORS.items():
+        actuator = spec.actuator(motor)
+        actuator.gear = parameters[name] * np.asarray(actuator.gear)
+
+
+SYSTEM = System("jaco", _build, timestep=0.1, ranges=_RANGES, vary=_vary)

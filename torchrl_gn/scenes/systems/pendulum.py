@@ -1,5 +1,27 @@
-"""Pendulum: one hinge with a torque motor. 20 ms, one suite physics step of 20 ms."""
+"""Pendulum: one hinge with a torque motor. 20 ms, one suite physics step of 20 ms.
 
-from torchrl_gn.scenes.systems.system import System, suite_model
+Variants: the length of the pole, at whose end the mass is, and the mass. The pole itself weighs
+nothing. The ball keeps its radius whatever its mass: it is not the size that varies.
+"""
 
-SYSTEM = System("pendulum", lambda: suite_model("pendulum"), timestep=0.02)
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.systems.resize import resize_capsule
+from torchrl_gn.scenes.systems.system import ParameterRange, System, suite_model
+
+_RANGES = {"length": ParameterRange(0.2, 1.0), "mass": ParameterRange(0.5, 3.0)}
+
+
+def _vary(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
+    ball = spec.geom("mass")
+    ball.pos = parameters["length"] * np.asarray(ball.pos)
+    ball.mass *= parameters["mass"]
+    resize_capsule(spec.geom("pole"), parameters["length"], 1.0)
+
+
+SYSTEM = System("pendulum", lambda: suite_model("pendulum"), timestep=0.02, ranges=_RANGES, vary=_vary)

@@ -2,15 +2,20 @@
 
 The suite's file holds the head; the other links are added here as
 ``dm_control.suite.swimmer`` adds them (the suite itself acts every 30 ms).
+
+Variants: the length of every link, and one thickness of all of them, width and height alike. Masses
+follow the volume, joints stay at the ends of the links. Motors, armatures and joint limits stay.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
 import mujoco
 
-from torchrl_gn.scenes.systems.system import System, suite_model
+from torchrl_gn.scenes.systems.resize import resize_along_y, resize_capsule
+from torchrl_gn.scenes.systems.system import ParameterRange, System, suite_model
 
 
 def swimmer(links: int) -> System:
@@ -24,7 +29,14 @@ def swimmer(links: int) -> System:
     """
     if links < 3:
         raise ValueError(f"A swimmer has at least 3 links, got {links}.")
-    return System(f"swimmer{links}", partial(_build, links), timestep=0.02)
+    ranges = {f"length_{name}": ParameterRange(0.3, 2.0) for name in _links(links)}
+    ranges["thickness"] = ParameterRange(0.5, 5.0)
+    return System(f"swimmer{links}", partial(_build, links), timestep=0.02, ranges=ranges, vary=partial(_vary, links))
+
+
+def _links(links: int) -> list[str]:
+    """Names of the bodies, head first."""
+    return ["head", *(f"segment_{i}" for i in range(links - 1))]
 
 
 def _build(links: int) -> mujoco.MjSpec:
@@ -45,3 +57,20 @@ def _build(links: int) -> mujoco.MjSpec:
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
         )
     return spec
+
+
+def _vary(links: int, spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
+    thickness, above = parameters["thickness"], 0.0  # half length of the link before, metres
+    for name in _links(links):
+        body, length = spec.body(name), parameters[f"length_{name}"]
+        for geom in body.geoms:
+            if geom.type == mujoco.mjtGeom.mjGEOM_CAPSULE:
+                resize_capsule(geom, length, thickness)
+            else:
+                resize_along_y(geom, length, thickness)
+        half = 0.05 * length
+        for joint in body.joints:
+            joint.pos = [0.0, -half, 0.0]
+        if name != "head":
+            body.pos = [0.0, above + half, 0.0]
+        above = half

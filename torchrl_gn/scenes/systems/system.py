@@ -3,11 +3,31 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
+
+
+@dataclass(frozen=True)
+class ParameterRange:
+    """Between which values random variants of a system have a parameter.
+
+    Attributes:
+        low: smallest value: a factor of the standard system's, or an angle in radians.
+        high: largest value.
+        standard: value in the standard system: 1 for factors, 0 for angles.
+    """
+
+    low: float
+    high: float
+    standard: float = 1.0
+
+    @property
+    def is_angle(self) -> bool:
+        """Whether the parameter is added, in radians, and no factor."""
+        return self.standard == 0
 
 
 @dataclass(frozen=True)
@@ -19,12 +39,16 @@ class System:
         build: makes the MJCF model.
         timestep: control step, seconds.
         settle_steps: physics steps without control after a reset.
+        ranges: by name, the parameters that random variants differ in; empty if there are none.
+        vary: changes a freshly built model to given values of all parameters.
     """
 
     name: str
     build: Callable[[], mujoco.MjSpec]
     timestep: float
     settle_steps: int = 0
+    ranges: Mapping[str, ParameterRange] = field(default_factory=dict)
+    vary: Callable[[mujoco.MjSpec, Mapping[str, float]], None] | None = None
 
 
 def model_file(path: str) -> str:

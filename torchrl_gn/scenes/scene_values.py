@@ -1,27 +1,24 @@
-"""The numbers of a scene that a forward model reads; what is left is topology."""
+"""The numbers of a scene that differ between its variants; what is left is topology."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.modules.contacts import slots
+from torchrl_gn.scenes.contact_points import contact_slots
 from torchrl_gn.scenes.joint_axes import joint_axes
-
-if TYPE_CHECKING:
-    from torchrl_gn.modules.forward_model import ForwardModel
-    from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.scene import Scene
 
 
 class SceneValues(NamedTuple):
     """Numbers that differ between variants of a scene (lengths, masses, ...), float64, each with or without a batch.
 
     Attributes:
-        nodes: ``[*B, N, F_n]`` static node features that the model reads, in SI units; or inferred ones.
+        nodes: ``[*B, N, F_n]`` static node features, all or those that a model reads, in SI units; or inferred ones.
         edges: ``[*B, E, F_e]``.
         globals_: ``[*B, F_g]``.
         joint_axis: ``[*B, E, 3]`` axis of each edge's joint, in the frame of the node that carries it.
@@ -45,17 +42,13 @@ class SceneValues(NamedTuple):
     contact_radius: Tensor
 
     @classmethod
-    def of(cls, scene: Scene, model: ForwardModel) -> SceneValues:
-        """What a model reads of a scene.
-
-        Raises:
-            ValueError: if the scene lacks features that the model reads.
-        """
-        heading, (offset, radius, _) = scene.heading, slots(scene)
+    def of(cls, scene: Scene) -> SceneValues:
+        """All numbers of a scene."""
+        heading, (offset, radius, _) = scene.heading, contact_slots(scene)
         values = {
-            "nodes": _columns(scene, model, "nodes", scene.static.nodes, scene.static.node_names),
-            "edges": _columns(scene, model, "edges", scene.static.edges, scene.static.edge_names),
-            "globals_": _columns(scene, model, "globals_", scene.static.globals_, scene.static.global_names),
+            "nodes": scene.static.nodes,
+            "edges": scene.static.edges,
+            "globals_": scene.static.globals_,
             "joint_axis": joint_axes(scene)[1].repeat(2, axis=0),
             "rest": np.array([1.0, 0.0, 0.0, 0.0]) if heading is None else heading.rest,
             "pivot": np.zeros(3) if heading is None else heading.pivot,
@@ -107,15 +100,5 @@ def topology(scene: Scene) -> dict[str, object]:
         "heading": turn,
         "pins": (linkage.parent.tolist(), linkage.root.tolist(), linkage.chain.tolist()),
         "joint axes": joint_axes(scene)[0].tolist(),
-        "contact points": slots(scene)[2].tolist(),
+        "contact points": contact_slots(scene)[2].tolist(),
     }
-
-
-def _columns(scene: Scene, model: ForwardModel, part: str, values, names) -> np.ndarray:
-    if model.static == "inferred":
-        return np.zeros((*np.shape(values)[:-1], getattr(model.static_size, part)))
-    wanted = getattr(model.features, part)
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")
-    return np.asarray(values)[..., [names.index(name) for name in wanted]]

@@ -1,0 +1,145 @@
+"""Random variants of the paper's systems (paper, SM "Description of the simulated environments")."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.build import build_scene
+from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange, System, find_system
+
+
+def parameter_ranges(system: str) -> dict[str, ParameterRange]:
+    """What random variants of a system differ in, and by how much (the SM's table).
+
+    Lengths, thicknesses, masses and gears are factors of the standard system's, angles are radians. What
+    each parameter changes is told in the system's file in ``torchrl_gn/scenes/systems``. Bodies keep
+    their density where their size changes.
+
+    Args:
+        system: name of a system: ``"pendulum"``, ``"cartpole"``, ``"swimmerN"``, ``"cheetah"`` or ``"jaco"``.
+
+    Raises:
+        ValueError: if it has no parameters.
+
+    Example:
+        >>> parameter_ranges("pendulum")["length"]
+        ParameterRange(low=0.2, high=1.0, standard=1.0)
+    """
+    return dict(_varied(system).ranges)
+
+
+def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -> np.ndarray:
+    """Draw parameters uniformly in their ranges, each on its own.
+
+    Args:
+        system: name of a system that has parameters.
+        count: number of variants.
+        rng: generator or seed; equal seeds give equal parameters, more of them the same ones first.
+
+    Returns:
+        ``[count, P]`` float64, columns in the order of :func:`parameter_ranges`.
+
+    Raises:
+        ValueError: if the system has no parameters or ``count`` is negative.
+    """
+    ranges = parameter_ranges(system).values()
+    if count < 0:
+        raise ValueError(f"count must not be negative, got {count}")
+    low, high = np.array([(one.low, one.high) for one in ranges]).T
+    return np.random.default_rng(rng).uniform(low, high, (count, len(ranges)))
+
+
+def sample_variants(
+    system: str, count: int, rng: int | np.random.Generator, *, timestep: float | None = None
+) -> list[Scene]:
+    """Random variants of a system: :func:`make_variants` of :func:`sample_parameters`.
+
+    Example:
+        >>> short, long = sorted(sample_variants("pendulum", 2, 0), key=lambda s: s.origin["parameters"]["length"])
+        >>> short.contact_points is None, short.num_nodes
+        (True, 2)
+    """
+    return make_variants(system, sample_parameters(system, count, rng), timestep=timestep)
+
+
+def make_variants(
+    system: str, parameters: np.ndarray, *, timestep: float | None = None, name: str | None = None
+) -> list[Scene]:
+    """Build variants of a system, some milliseconds each.
+
+    Args:
+        system: name of a system that has parameters.
+        parameters: ``[count, P]`` as :func:`sample_parameters` gives them; they may lie outside of the ranges.
+        timestep: control step, seconds; by default the system's.
+        name: name of the scenes; by default the system's.
+
+    Raises:
+        ValueError: if the system has no parameters, or values are no such parameters.
+    """
+    ranges = parameter_ranges(system)
+    parameters = np.asarray(parameters, dtype=np.float64)
+    if parameters.ndim != 2 or parameters.shape[1] != len(ranges):
+        raise ValueError(f"parameters of {system!r} must be [count, {len(ranges)}], got {list(parameters.shape)}")
+    rows = (dict(zip(ranges, row, strict=True)) for row in parameters.tolist())
+    return list(_build(_varied(system), rows, timestep=timestep, name=name))
+
+
+def build_variant(
+    system: System, parameters: Mapping[str, float], *, timestep: float | None = None, name: str | None = None
+) -> Scene:
+    """One variant; parameters that are left out are those of the standard system.
+
+    Raises:
+        ValueError: if the system lacks a parameter, or a value cannot be one.
+    """
+    standard = {key: one.standard for key, one in _varied(system.name).ranges.items()}
+    if unknown := [key for key in parameters if key not in standard]:
+        raise ValueError(f"{system.name!r} has no parameters {unknown}; use some of {list(standard)}.")
+    values = {**standard, **{key: float(value) for key, value in parameters.items()}}
+    return next(_build(system, iter([values]), timestep=timestep, name=name))
+
+
+def _build(
+    system: System, rows: Iterator[Mapping[str, float]], *, timestep: float | None, name: str | None
+) -> Iterator[Scene]:
+    assert system.vary is not None
+    standard = system.build()
+    standard.compiler.usethread = False  # threads take longer to start than such a model to compile
+    for texture in standard.textures:
+        # Drawn anew and kept by every model: 12 MB and most of the time, for nothing that moves.
+        texture.width = texture.height = _TEXTURE
+    for values in rows:
+        _check(system, values)
+        spec: mujoco.MjSpec = standard.copy()
+        system.vary(spec, values)
+        yield build_scene(
+            spec,
+            name=name or system.name,
+            timestep=system.timestep if timestep is None else timestep,
+            settle_steps=system.settle_steps,
+            origin={"system": system.name, "parameters": dict(values)},
+        )
+
+
+_TEXTURE = 16  # pixels
+
+
+def _check(system: System, values: Mapping[str, float]) -> None:
+    for key, value in values.items():
+        if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
+            wanted = "a finite angle" if system.ranges[key].is_angle else "a finite factor above 0"
+            raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
+
+
+def _varied(name: str) -> System:
+    system = find_system(name)
+    if system is None or system.vary is None:
+        having = [known for known in SYSTEMS if (found := find_system(known)) and found.vary]
+        names = ["swimmerN" if known == "swimmer6" else known for known in having]
+        raise ValueError(f"{name!r} has no parameters to vary; these systems have: {', '.join(names)}.")
+    return system
