@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from torchrl_gn.data import UnstableSimulationError, sample_start_states
+from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states
 from torchrl_gn.data.start_states import _draw, draw_start_states
 from torchrl_gn.scenes import SYSTEMS, Scene, load_scene
 
@@ -109,7 +109,7 @@ def test_repeatable_and_different(name: str) -> None:
 
 def test_unstable_starts_are_drawn_again_and_counted() -> None:
     scene = dataclasses.replace(repelled_hinge(1.5), settle_steps=1)
-    states, rejected = draw_start_states(scene, 200, 0)
+    states, rejected = draw_start_states(Simulator(scene), np.zeros(200, dtype=int), 0)
     assert (np.abs(states[:, 1]) < 1.501).all() and 150 < rejected < 300
     with pytest.raises(UnstableSimulationError, match="'repelled'.*1 physics steps"):
         sample_start_states(dataclasses.replace(repelled_hinge(0.01), settle_steps=1), 50, 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import numpy as np
@@ -14,6 +14,7 @@ from torchrl_gn.data.errors import UnstableSimulationError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.scene_values import SceneValues
 
 CHUNK = 250
 """Sequences that share one derived seed; part of what makes data repeat, so it never changes."""
@@ -23,7 +24,7 @@ _MAX_REJECTED = 0.1
 
 
 def collect_trajectories(
-    scene: Scene,
+    scene: Scene | Sequence[Scene],
     num: int,
     steps: int = 100,
     seed: int = 0,
@@ -40,19 +41,21 @@ def collect_trajectories(
     the number of threads.
 
     Args:
-        scene: the scene.
+        scene: the scene, or variants of one (:func:`~torchrl_gn.scenes.sample_variants`), which the sequences
+            take in turn; each then brings its variant's numbers.
         num: number of sequences.
         steps: control steps ``T`` of each.
         seed: seed of starts and actions.
         split: data of equal seed and another split are independent;
             :func:`~torchrl_gn.data.create_dataset` gives 0, 1, 2 to train, validation, test.
         knot_interval: control steps between the knots of the random actions.
-        simulator: simulator of that scene, to reuse its threads.
+        simulator: simulator of that scene, or of those, to reuse its threads.
         progress: called with sequences done and wanted.
 
     Returns:
         TensorDict ``[num]``, float64: ``state`` ``[num, T+1, N, 13]``, ``action`` ``[num, T, A]``,
-        ``physics`` ``[num, T+1, S]``.
+        ``physics`` ``[num, T+1, S]``; of variants also ``static``, a TensorDict ``[num]`` of the entries of
+        :class:`~torchrl_gn.scenes.SceneValues` that a model bound with ``static_key="static"`` reads.
 
     Raises:
         ValueError: ``num`` or ``steps`` is below one.
@@ -62,19 +65,30 @@ def collect_trajectories(
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
     simulator = simulator or Simulator(scene)
+    scenes = len(simulator.scenes)
     chunks = []
     for first in range(0, num, CHUNK):
         count = min(CHUNK, num - first)
-        chunk, _ = collect_chunk(simulator, count, steps, seed, (split, first // CHUNK), knot_interval=knot_interval)
+        variant = np.arange(first, first + count) % scenes
+        chunk, _ = collect_chunk(simulator, variant, steps, seed, (split, first // CHUNK), knot_interval=knot_interval)
+        if not isinstance(scene, Scene):
+            chunk["static"] = static_values(simulator.scenes, variant)
         chunks.append(chunk)
         if progress is not None:
             progress(first + count, num)
     return cast(TensorDict, torch.cat(chunks)) if len(chunks) > 1 else chunks[0]
 
 
+def static_values(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDict:
+    """Numbers of each sequence's scene, a TensorDict ``[n]`` for ``[n]`` indices of scenes."""
+    which, row = np.unique(variant, return_inverse=True)
+    values = torch.stack([SceneValues.of(scenes[index]).tensordict() for index in which])
+    return cast(TensorDict, values[torch.from_numpy(row)])
+
+
 def collect_chunk(
     simulator: Simulator,
-    count: int,
+    variant: np.ndarray,
     steps: int,
     seed: int,
     key: tuple[int, ...],
@@ -84,8 +98,8 @@ def collect_chunk(
     """Simulate the sequences that share one derived seed, drawing unstable ones again.
 
     Args:
-        simulator: simulator of one scene.
-        count: number of sequences.
+        simulator: simulator of one scene, or of several.
+        variant: ``[count]`` integers, which of its scenes each sequence is of.
         steps: control steps of each.
         seed: the data set's seed.
         key: distinguishes the chunk's seed from all others'.
@@ -95,13 +109,14 @@ def collect_chunk(
         TensorDict ``[count]`` of ``state``, ``action`` and ``physics``, and the number of
         unstable simulations that were rejected.
     """
-    scene = simulator.scene
+    scene, count = simulator.scene, len(variant)
     result, rejected, pending = None, 0, torch.arange(count)
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*key, attempt)))
-        start, bad_starts = draw_start_states(scene, len(pending), rng, simulator)
+        own = variant[pending.numpy()]
+        start, bad_starts = draw_start_states(simulator, own, rng)
         action = spline_controls(scene, len(pending), steps, rng, knot_interval=knot_interval)
-        drawn = simulator.rollout(start, action)
+        drawn = simulator.rollout(start, action, own)
         drawn["action"] = torch.from_numpy(action)
         stable = drawn.pop("stable")
         if result is None:

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from operator import index
 from pathlib import Path
 
+import numpy as np
+import torch
 from tensordict import TensorDict
 
-from torchrl_gn.data.collect import CHUNK, collect_chunk, collect_trajectories
+from torchrl_gn.data.collect import CHUNK, collect_chunk, collect_trajectories, static_values
 from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, package_versions
 from torchrl_gn.data.errors import DatasetError
@@ -18,6 +20,8 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.errors import SceneError
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.scene_values import SceneValues
+from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters
 
 __all__ = ["TrajectoryDataset", "collect_trajectories", "create_dataset", "load_dataset"]
 
@@ -27,11 +31,13 @@ class TrajectoryDataset:
     """Trajectories of a scene under random control, in three splits.
 
     Each split is a TensorDict ``[M]``, float64: ``state`` ``[M, T+1, N, 13]``, ``action`` ``[M, T, A]`` and
-    ``physics`` ``[M, T+1, S]``. They are mapped from disk, read when needed; writing to them changes
-    memory only, never the files.
+    ``physics`` ``[M, T+1, S]``; of variants also ``static``, a TensorDict ``[M]`` of the entries of
+    :class:`~torchrl_gn.scenes.SceneValues`, and ``parameters`` ``[M, P]``, in the order of
+    :func:`~torchrl_gn.scenes.parameter_ranges`. They are mapped from disk, read when needed; writing to them
+    changes memory only, never the files.
 
     Attributes:
-        scene: the scene.
+        scene: the scene; of variants, the standard one.
         train: sequences to train on.
         validation: sequences to stop early on.
         test: sequences to report errors on.
@@ -46,6 +52,18 @@ class TrajectoryDataset:
     rejected: dict[str, int]
     manifest: dict = field(repr=False)
 
+    def scene_of(self, split: str, index: int) -> Scene:
+        """The scene of one sequence, built again if it is a variant.
+
+        Args:
+            split: ``"train"``, ``"validation"`` or ``"test"``.
+            index: which sequence of it.
+        """
+        if split not in SPLITS:
+            raise ValueError(f"split={split!r} is not known; use one of {list(SPLITS)}.")
+        parameters = getattr(self, split).get("parameters", None)
+        return self.scene if parameters is None else _variants(self.scene, parameters[index, None].numpy())[0]
+
 
 def create_dataset(
     path: str | os.PathLike,
@@ -56,14 +74,15 @@ def create_dataset(
     steps: int = 100,
     seed: int = 0,
     *,
+    variants: int | None = None,
     knot_interval: float = 10.0,
     num_threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> TrajectoryDataset:
     """Simulate a data set onto disk, or finish or load the one that is there.
 
-    The default sizes are the paper's. Data depend on the scene, sizes, ``steps``, ``seed`` and
-    ``knot_interval`` alone. They are written in chunks; after an interruption the same call goes on
+    The default sizes are the paper's. Data depend on the scene, sizes, ``steps``, ``seed``, ``variants``
+    and ``knot_interval`` alone. They are written in chunks; after an interruption the same call goes on
     where it stopped and gives the same bits. Splits have independent seeds. Unstable simulations
     are drawn again and counted.
 
@@ -75,12 +94,16 @@ def create_dataset(
         test: number of test sequences.
         steps: control steps of each sequence.
         seed: seed, not negative.
+        variants: number of random variants of the scene's system that the sequences of each split take in turn,
+            no split another's; at least as many as sequences give each sequence its own. Default: all are of
+            the scene itself. The paper does not say how many variants its 20000 sequences are of.
         knot_interval: control steps between the knots of the random actions.
         num_threads: threads of the simulation. Default: the cores this process may use.
         progress: called with sequences done and wanted, after every chunk.
 
     Raises:
-        ValueError: a size or ``steps`` is below one, ``seed`` below zero or ``knot_interval`` not above 0 and finite.
+        ValueError: a size, ``steps`` or ``variants`` is below one, ``seed`` below zero or ``knot_interval`` not
+            above 0 and finite, or the scene is of no system that has variants.
         DatasetError: the folder holds something else, another or a damaged data set; nothing of it
             is changed.
         UnstableSimulationError: more than a tenth of a chunk's simulations become unstable.
@@ -88,10 +111,14 @@ def create_dataset(
     sizes = dict(zip(SPLITS, map(index, (train, validation, test)), strict=True))
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
-    for name, value in {**sizes, "steps": steps}.items():
+    counts = {**sizes, "steps": steps, **({} if variants is None else {"variants": variants})}
+    for name, value in counts.items():
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     check_knot_interval(knot_interval)
+    ranges = None
+    if variants is not None:
+        ranges = {name: [one.low, one.high] for name, one in parameter_ranges(_system(scene)).items()}
     files = DatasetFiles(Path(path))
     request = {
         "scene": scene.name,
@@ -101,6 +128,8 @@ def create_dataset(
         "seed": index(seed),
         "knot_interval": float(knot_interval),
         "chunk": CHUNK,
+        "variants": None if variants is None else index(variants),
+        "parameters": ranges,
     }
     if files.exists():
         manifest = files.read()
@@ -115,6 +144,7 @@ def create_dataset(
                 "state": [steps + 1, scene.num_nodes, 13],
                 "action": [steps, scene.num_actions],
                 "physics": [steps + 1, scene.physics_size],
+                **({} if ranges is None else _variant_entries(scene, len(ranges))),
             },
             "versions": package_versions(),
             "chunks": {split: [] for split in SPLITS},
@@ -179,20 +209,61 @@ def _collect_missing(
     total = sum(request["sizes"].values())
     done = sum(min(len(manifest["chunks"][split]) * CHUNK, size) for split, size in request["sizes"].items())
     for number, (split, size) in enumerate(request["sizes"].items()):
+        parameters = None
+        if request["variants"] is not None:
+            rng = np.random.default_rng(np.random.SeedSequence(request["seed"], spawn_key=(number,)))
+            parameters = sample_parameters(_system(scene), min(request["variants"], size), rng)
         for first in range(len(manifest["chunks"][split]) * CHUNK, size, CHUNK):
+            count, own = min(CHUNK, size - first), None
+            variant = np.zeros(count, dtype=np.int64)
+            if parameters is not None:
+                own = parameters[np.arange(first, first + count) % len(parameters)]
+                # Built chunk by chunk: thousands of models at once would take gigabytes.
+                distinct, variant = np.unique(own, axis=0, return_inverse=True)
+                variant = variant.reshape(-1)  # some versions of NumPy keep the axis
+                simulator = Simulator(_variants(scene, distinct), num_threads)
             chunk, rejected = collect_chunk(
                 simulator,
-                min(CHUNK, size - first),
+                variant,
                 request["steps"],
                 request["seed"],
                 (number, first // CHUNK),
                 knot_interval=request["knot_interval"],
             )
-            arrays = {name: chunk.get(name).numpy() for name in manifest["entries"]}
+            if own is not None:
+                chunk["static"] = static_values(simulator.scenes, variant)
+                chunk["parameters"] = torch.from_numpy(own)
+            arrays = {name: chunk.get(tuple(name.split("/"))).numpy() for name in manifest["entries"]}
             files.append(manifest, split, arrays, rejected)
-            done += len(chunk)
+            done += count
             if progress is not None:
                 progress(done, total)
+
+
+def _system(scene: Scene) -> str:
+    """Name of the system that variants of a scene are of.
+
+    Raises:
+        ValueError: if there is none, or the scene is itself a variant.
+    """
+    if "parameters" in scene.origin:
+        raise ValueError(f"Scene {scene.name!r} is a variant already; give the standard system, without parameters.")
+    if "system" not in scene.origin:
+        raise ValueError(
+            f"Scene {scene.name!r} is an MJCF model, which has no parameters to vary; give one of the paper's systems"
+            " that torchrl_gn.scenes.parameter_ranges knows, or collect_trajectories a list of your own variants."
+        )
+    return scene.origin["system"]
+
+
+def _variants(scene: Scene, parameters: np.ndarray) -> list[Scene]:
+    return make_variants(_system(scene), parameters, timestep=scene.timestep, name=scene.name)
+
+
+def _variant_entries(scene: Scene, parameters: int) -> dict[str, list[int]]:
+    """Shapes of what sequences of variants have besides their states."""
+    static = {f"static/{name}": list(value.shape) for name, value in SceneValues.of(scene)._asdict().items()}
+    return {**static, "parameters": [parameters]}
 
 
 def _open(files: DatasetFiles, manifest: dict, scene: Scene) -> TrajectoryDataset:

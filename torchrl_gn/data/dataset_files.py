@@ -4,6 +4,7 @@
 
     manifest.json                                 what the data are, which chunks are done
     train/state.bin, action.bin, physics.bin      little-endian float64, row after row
+    train/static/nodes.bin, ...                   of variants, the numbers of each sequence's scene
     validation/..., test/...
 """
 
@@ -23,7 +24,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.data.errors import DatasetError
 
-FORMAT = 1
+FORMAT = 2
 SPLITS = ("train", "validation", "test")
 _KEYS = {"format", "request", "description", "entries", "versions", "chunks"}
 
@@ -70,7 +71,8 @@ class DatasetFiles:
     def create(self, manifest: dict) -> None:
         """Make the folder and a manifest without chunks."""
         for split in SPLITS:
-            (self.root / split).mkdir(parents=True, exist_ok=True)
+            for name in manifest["entries"]:
+                self._file(split, name).parent.mkdir(parents=True, exist_ok=True)
         self._write(manifest)
 
     def read(self) -> dict:
@@ -129,7 +131,7 @@ class DatasetFiles:
         Args:
             manifest: gets the chunk's entry.
             split: name of the split.
-            arrays: ``[rows, *shape]`` float64 by name.
+            arrays: ``[rows, *shape]`` float64 by name; a part of a name before ``/`` is a folder.
             rejected: simulations that were drawn again for this chunk.
         """
         done, sums = _rows_done(manifest, split), {}
@@ -156,7 +158,7 @@ class DatasetFiles:
                 flat = torch.from_file(file, shared=False, size=numel, dtype=torch.float64)
             else:  # a scene without actuators
                 flat = torch.empty(0, dtype=torch.float64)
-            entries[name] = flat.view(size, *shape)
+            entries[tuple(name.split("/"))] = flat.view(size, *shape)
         return TensorDict(entries, batch_size=[size])
 
     def _file(self, split: str, name: str) -> Path:

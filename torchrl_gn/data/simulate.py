@@ -161,18 +161,21 @@ class Simulator:
             state[row] = data.sensordata[where].reshape(state.shape[1:])
         return torch.from_numpy(state.reshape(*batch, *state.shape[1:]))
 
-    def settle(self, physics: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    def settle(
+        self, physics: np.ndarray, steps: int, variant: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Advance states by physics steps without control; their time is kept.
 
         Args:
             physics: ``[n, S]`` float64, full MuJoCo states.
             steps: number of physics steps, at least 1.
+            variant: as for :meth:`rollout`.
 
         Returns:
             States ``[n, S]`` and which of them ``[n]`` are stable.
         """
         start = self._checked_physics(physics)
-        which = self._variants(None, start.shape[:-1])
+        which = self._variants(variant, start.shape[:-1])
         settled, stable = np.empty_like(start), np.empty(len(start), dtype=bool)
         for rows in self._chunks(len(start), steps + 1):
             controls = np.zeros((len(start[rows]), steps + 1, self.scene.num_actions))

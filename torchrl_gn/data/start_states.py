@@ -42,35 +42,33 @@ def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) ->
     Raises:
         UnstableSimulationError: states still fall unstable after ten draws.
     """
-    return draw_start_states(scene, n, rng)[0]
+    if n < 0:
+        raise ValueError(f"n must not be negative, got {n}")
+    return draw_start_states(Simulator(scene), np.zeros(n, dtype=np.int64), rng)[0]
 
 
 def draw_start_states(
-    scene: Scene, n: int, rng: int | np.random.Generator, simulator: Simulator | None = None
+    simulator: Simulator, variant: np.ndarray, rng: int | np.random.Generator
 ) -> tuple[np.ndarray, int]:
     """As :func:`sample_start_states`, with the number of unstable states that were drawn again.
 
     Args:
-        scene: the scene.
-        n: number of states.
+        simulator: simulator of one or several scenes.
+        variant: ``[n]`` integers, which of its scenes each state is for.
         rng: generator or seed.
-        simulator: simulator of that scene, to reuse its threads.
     """
-    if n < 0:
-        raise ValueError(f"n must not be negative, got {n}")
-    rng = np.random.default_rng(rng)
-    states = _draw_apart(scene, n, rng)
+    rng, n, scene = np.random.default_rng(rng), len(variant), simulator.scene
+    states = _draw_apart(simulator, variant, rng)
     if n == 0 or scene.settle_steps == 0:
         return states, 0
-    simulator = simulator or Simulator(scene)
     pending, rejected = np.arange(n), 0
     for _ in range(_ATTEMPTS):
-        states[pending], stable = simulator.settle(states[pending], scene.settle_steps)
+        states[pending], stable = simulator.settle(states[pending], scene.settle_steps, variant[pending])
         pending = pending[~stable]
         if not len(pending):
             return states, rejected
         rejected += len(pending)
-        states[pending] = _draw_apart(scene, len(pending), rng)
+        states[pending] = _draw_apart(simulator, variant[pending], rng)
     raise UnstableSimulationError(
         f"{len(pending)} of {n} start states of {scene.name!r} became unstable within the "
         f"{scene.settle_steps} physics steps after a reset, {_ATTEMPTS} times in a row. "
@@ -78,16 +76,24 @@ def draw_start_states(
     )
 
 
-def _draw_apart(scene: Scene, n: int, rng: np.random.Generator) -> np.ndarray:
+def _draw_apart(simulator: Simulator, variant: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Start states; for JACO, without overlapping bodies."""
-    states = _draw(scene, n, rng)
-    if scene.origin.get("system") != "jaco":
+    states, scenes = _draw_each(simulator, variant, rng), simulator.scenes
+    if simulator.scene.origin.get("system") != "jaco":
         return states
-    pending, data = np.arange(n), mujoco.MjData(scene.model)
+    pending, data = np.arange(len(variant)), mujoco.MjData(simulator.scene.model)
     while len(pending):
-        pending = np.array([row for row in pending if _overlaps(scene.model, data, states[row])], dtype=np.int64)
-        states[pending] = _draw(scene, len(pending), rng)
+        overlapping = [row for row in pending if _overlaps(scenes[variant[row]].model, data, states[row])]
+        pending = np.array(overlapping, dtype=np.int64)
+        states[pending] = _draw_each(simulator, variant[pending], rng)
     return states
+
+
+def _draw_each(simulator: Simulator, variant: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    if len(simulator.scenes) == 1:
+        return _draw(simulator.scene, len(variant), rng)
+    rows = [_draw(simulator.scenes[which], 1, rng) for which in variant]
+    return np.concatenate(rows) if rows else np.empty((0, simulator.scene.physics_size))
 
 
 def _overlaps(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray) -> bool:

@@ -16,7 +16,7 @@ from torchrl_gn.scenes.errors import SceneChangedWarning
 from torchrl_gn.scenes.mjcf_source import is_mjcf_text, read_mjcf, rebuild_mjcf
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
-from torchrl_gn.scenes.variants import build_variant
+from torchrl_gn.scenes.variants import make_variant
 
 
 def load_scene(
@@ -49,8 +49,8 @@ def load_scene(
         >>> load_scene("swimmer6").timestep
         0.02
     """
-    if parameters is not None and (not isinstance(source, str) or find_system(source) is None):
-        raise ValueError(f"Only the paper's systems have parameters, among {', '.join(SYSTEMS)}; not this source.")
+    if parameters is not None:
+        return make_variant(source, parameters, timestep=timestep, name=name)
     if isinstance(source, mujoco.MjSpec):
         spec: Any = source
         return build_scene(spec, name=name or spec.modelname, timestep=timestep)
@@ -60,8 +60,6 @@ def load_scene(
         raise TypeError(f"load_scene takes a name, a path, MJCF text or an MjSpec, got {type(source).__name__}.")
     if isinstance(source, str) and not is_mjcf_text(source):
         system = find_system(source)
-        if system is not None and parameters is not None:
-            return build_variant(system, parameters, timestep=timestep, name=name)
         if system is not None:
             return build_scene(
                 system.build(),
@@ -89,7 +87,7 @@ def scene_from_description(description: dict) -> Scene:
         raise ValueError(_unknown(description["system"]))
     name, timestep = description["name"], description["timestep"]
     if system and "parameters" in description:
-        scene = build_variant(system, description["parameters"], timestep=timestep, name=name)
+        scene = make_variant(system.name, description["parameters"], timestep=timestep, name=name)
     else:
         keys = ("system",) if system else ("mjcf", "assets")
         scene = build_scene(

@@ -89,19 +89,20 @@ def make_variants(
     return list(_build(_varied(system), rows, timestep=timestep, name=name))
 
 
-def build_variant(
-    system: System, parameters: Mapping[str, float], *, timestep: float | None = None, name: str | None = None
+def make_variant(
+    system: object, parameters: Mapping[str, float], *, timestep: float | None = None, name: str | None = None
 ) -> Scene:
     """One variant; parameters that are left out are those of the standard system.
 
     Raises:
-        ValueError: if the system lacks a parameter, or a value cannot be one.
+        ValueError: if it is no system that has these parameters, or a value cannot be one.
     """
-    standard = {key: one.standard for key, one in _varied(system.name).ranges.items()}
+    found = _varied(system)
+    standard = {key: one.standard for key, one in found.ranges.items()}
     if unknown := [key for key in parameters if key not in standard]:
-        raise ValueError(f"{system.name!r} has no parameters {unknown}; use some of {list(standard)}.")
+        raise ValueError(f"{found.name!r} has no parameters {unknown}; use some of {list(standard)}.")
     values = {**standard, **{key: float(value) for key, value in parameters.items()}}
-    return next(_build(system, iter([values]), timestep=timestep, name=name))
+    return next(_build(found, iter([values]), timestep=timestep, name=name))
 
 
 def _build(
@@ -136,10 +137,11 @@ def _check(system: System, values: Mapping[str, float]) -> None:
             raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
 
 
-def _varied(name: str) -> System:
-    system = find_system(name)
+def _varied(source: object) -> System:
+    system = find_system(source) if isinstance(source, str) else None
     if system is None or system.vary is None:
         having = [known for known in SYSTEMS if (found := find_system(known)) and found.vary]
         names = ["swimmerN" if known == "swimmer6" else known for known in having]
-        raise ValueError(f"{name!r} has no parameters to vary; these systems have: {', '.join(names)}.")
+        what = repr(source) if isinstance(source, str) and "<" not in source else "An MJCF model"
+        raise ValueError(f"{what} has no parameters to vary; these systems have: {', '.join(names)}.")
     return system

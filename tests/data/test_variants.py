@@ -1,0 +1,189 @@
+"""Trajectories of random variants, each of its own scene, in memory and on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_gn.data import (
+    DatasetError,
+    Simulator,
+    collect,
+    collect_trajectories,
+    create_dataset,
+    dataset,
+    load_dataset,
+    sample_start_states,
+    spline_controls,
+    trajectory_buffer,
+)
+from torchrl_gn.scenes import Scene, SceneValues, load_scene, make_variants, parameter_ranges, sample_variants
+
+SYSTEMS = ["pendulum", "cartpole", "swimmer3", "swimmer6", "cheetah", "jaco"]
+SIZES = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
+SPLITS = ("train", "validation", "test")
+
+
+@pytest.fixture
+def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "CHUNK", 4)
+    monkeypatch.setattr(dataset, "CHUNK", 4)
+
+
+def _equal(first, second) -> bool:
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
+    return all(torch.equal(first[key], second[key]) for key in first.keys(True, True))
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_together_as_each_alone(system: str) -> None:
+    scenes = sample_variants(system, 5, 0)
+    data = collect_trajectories(scenes, 7, 20, seed=1)
+    assert _equal(data, collect_trajectories(scenes, 7, 20, seed=1, simulator=Simulator(scenes, 2)))
+    for i in range(7):
+        scene = scenes[i % 5]
+        alone = Simulator(scene, 1).rollout(data["physics"][i, 0], data["action"][i])
+        assert alone["stable"] and torch.equal(alone["state"], data["state"][i])
+        assert torch.equal(alone["physics"], data["physics"][i])
+        for name, value in SceneValues.of(scene)._asdict().items():
+            assert torch.equal(data["static", name][i], value)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_pinned_bodies_stay_pinned(system: str) -> None:
+    scenes = sample_variants(system, 5, 2)
+    state = collect_trajectories(scenes, 5, 20)["state"]
+    for scene, states in zip(scenes, state.numpy(), strict=True):
+        pins = []
+        for node, arms in (
+            (scene.linkage.parent, scene.linkage.parent_arm),
+            (np.arange(scene.num_nodes), scene.linkage.arm),
+        ):
+            w, v = states[:, node, 3:4], states[:, node, 4:7]
+            turned = np.cross(v, np.cross(v, arms) + w * arms)
+            pins.append(states[:, node, :3] + arms + 2 * turned)
+        assert np.abs(pins[1] - pins[0]).max() < 1e-12
+        assert np.ptp(states[:, 1:, :7], axis=0).max() > 1e-3  # and something moves
+
+
+def test_starts_are_of_the_variants_own_model() -> None:
+    scenes = sample_variants("cheetah", 30, 0)
+    data = collect_trajectories(scenes, 30, 1)
+    for scene, start in zip(scenes, data["physics"][:, 0].numpy(), strict=True):
+        points, state = scene.contact_points, Simulator(scene, 1).observe(torch.from_numpy(start)).numpy()
+        assert points is not None
+        w, v = state[points.node, 3:4], state[points.node, 4:7]
+        place = state[points.node, :3] + points.offset
+        place += 2 * np.cross(v, np.cross(v, points.offset) + w * points.offset)
+        height = (place[:, 2] - points.radius).min()
+        assert -0.1 < height < 0.05, scene.origin  # settled on the ground, however long the legs
+
+
+def test_variants_are_stable() -> None:
+    for system in SYSTEMS[:-1]:
+        scenes = sample_variants(system, 60, 5)
+        rng = np.random.default_rng(0)
+        starts = np.concatenate([sample_start_states(scene, 1, rng) for scene in scenes])
+        played = Simulator(scenes).rollout(starts, spline_controls(scenes[0], 60, 30, rng))
+        assert played["stable"].all(), system
+
+
+@pytest.mark.usefixtures("_small_chunks")
+@pytest.mark.parametrize("count", [1, 3, 100])
+def test_on_disk_as_in_memory(tmp_path: Path, count: int) -> None:
+    scene = load_scene("cartpole", timestep=0.02)
+    made = create_dataset(tmp_path / "d", scene, **SIZES, variants=count)
+    loaded = load_dataset(tmp_path / "d")
+    assert loaded.scene.fingerprint() == scene.fingerprint()
+    seen = []
+    for number, split in enumerate(SPLITS):
+        data = getattr(loaded, split)
+        assert _equal(getattr(made, split), data)
+        own = min(count, SIZES[split])
+        parameters = data["parameters"].numpy()
+        assert len(np.unique(parameters, axis=0)) == own
+        assert np.array_equal(parameters, parameters[np.arange(len(data)) % own])
+        seen.append(parameters[:own])
+        scenes = make_variants("cartpole", parameters[:own], timestep=0.02)
+        expected = collect_trajectories(scenes, SIZES[split], 6, seed=3, split=number)
+        assert _equal(data.exclude("parameters"), expected)
+        last = loaded.scene_of(split, len(data) - 1)
+        assert last.fingerprint() == scenes[(len(data) - 1) % own].fingerprint()
+    everything = np.concatenate(seen)
+    assert len(np.unique(everything, axis=0)) == len(everything)  # no variant is in two splits
+    assert list(loaded.manifest["request"]["parameters"]) == list(parameter_ranges("cartpole"))
+    with pytest.raises(ValueError, match="split='tset' is not known"):
+        loaded.scene_of("tset", 0)
+
+
+def _digest(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.usefixtures("_small_chunks")
+@pytest.mark.parametrize("after", [2, 4])
+def test_interrupted_resumes_to_identical_data(tmp_path: Path, after: int) -> None:
+    scene, calls = load_scene("pendulum"), []
+
+    def interrupt(*_) -> None:
+        calls.append(None)
+        if len(calls) == after:
+            raise KeyboardInterrupt
+
+    create_dataset(tmp_path / "whole", scene, **SIZES, variants=6)
+    with pytest.raises(KeyboardInterrupt):
+        create_dataset(tmp_path / "parts", scene, **SIZES, variants=6, progress=interrupt)
+    create_dataset(tmp_path / "parts", scene, **SIZES, variants=6)
+    assert _digest(tmp_path / "whole") == _digest(tmp_path / "parts")
+
+
+def test_damaged_and_other_data_are_refused(tmp_path: Path) -> None:
+    scene = load_scene("pendulum")
+    create_dataset(tmp_path / "d", scene, **SIZES, variants=6)
+    for other in (None, 7):
+        with pytest.raises(DatasetError, match=f"variants is 6, not {other}"):
+            create_dataset(tmp_path / "d", scene, **SIZES, variants=other)
+    file = tmp_path / "d" / "validation" / "static" / "nodes.bin"
+    content = bytearray(file.read_bytes())
+    content[50] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(DatasetError, match="nodes.bin.*do not have their checksum"):
+        load_dataset(tmp_path / "d")
+
+
+def test_a_data_set_of_one_scene_made_before_variants_is_still_read(tmp_path: Path) -> None:
+    scene = load_scene("pendulum")
+    made = create_dataset(tmp_path / "d", scene, **SIZES)
+    assert "static" not in made.train and made.scene_of("train", 2) is scene
+    file = tmp_path / "d" / "manifest.json"
+    manifest = json.loads(file.read_text())
+    del manifest["request"]["variants"], manifest["request"]["parameters"]
+    file.write_text(json.dumps({**manifest, "format": 1}))
+    assert _equal(create_dataset(tmp_path / "d", scene, **SIZES).train, made.train)
+
+
+def test_scenes_without_variants_are_refused(tmp_path: Path, swimmer: Scene) -> None:
+    text = '<mujoco model="swimmer6"><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>'
+    for scene, message in (
+        (load_scene("acrobot"), "'acrobot' has no parameters to vary"),
+        (load_scene(text), "'swimmer6' is an MJCF model"),
+        (load_scene("pendulum", parameters={"mass": 2}), "'pendulum' is a variant already"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            create_dataset(tmp_path / "d", scene, **SIZES, variants=3)
+    with pytest.raises(ValueError, match="variants must be at least 1, got 0"):
+        create_dataset(tmp_path / "d", swimmer, **SIZES, variants=0)
+    assert not (tmp_path / "d").exists()
+
+
+def test_samples_bring_their_trajectorys_values(tmp_path: Path) -> None:
+    data = create_dataset(tmp_path / "d", load_scene("pendulum"), **SIZES, variants=10).train
+    for window in (1, 3):
+        batch = trajectory_buffer(data, batch_size=40, window=window, seed=0).sample()
+        trajectory = batch["index"][..., 0]
+        for name in SceneValues._fields:
+            assert torch.equal(batch["static", name], data["static", name][trajectory])
