@@ -7,6 +7,8 @@ evaluates one-step and rollout errors on trajectories never trained on (paper: F
 "Evaluation rollout in a Swimmer6" and "One-step and 100-step rollout errors"). Leaves
 config.yaml, metrics.json, the checkpoint, a figure of predicted against true states and a
 video in its run folder, `run_dir=PATH`. Ctrl-C saves everything; the same `run_dir` goes on.
+`parametrized=true` trains on random variants of the system instead, each sequence of its own (paper: SM
+"Datasets"), and evaluates on variants never trained on and on the standard system.
 All options with their defaults: recipes/config/forward_model.yaml. What came out, and how
 long it took: docs/results.md.
 """
@@ -20,9 +22,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_gn.data import create_dataset, trajectory_buffer
+from torchrl_gn.data import collect_trajectories, create_dataset, trajectory_buffer
 from torchrl_gn.evaluation import evaluate_errors, plot_training_curve, report
-from torchrl_gn.modules import FeatureSet, ForwardModel
+from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import (
@@ -51,9 +53,14 @@ def make_model(cfg: DictConfig, scene: Scene) -> ForwardModel:
     return ForwardModel(FeatureSet.of(scene), items=items, **options(cfg.model))
 
 
+def bind(cfg: DictConfig, model: ForwardModel, scene: Scene) -> BoundForwardModel:
+    """Join the weights to the scene, or to its variants, whose numbers come with the samples."""
+    return model.bind(scene, static_key="static" if cfg.parametrized else None)
+
+
 def make_trainer(cfg: DictConfig, model: ForwardModel, scene, dataset) -> Trainer:
     """Wire data, loss and optimiser together."""
-    bound = model.bind(scene)
+    bound = bind(cfg, model, scene)
     noise = torch.Generator().manual_seed(cfg.seed)
     loss = ForwardModelLoss(bound, noise=cfg.noise, generator=noise)
     train = dataset.train
@@ -141,6 +148,7 @@ def main(cfg: DictConfig) -> None:
             test=cfg.data.test,
             steps=cfg.data.length,
             seed=cfg.data.seed,
+            variants=(cfg.data.variants or cfg.data.train) if cfg.parametrized else None,
             progress=show,
         )
     model = begun.model if begun else make_model(cfg, scene)
@@ -153,13 +161,17 @@ def main(cfg: DictConfig) -> None:
     curves = begun.training["curves"] if begun else {"seconds": [], "loss": []}
     train(trainer, curves, run, tracker, cfg)
 
-    table, files = report(model.bind(scene), dataset.test, run.path)
+    table, files = report(bind(cfg, model, scene), dataset.test, run.path, scene=dataset.scene_of("test", 0))
+    tables = {"": table}
+    if cfg.parametrized:
+        sequences = collect_trajectories(scene, cfg.data.test, cfg.data.length, cfg.data.seed, split=3)
+        tables["standard/"] = evaluate_errors(model.bind(scene), sequences)
     if curves["seconds"]:
         curve = {"loss": (curves["seconds"], curves["loss"])}
         files.append(plot_training_curve(curve, run.path / "training.png", ylabel="loss"))
     metrics = run.write_metrics(
         {
-            **table.to_metrics(),
+            **{f"{prefix}{name}": value for prefix, of in tables.items() for name, value in of.to_metrics().items()},
             "steps": trainer.step,
             "training_seconds": trainer.seconds,
             "outside_model_share": trainer.outside_share(),
@@ -171,6 +183,8 @@ def main(cfg: DictConfig) -> None:
     tracker.log_files(files)
     tracker.close()
     print(table)
+    if cfg.parametrized:
+        print(f"\nThe standard {scene.name}:\n{tables['standard/']}")
     for path in [*files, run.path / "metrics.json", run.checkpoint]:
         print(path)
 

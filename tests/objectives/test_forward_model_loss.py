@@ -7,8 +7,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_gn.modules import BODY_STATE, quaternion
+from torchrl_gn.data import create_dataset, trajectory_buffer
+from torchrl_gn.evaluation import evaluate_errors
+from torchrl_gn.modules import BODY_STATE, FeatureSet, ForwardModel, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.scenes import load_scene
 
 COMPONENTS = BODY_STATE.names
 
@@ -313,3 +316,26 @@ def test_batches_that_do_not_fit_are_named(make_loss, windows):
         loss(TensorDict({**batch, "next": {"state": batch["next", "state"][..., :12]}}, batch.batch_size))
     with pytest.raises(ValueError, match="noise=-1 must not be negative"):
         make_loss(noise=-1)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "swimmer3", "cheetah", "jaco"])
+def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
+    torch.manual_seed(0)
+    scene, small = load_scene(name), {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+    data = create_dataset(tmp_path, scene, train=6, validation=1, test=1, steps=4, variants=6)
+    model = ForwardModel(FeatureSet.of(scene), **small).double()
+    loss = ForwardModelLoss(model.bind(scene, static_key="static"))
+    loss.fit_normalizers(trajectory_buffer(data.train, batch_size=200, seed=0).sample())
+    for window in (1, 3):
+        batch = trajectory_buffer(data.train, batch_size=8, window=window, seed=1).sample()
+        alone = []
+        for sample in batch:
+            own = data.scene_of("train", int(sample["index"].flatten()[0]))
+            one = ForwardModelLoss(model.bind(own, strict=True))(sample.exclude("static").unsqueeze(0))
+            alone.append(one["loss_forward_model"])
+        torch.testing.assert_close(loss(batch)["loss_forward_model"], torch.stack(alone).mean(), rtol=1e-9, atol=0)
+    model.requires_grad_(False)
+    table = evaluate_errors(model.bind(scene, static_key="static"), data.train[:1], horizons=(4,))
+    own = evaluate_errors(model.bind(data.scene_of("train", 0)), data.train[:1].exclude("static"), horizons=(4,))
+    for error in ("one_step_error", "rollout_error_4"):
+        assert table[error].total == pytest.approx(own[error].total, rel=1e-9)

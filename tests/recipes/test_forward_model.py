@@ -77,6 +77,17 @@ def test_bad_options_end_in_one_line_and_touch_nothing(interrupted):
     assert {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()} == before
 
 
+def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_path):
+    options = (*SMALL, "parametrized=true", "minutes=null", "steps=5", f"run_dir={tmp_path}")
+    code, output, errors = run(*options)
+    assert code == 0, errors
+    assert "warning" not in errors.lower() and "The standard pendulum" in output
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert 0 < metrics["one_step_error"] != metrics["standard/one_step_error"] > 0
+    request = json.loads((tmp_path / "data" / "manifest.json").read_text())["request"]
+    assert request["variants"] == 20 and list(request["parameters"]) == ["length", "mass"]
+
+
 def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path):
     options = (f"checkpoint={interrupted}", "sequences=5", f"run_dir={tmp_path}")
     code, output, errors = run(*options, "system=cartpole", recipe="evaluate")

@@ -12,6 +12,7 @@ from torchrl_gn.evaluation.errors import evaluate_errors
 from torchrl_gn.evaluation.figures import plot_body_trajectory, plot_errors
 from torchrl_gn.evaluation.video import rollout_video
 from torchrl_gn.modules import BoundForwardModel
+from torchrl_gn.scenes import Scene
 
 
 def report(
@@ -20,21 +21,24 @@ def report(
     folder: str | os.PathLike,
     *,
     horizons: tuple[int, ...] = (20, 100),
+    scene: Scene | None = None,
 ) -> tuple[ErrorTable, list[Path]]:
     """Evaluate a model on test trajectories and draw what it does.
 
     Args:
         model: the model, bound to the scene of the trajectories.
-        trajectories: ``[M]`` test trajectories, ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``.
+        trajectories: ``[M]`` test trajectories, ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``, and
+            static values at the model's ``static_key`` if it has one.
         folder: where the files go.
         horizons: steps of the rollout errors.
+        scene: scene of the first trajectory, which is drawn, if that is a variant of the model's.
 
     Returns:
         The error table, and the written files: the paper's figure of one body
         (``prediction.png``), the errors as bars (``errors.png``) and truth beside
         prediction of the first trajectory (``rollout.gif``).
     """
-    folder, scene = Path(folder), model.scene
+    folder, scene = Path(folder), scene or model.scene
     table = evaluate_errors(model, trajectories, horizons=horizons, keep=1)
     truth, prediction = trajectories["state"][0, : table.rollouts.shape[1]], table.rollouts[0]
     finite = prediction.isfinite().flatten(1).all(1)
