@@ -61,7 +61,11 @@ def build_scene(
     joint_names = tuple(named(mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in range(model.njnt))
     static = static_graph(model, graph, actuator_of_joint, substeps * model.opt.timestep)
     _refuse_non_finite(static, name, node_names, joint_names)
-    live, invariant = live_channels(model, graph.body), translation_invariant(model, graph)
+    data = mujoco.MjData(model)
+    live = live_channels(model, data, graph.body)
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_kinematics(model, data)
+    invariant = translation_invariant(model, data, graph)
     return Scene(
         name=name,
         model=model,
@@ -76,9 +80,9 @@ def build_scene(
         static=static,
         live=live,
         translation_invariant=invariant,
-        linkage=find_linkage(model, graph),
-        heading=find_heading(model, graph, live, invariant),
-        contact_points=find_contact_points(model, graph),
+        linkage=find_linkage(model, data, graph),
+        heading=find_heading(model, data, graph, live, invariant),
+        contact_points=find_contact_points(model, data, graph),
         action_low=model.actuator_ctrlrange[:, 0].copy(),
         action_high=model.actuator_ctrlrange[:, 1].copy(),
         substeps=substeps,

@@ -40,14 +40,17 @@ class ContactPoints:
     origin: np.ndarray
 
 
-def find_contact_points(model: mujoco.MjModel, graph: Topology) -> ContactPoints | None:
+def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> ContactPoints | None:
     """The points that can touch a scene's plane; None without a plane, or if nothing can touch it.
 
     Spheres, ends of capsules, corners of boxes and ends of an ellipsoid's axes; of cylinders and meshes
     nothing is known. With several planes the first that can be touched is taken.
+
+    Args:
+        model: the scene's model.
+        data: of that model at its reference, kinematics done.
+        graph: its topology.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     of_geom = graph.node_of_body[model.geom_bodyid]
     for plane in np.flatnonzero((model.geom_type == _GEOM.mjGEOM_PLANE) & (of_geom == 0)):
         nodes, offsets, radii = [], [], []

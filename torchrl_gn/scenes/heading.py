@@ -35,7 +35,7 @@ class Heading:
 
 
 def find_heading(
-    model: mujoco.MjModel, graph: Topology, live: np.ndarray, translation_invariant: np.ndarray
+    model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, live: np.ndarray, translation_invariant: np.ndarray
 ) -> Heading | None:
     """The world axis about which the dynamics, contacts with the world apart, can be turned.
 
@@ -47,6 +47,7 @@ def find_heading(
 
     Args:
         model: the scene's model.
+        data: of that model at its reference, kinematics done.
         graph: its topology.
         live: ``[N, 12]`` bool, components of the state change that can differ from zero.
         translation_invariant: ``[3]`` bool.
@@ -77,10 +78,10 @@ def find_heading(
     vectors = live.reshape(len(live), 4, 3)
     if not np.array_equal(vectors[..., across[0]], vectors[..., across[1]]):
         return None
-    pivot = np.zeros(3) if moved else _anchor(model, hinge)
+    pivot = np.zeros(3) if moved else data.xanchor[hinge].copy()
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, rest.ravel())
-    return Heading(not touches_world(model, graph, None), node, axis, pivot, quat)
+    return Heading(not touches_world(model, data, graph, None), node, axis, pivot, quat)
 
 
 def _slides_then_hinge(model: mujoco.MjModel, body: int) -> tuple[list[int], int | None]:
@@ -103,9 +104,3 @@ def _alike(model: mujoco.MjModel, slides: list[int], rest: np.ndarray, across: l
     dofs = model.jnt_dofadr[slides]
     table = [model.dof_damping, model.dof_dampingpoly, model.dof_armature, model.dof_frictionloss]
     return all(np.array_equal(values[dofs[0]], values[dofs[1]]) for values in table)
-
-
-def _anchor(model: mujoco.MjModel, hinge: int) -> np.ndarray:
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    return data.xanchor[hinge].copy()

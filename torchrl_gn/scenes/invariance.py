@@ -13,7 +13,7 @@ _TOLERANCE = 1e-9
 _Disable = mujoco.mjtDisableBit
 
 
-def translation_invariant(model: mujoco.MjModel, graph: Topology) -> np.ndarray:
+def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> np.ndarray:
     """Axes along which the dynamics do not depend on where the scene is.
 
     An axis counts if every tree that hangs from the world can move along it by
@@ -24,13 +24,18 @@ def translation_invariant(model: mujoco.MjModel, graph: Topology) -> np.ndarray:
     flexes) counts as not invariant. Gravity, wind and fluid drag are the same
     everywhere.
 
+    Args:
+        model: the scene's model.
+        data: of that model at its reference, kinematics done.
+        graph: its topology.
+
     Returns:
         ``[3]`` bool.
     """
-    return np.array([_invariant_along(model, graph, axis) for axis in np.eye(3)])
+    return np.array([_invariant_along(model, data, graph, axis) for axis in np.eye(3)])
 
 
-def _invariant_along(model: mujoco.MjModel, graph: Topology, axis: np.ndarray) -> bool:
+def _invariant_along(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
     if model.nplugin or model.nflex:
         return False
     shifted: set[int] = set()  # joints that carry the shift
@@ -41,7 +46,7 @@ def _invariant_along(model: mujoco.MjModel, graph: Topology, axis: np.ndarray) -
         shifted.update(joints)
     return (
         not any(feels_position(model, joint) for joint in shifted)
-        and not touches_world(model, graph, axis)
+        and not touches_world(model, data, graph, axis)
         and not any(tied(model, graph, shifted))
     )
 
@@ -98,13 +103,11 @@ def feels_position(model: mujoco.MjModel, joint: int) -> bool:
     return False
 
 
-def touches_world(model: mujoco.MjModel, graph: Topology, axis: np.ndarray | None) -> bool:
+def touches_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray | None) -> bool:
     """Whether a moving geom can collide with a fixed one, planes parallel to ``axis`` apart."""
     if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
         return False
     fixed = graph.node_of_body[model.geom_bodyid] == 0
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     for still in np.flatnonzero(fixed):
         normal = data.geom_xmat[still].reshape(3, 3)[:, 2]
         plane = model.geom_type[still] == mujoco.mjtGeom.mjGEOM_PLANE

@@ -35,14 +35,17 @@ class Linkage:
     root: np.ndarray
 
 
-def find_linkage(model: mujoco.MjModel, graph: Topology) -> Linkage:
+def find_linkage(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> Linkage:
     """Read the pins of a model's joints.
 
     A body is pinned to its parent if all its joints are hinges and balls about one point.
+
+    Args:
+        model: the scene's model.
+        data: of that model at its reference, kinematics done.
+        graph: its topology.
     """
     count = len(graph.body)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     parent, root = np.arange(count), np.arange(count)
     parent_arm, arm, chain = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, count))
     for node in range(1, count):

@@ -8,7 +8,7 @@ import numpy as np
 _TOLERANCE = 1e-9
 
 
-def live_channels(model: mujoco.MjModel, body: np.ndarray, *, samples: int = 8) -> np.ndarray:
+def live_channels(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray, *, samples: int = 8) -> np.ndarray:
     """Components of the state change that can ever differ from zero.
 
     A component is dead if its row of the body's Jacobian (world frame, at the
@@ -19,6 +19,7 @@ def live_channels(model: mujoco.MjModel, body: np.ndarray, *, samples: int = 8) 
 
     Args:
         model: compiled model.
+        data: of that model; what is in it is overwritten.
         body: ``[N]`` root body of each node.
         samples: number of random configurations.
 
@@ -28,7 +29,6 @@ def live_channels(model: mujoco.MjModel, body: np.ndarray, *, samples: int = 8) 
         angular velocity.
     """
     rng = np.random.default_rng(0)
-    data = mujoco.MjData(model)
     largest = np.zeros((len(body), 6))  # largest entry of every Jacobian row
     jacobian = np.zeros((6, model.nv))
     for _ in range(samples):

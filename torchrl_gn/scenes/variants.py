@@ -12,6 +12,8 @@ from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange, System, find_system
 
+_TEXTURE = 16  # pixels
+
 
 def parameter_ranges(system: str) -> dict[str, ParameterRange]:
     """What random variants of a system differ in, and by how much (the SM's table).
@@ -125,9 +127,6 @@ def _build(
             settle_steps=system.settle_steps,
             origin={"system": system.name, "parameters": dict(values)},
         )
-
-
-_TEXTURE = 16  # pixels
 
 
 def _check(system: System, values: Mapping[str, float]) -> None:

@@ -11,6 +11,7 @@ variant's lowest point is as high above the ground as the standard cheetah's.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import mujoco
 import numpy as np
@@ -42,7 +43,6 @@ def _build() -> mujoco.MjSpec:
 
 
 def _vary(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
-    clearance = _lowest(spec)
     for name in ("torso", *_LIMBS):
         body, length = spec.body(name), parameters[f"length_{name}"]
         for geom in body.geoms:
@@ -53,7 +53,13 @@ def _vary(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
             half = 0.5 * parameters[f"angle_{name}"]
             body.quat = [np.cos(half), 0.0, np.sin(half), 0.0]
     torso = spec.body("torso")
-    torso.pos = [*torso.pos[:2], torso.pos[2] + (clearance - _lowest(spec))]
+    torso.pos = [*torso.pos[:2], torso.pos[2] + (_clearance() - _lowest(spec))]
+
+
+@cache
+def _clearance() -> float:
+    """Height of the standard cheetah's lowest point, metres."""
+    return _lowest(_build())
 
 
 def _lowest(spec: mujoco.MjSpec) -> float:
