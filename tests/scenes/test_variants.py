@@ -203,6 +203,9 @@ def test_cheetah(variants):
         size = standard.model.geom_size[moving] * [parameters["thickness"], 1, 1]
         size[:, 1] *= lengths[model.geom_bodyid[moving] - 1]
         np.testing.assert_allclose(model.geom_size[moving], size, rtol=1e-12)
+        # The points that can touch the ground keep their order.
+        offset, expected = (SceneValues.of(one).contact_offset[1:].numpy() for one in (scene, standard))
+        np.testing.assert_allclose(offset, expected * lengths[:, None, None], atol=1e-12)
         for node in range(2, scene.num_nodes):
             expected = standard.linkage.parent_arm[node] * lengths[scene.parent[node] - 1]
             np.testing.assert_allclose(scene.linkage.parent_arm[node], expected, atol=1e-12)

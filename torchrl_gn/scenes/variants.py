@@ -62,9 +62,9 @@ def sample_variants(
     """Random variants of a system: :func:`make_variants` of :func:`sample_parameters`.
 
     Example:
-        >>> short, long = sorted(sample_variants("pendulum", 2, 0), key=lambda s: s.origin["parameters"]["length"])
-        >>> short.contact_points is None, short.num_nodes
-        (True, 2)
+        >>> variants = sample_variants("swimmer6", 3, rng=0)
+        >>> [round(scene.origin["parameters"]["thickness"], 1) for scene in variants]
+        [3.2, 0.7, 0.6]
     """
     return make_variants(system, sample_parameters(system, count, rng), timestep=timestep)
 
