@@ -207,7 +207,8 @@ class BoundForwardModel(TensorDictModuleBase):
                     f"The model reads each sample's static values at {self.static_key!r}; give static_of(scene),"
                     " or bind without static_key."
                 )
-            return static
+            # A model without static features still links bodies by their own lengths.
+            return static.exclude("nodes", "edges", "globals_") if self.model.static == "none" else static
         if isinstance(static, TensorDictBase):
             self._refuse_others(static)
         return None
