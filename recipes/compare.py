@@ -17,6 +17,7 @@ import itertools
 import json
 import math
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -106,7 +107,8 @@ def all_runs(cfg: DictConfig, folder: Path) -> list[Run]:
             f"threads={cfg.threads}",
         ]
         shared += [f"data.folder={Path(cfg.data_dir) / system}", *cfg.overrides]
-        path = folder / system / name.replace(" ", "_") / f"seed{seed}"
+        # Hydra reads a comma in an override as a list.
+        path = folder / system / re.sub(r"[^\w.%-]+", "_", name) / f"seed{seed}"
         runs.append(Run(system, name, seed, (*shared, *variants[name]), path))
     return runs
 

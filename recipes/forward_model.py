@@ -71,7 +71,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, scene, dataset) -> Traine
     validation = dataset.validation
 
     def validate() -> float:
-        return evaluate_errors(bound, validation, horizons=(20,))["rollout_error_20"].total
+        return evaluate_errors(bound, validation, horizons=(20,), one_step=False)["rollout_error_20"].total
 
     return Trainer(
         loss,

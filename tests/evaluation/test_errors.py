@@ -241,3 +241,14 @@ def test_bad_trajectories_are_refused(scenes, change, message):
     scene = scenes["cheetah"]
     with pytest.raises(ValueError, match=message):
         evaluate_errors(as_model(lambda s, a: s * 1, scene), change(random_trajectories(scene, 3, 5)), horizons=(5,))
+
+
+def test_only_what_is_asked_for_is_predicted(scenes):
+    scene = scenes["pendulum"]
+    trajectories = random_trajectories(scene, 3, 6)
+    states: list[int] = []
+    model = as_model(lambda s, a: (states.append(s[..., 0, 0].numel()), s * 1)[1], scene)
+    table = evaluate_errors(model, trajectories, horizons=(4,), one_step=False)
+    assert list(table.to_metrics())[0].startswith("rollout_error_4") and sum(states) == 3 * 4
+    both = evaluate_errors(model, trajectories, horizons=(4,))
+    assert both["rollout_error_4"].total == table["rollout_error_4"].total

@@ -64,6 +64,7 @@ def evaluate_errors(
     trajectories: TensorDictBase,
     *,
     horizons: Sequence[int] = (20, 100),
+    one_step: bool = True,
     batch_size: int = 1000,
     keep: int = 0,
     scene: Scene | None = None,
@@ -88,13 +89,14 @@ def evaluate_errors(
         trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]``, ``"action"`` ``[M, T, A]`` and, if
             the model reads them, static values ``[M]`` at its ``static_key``; may lie on disk (memory-mapped).
         horizons: lengths of the rollouts to measure, at most ``T``.
+        one_step: whether to measure the one-step error, which takes a prediction of every step.
         batch_size: number of states that the model gets in one call.
         keep: number of predicted rollouts to return in the table.
         scene: which nodes count and which components are live; default ``model.scene``.
         device: where to run; default where the trajectories are.
 
     Returns:
-        Table with ``"one_step_error"`` and one ``"rollout_error_<H>"`` for each horizon.
+        Table with ``"one_step_error"``, if asked for, and one ``"rollout_error_<H>"`` for each horizon.
 
     Raises:
         KeyError: if the model reads static values that the trajectories lack.
@@ -109,7 +111,7 @@ def evaluate_errors(
     _check(states, actions, horizons, batch_size, scene, layout)
     steps, horizon = actions.shape[1], max(horizons, default=0)
     predicted = torch.as_tensor(scene.predicted, device=device or states.device)
-    one_step = _Sums(1, layout, predicted)
+    single = _Sums(1, layout, predicted)
     rollouts = _Sums(horizon, layout, predicted)
     static = model.static_in(trajectories) if isinstance(model, BoundForwardModel) else None
     if static is not None:
@@ -117,19 +119,22 @@ def evaluate_errors(
     kept: list[Tensor] = []
 
     with torch.no_grad(), _evaluation_mode(model):
-        for state, action, own in _batches(states, actions, static, max(1, batch_size // steps), device, layout):
+        size = max(1, batch_size // steps)
+        for state, action, own in _batches(states, actions, static, size, device, layout) if one_step else ():
             flat = state[:, :-1].flatten(0, 1)
             each = None if own is None else own.unsqueeze(1).expand(len(state), steps).reshape(-1)
             prediction = predict(model, flat, action.flatten(0, 1), each)
-            valid = one_step.add(0, prediction, state[:, 1:].flatten(0, 1), flat)
-            one_step.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
+            valid = single.add(0, prediction, state[:, 1:].flatten(0, 1), flat)
+            single.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
         for state, action, own in _batches(states, actions, static, batch_size, device, layout) if horizons else ():
             wanted = max(0, min(keep - sum(map(len, kept)), len(state)))
             guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own)
             kept.append(_add_rollouts(guarded, state, rollouts, wanted))
 
     dead = _dead_components(scene, layout)
-    errors = {"one_step_error": one_step.error("one_step_error", 1, len(states), steps, dead)}
+    errors = {}
+    if one_step:
+        errors["one_step_error"] = single.error("one_step_error", 1, len(states), steps, dead)
     for length in horizons:
         name = f"rollout_error_{length}"
         errors[name] = rollouts.error(name, length, len(states), length, dead)

@@ -127,7 +127,8 @@ class Trainer:
         if self.validate is None or due <= self.validated:
             return None
         start = self.budget.now()
-        error = self.validate()
+        with fast_matmul():
+            error = self.validate()
         self.validated = due
         self.since_best += 1
         if error < self.best:
