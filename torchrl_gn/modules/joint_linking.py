@@ -143,7 +143,7 @@ class JointLinking(Linking):
         normal = turning.mT @ turning + weight * (moving.mT @ moving)
         # Two parallel hinges at one place would share their turn: a little of nothing settles it.
         normal = normal + 1e-12 * torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
-        wanted = torch.cat((turns.flatten(-2), gaps.flatten(-2)), dim=-1).unsqueeze(-1)
+        wanted = torch.cat((turns.flatten(-2), gaps.flatten(-2)[..., self.placed]), dim=-1).unsqueeze(-1)
         return torch.linalg.solve_ex(normal, pull @ wanted)[0].squeeze(-1)
 
 

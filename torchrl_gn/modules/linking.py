@@ -40,6 +40,8 @@ class Linking(Float64Buffers):
     root: Tensor
     root_moves: Tensor
     turning: Tensor
+    lever_arms: Tensor
+    placed: Tensor
     levers: Tensor
     spread: Tensor
     live: Tensor
@@ -60,7 +62,12 @@ class Linking(Float64Buffers):
         }
         for name, value in values.items():
             self.register_buffer(name, torch.as_tensor(value), persistent=False)
-        self.register_buffer("levers", self._levers(), persistent=False)
+        # Of all arms and places those that turning can move: in the plane less than half of the products.
+        levers = self._levers()
+        values = {"lever_arms": levers.any(2).any(1), "placed": levers.any(2).any(0)}
+        for name, used in values.items():
+            self.register_buffer(name, used.nonzero().flatten(), persistent=False)
+        self.register_buffer("levers", levers[self.lever_arms][:, self.placed].flatten(1), persistent=False)
 
     def forward(self, state: Tensor, delta: Tensor, std: Tensor, values: SceneValues) -> Tensor:
         """The nearest change that keeps pins together.
@@ -82,7 +89,7 @@ class Linking(Float64Buffers):
 
         arms, along = self.pins(state, before, turn, spin)
         moves = self.moves(arms)
-        misses = self._gap(moved, along).unflatten(-1, (2, 3)).movedim(-2, -1).flatten(-3, -2)
+        misses = self._gap(moved, along).unflatten(-1, (2, 3)).movedim(-2, -1).flatten(-3, -2)[..., self.placed, :]
         ratio = position_weight(std).to(state.dtype)
         pull = ratio * moves.mT
         normal = pull @ moves + torch.eye(moves.shape[-1], dtype=state.dtype, device=state.device)
@@ -104,8 +111,16 @@ class Linking(Float64Buffers):
         return torch.stack((upper, lower), dim=-4).squeeze(-1)
 
     def moves(self, arms: Tensor) -> Tensor:
-        """``[*B, 3 N, L]``: how turning moves the bodies of a linkage about it as a whole, linear in the arms."""
-        return (arms.flatten(-3) @ self.levers.to(arms.dtype)).unflatten(-1, (-1, len(self.turning)))
+        """``[*B, R, L]``: how turning moves bodies relative to their linkage as a whole, linear in the arms.
+
+        Args:
+            arms: ``[*B, 2, N, 3]``.
+
+        Returns:
+            For the ``R`` of the ``3 N`` coordinates that turning moves (``placed``).
+        """
+        used = arms.flatten(-3)[..., self.lever_arms]
+        return (used @ self.levers.to(arms.dtype)).unflatten(-1, (-1, len(self.turning)))
 
     def pins(self, state: Tensor, arms: Tensor, turn: Tensor, spin: Tensor) -> tuple[Tensor, Tensor]:
         """Where pins put the bodies after a change of orientations and angular velocities.
@@ -133,7 +148,7 @@ class Linking(Float64Buffers):
         return start - torch.where(moves, mix(self.mean, start), mix(self.root, start))
 
     def _levers(self) -> Tensor:
-        """``[6 N, 3 N L]``: velocities of bodies about their linkage's own for each live angular velocity, by arm."""
+        """``[6 N, 3 N, L]``: velocities of bodies about their linkage's own for each live angular velocity, by arm."""
         count = len(self.parent)
         upper, lower = torch.eye(6 * count, dtype=torch.float64).view(-1, 2, count, 3).unbind(1)
         upper, lower = _cross(upper).unsqueeze(-3), _cross(lower).unsqueeze(-3)  # [6 N, N, 1, 3, 3]
@@ -143,7 +158,7 @@ class Linking(Float64Buffers):
         bodies = torch.einsum("ij,...jkab->...iakb", self.chain, pins)
         means = torch.einsum("ij,...jakb->...iakb", self.mean, bodies)
         bodies = bodies - self.root_moves.double()[:, :, None, None] * means
-        return bodies.flatten(-2).flatten(-3, -2)[..., self.turning].flatten(1)
+        return bodies.flatten(-2).flatten(-3, -2)[..., self.turning]
 
 
 def position_weight(std: Tensor) -> Tensor:
