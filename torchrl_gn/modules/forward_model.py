@@ -102,7 +102,7 @@ class ForwardModel(nn.Module):
         global_hidden: hidden sizes of the global MLP.
         mlp_hidden: hidden sizes of the rival.
         items: numbers of nodes and edges of the only graphs that the rival can read.
-        activation: between the layers: ``"relu"`` (paper), ``"silu"``, ``"gelu"`` or ``"tanh"``.
+        activation: between the layers: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
 
     Raises:
         ValueError: if an option is none of its choices, or the rival lacks ``items``.
@@ -129,7 +129,7 @@ class ForwardModel(nn.Module):
         global_hidden: Sequence[int] = (128, 128),
         mlp_hidden: Sequence[int] = (256, 256, 256, 256, 256),
         items: Sequence[int] | None = None,
-        activation: str = "relu",
+        activation: str = "silu",
     ) -> None:
         super().__init__()
         for name, value, choices in (

@@ -34,7 +34,10 @@ def linear(pairs, table=None, matrix=None, items=None, activation: str | None = 
     else:
         layer = _plain_layer if torch.compiler.is_compiling() else _Layer.apply
         out = layer(relu, table, matrix, items, *used)
-    return out if relu or activation is None else ACTIVATIONS[activation]()(out)
+    if relu or activation is None:
+        return out
+    in_place = activation == "silu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling() and bool(used)
+    return F.silu(out, inplace=True) if in_place else ACTIVATIONS[activation]()(out)
 
 
 def product(matrix: Tensor, items: Tensor) -> Tensor:
