@@ -99,7 +99,7 @@ def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[Forward
     torch.manual_seed(cfg.seed)
     edges = hidden if cfg.edge_hidden is None else list(cfg.edge_hidden)
     sizes = {"edge_hidden": edges, "node_hidden": hidden, "global_hidden": hidden, "latent": cfg.latent}
-    model = ForwardModel(FeatureSet.of(scene), **sizes)
+    model = ForwardModel(FeatureSet.of(scene), activation=cfg.activation, **sizes)
     ForwardModelLoss(model.bind(scene)).fit_normalizers(transitions)
     return model, transitions
 
