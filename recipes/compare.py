@@ -16,10 +16,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
 import time
@@ -84,10 +82,10 @@ class Runner:
                 self.processes.discard(process)
 
     def stop(self) -> None:
-        """End all runs as Ctrl-C would: they save themselves."""
+        """Tell all runs to end: they save themselves."""
         self.stopped = True
         for process in list(self.processes):
-            os.kill(process.pid, signal.SIGINT)
+            process.terminate()
 
 
 def all_runs(cfg: DictConfig, folder: Path) -> list[Run]:

@@ -23,7 +23,13 @@ def start(*options: str, recipe: str = "forward_model") -> subprocess.Popen:
     pytest.importorskip("hydra")
     command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *options]
     environment = os.environ | {"WANDB_MODE": "offline"}
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # Shells let what they start in the background ignore Ctrl-C, and so would the recipe.
+    return subprocess.Popen(command, env=environment, preexec_fn=_listen_to_ctrl_c, **pipes)
+
+
+def _listen_to_ctrl_c() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:

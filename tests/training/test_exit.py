@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
+
 import pytest
 
 from torchrl_gn.training.checkpoint import CheckpointError
@@ -37,6 +41,26 @@ def test_interruptions_say_that_the_run_is_saved(capsys):
         ending(KeyboardInterrupt())()
     assert caught.value.code == 130
     assert "saved" in capsys.readouterr().err
+
+
+def test_being_told_to_end_is_an_interruption(capsys):
+    saved = []
+
+    @clean_exit
+    def main() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+        except KeyboardInterrupt:
+            saved.append(True)
+            raise
+
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 143 and saved
+    assert "saved" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 @pytest.mark.parametrize("error", [RuntimeError("bug"), TypeError("bug"), AssertionError("bug")])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import signal
 import sys
+import threading
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
@@ -15,21 +17,31 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
     """Let a recipe's main function end cleanly.
 
     What its user can mend (a bad option, file or data set, an unstable simulation) is one line
-    on standard error and exit code 1, without a traceback. Ctrl-C is exit code 130, after the
-    recipe has saved what it has. Anything else is a bug and keeps its traceback.
+    on standard error and exit code 1, without a traceback. Ctrl-C is exit code 130, and being told to
+    end (SIGTERM, as a cluster does) 143, after the recipe has saved what it has. Anything else is
+    a bug and keeps its traceback.
     """
 
     @functools.wraps(main)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        in_main = threading.current_thread() is threading.main_thread()
+        before = signal.signal(signal.SIGTERM, _interrupt) if in_main else None
         try:
             return main(*args, **kwargs)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interrupt:
             sys.stderr.write("Interrupted; what was done is saved. The same run_dir goes on from there.\n")
-            raise SystemExit(130) from None
+            raise SystemExit(128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)) from None
         except (ValueError, OSError, RuntimeError, FloatingPointError, ImportError) as error:
             if type(error) is RuntimeError:
                 raise
             sys.stderr.write(f"{type(error).__name__}: {error}\n")
             raise SystemExit(1) from error
+        finally:
+            if in_main:
+                signal.signal(signal.SIGTERM, before)
 
     return wrapped
+
+
+def _interrupt(number: int, _) -> None:
+    raise KeyboardInterrupt(number)
