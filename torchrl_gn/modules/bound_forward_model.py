@@ -121,6 +121,10 @@ class BoundForwardModel(TensorDictModuleBase):
         """The scene's own numbers, without batch."""
         return SceneValues(*(getattr(self, f"static_{name}") for name in SceneValues._fields))
 
+    def _read(self, static: TensorDictBase | None) -> SceneValues:
+        """Numbers that samples bring, or the scene's own."""
+        return self.values if static is None else SceneValues.read(static, self.values)
+
     def static_of(self, scene: Scene) -> TensorDict:
         """Static values of a variant of this scene, to give samples at the ``static_key``.
 
@@ -270,7 +274,7 @@ class BoundForwardModel(TensorDictModuleBase):
         Args:
             static: static values of every sample, by default the scene's.
         """
-        values = self.values if static is None else SceneValues.read(static, self.values)
+        values = self._read(static)
         core = None if self.plain else self.model.fold(self.static_graph(values), self.predicted_nodes)
         return Folded(core, values)
 
@@ -345,7 +349,7 @@ class BoundForwardModel(TensorDictModuleBase):
         """
         if static is not None:
             require_finite(static, "static")
-        values = self.values if static is None else SceneValues.read(static, self.values)
+        values = self._read(static)
         for part, (_, normalizer) in zip(values, self._static_normalizers(), strict=False):
             normalizer.update(part)
 
@@ -367,7 +371,7 @@ class BoundForwardModel(TensorDictModuleBase):
         for what, given in (("state", state), ("action", action), ("next state", next_state), ("static", static)):
             if given is not None:
                 require_finite(given, what)
-        values = self.values if static is None else SceneValues.read(static, self.values)
+        values = self._read(static)
         encoded, controls = self.frame.features(state, action, values)
         self.model.node_normalizer.update(encoded)
         self.model.edge_normalizer.update(controls)

@@ -46,8 +46,7 @@ class Contacts(Float64Buffers):
             "normal": np.array([0.0, 0.0, 1.0]) if points is None else points.normal,
             "origin": np.zeros(3) if points is None else points.origin,
         }
-        for name, value in values.items():
-            self.register_buffer(name, torch.as_tensor(value), persistent=False)
+        self.constants(values)
 
     def forward(self, state: Tensor, offset: Tensor, radius: Tensor) -> Tensor:
         """Features of every node.

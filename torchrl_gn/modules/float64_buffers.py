@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import torch
 from torch import Tensor, nn
 
 
 class Float64Buffers(nn.Module):
     """Module whose tensors keep their dtype whatever a network around it is cast to: only the device follows."""
+
+    def constants(self, values: Mapping[str, Any]) -> None:
+        """Register arrays or tensors as buffers that are no part of a checkpoint: they follow from the scene."""
+        for name, value in values.items():
+            self.register_buffer(name, torch.as_tensor(value), persistent=False)
 
     def _apply(self, fn, recurse: bool = True):
         def keep_dtype(tensor: Tensor) -> Tensor:

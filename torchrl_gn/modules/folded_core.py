@@ -198,10 +198,6 @@ class FoldedCore:
             out=(_columns(weight.T, out).T, bias[out[0]] * out[1] + shift),
         )
 
-    def snapshot(self, dtype: torch.dtype) -> FoldedCore:
-        """Copy that shares no memory and passes no gradient to the weights."""
-        return map_tensors(self, lambda tensor: tensor.detach().to(dtype).clone(memory_format=torch.contiguous_format))
-
 
 def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedCore:
     """Fold a core for graphs of one topology.
@@ -304,16 +300,21 @@ def _columns(weight: Tensor, columns: Columns) -> Tensor:
     return weight[:, index] * factor
 
 
-def map_tensors(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
+def _map(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
     """The same nested tuples and dataclasses with ``function`` on every floating-point tensor."""
     if isinstance(value, Tensor):
         return function(value) if value.is_floating_point() else value
     if isinstance(value, tuple):
-        return tuple(map_tensors(entry, function) for entry in value)
+        return tuple(_map(entry, function) for entry in value)
     if is_dataclass(value) and not isinstance(value, type):
-        changed = {field.name: map_tensors(getattr(value, field.name), function) for field in fields(value)}
+        changed = {field.name: _map(getattr(value, field.name), function) for field in fields(value)}
         return replace(value, **changed)
     return value
+
+
+def snapshot(folded: Any, dtype: torch.dtype) -> Any:
+    """Copy of a folded network that shares no memory and passes no gradient to the weights."""
+    return _map(folded, lambda tensor: tensor.detach().to(dtype).clone(memory_format=torch.contiguous_format))
 
 
 def copy_into(old, new) -> bool:

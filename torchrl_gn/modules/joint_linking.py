@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.modules import quaternion
-from torchrl_gn.modules.linking import Linking, mix, position_weight
+from torchrl_gn.modules.linking import Linking, position_weight
 from torchrl_gn.modules.state_layout import BODY_STATE
 from torchrl_gn.scenes.joint_axes import joint_axes
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 def make_linking(scene: Scene) -> Linking:
     """The linking that a scene needs: by joint rates where they are fewer than the rates of its bodies."""
-    by_joints = JointLinking(scene)
-    return by_joints if len(by_joints.dof_node) < len(by_joints.turning) else Linking(scene)
+    fewer = len(_dofs(scene)) < np.count_nonzero(scene.live[:, 9:])
+    return JointLinking(scene) if fewer else Linking(scene)
 
 
 class JointLinking(Linking):
@@ -68,8 +68,7 @@ class JointLinking(Linking):
             "second": owns * (stage == 1),
             "is_root": (linkage.parent == np.arange(count))[:, None],
         }
-        for name, value in values.items():
-            self.register_buffer(name, torch.as_tensor(value), persistent=False)
+        self.constants(values)
         # Parents come before their children, as in MuJoCo's trees.
         self._order = [(int(n), int(linkage.parent[n])) for n in range(count) if linkage.parent[n] != n]
         self._two_stages = bool((stage == 1).any())
@@ -91,19 +90,18 @@ class JointLinking(Linking):
         turned = self._compose(axes, angles)
         here = self._turn(turned, axes, arms)
         missing = quaternion.log(quaternion.product(predicted, quaternion.conjugate(turned)))
-        along = mix(self.chain, here[1][..., 0, :, :] - here[1][..., 1, :, :])
-        angles = angles + self._solve(*here, missing, self._gap(place, along), weight)
+        gaps = self._gap(place, self._along(here[1]))
+        angles = angles + self._solve(*here, missing, gaps, weight)
         turned = self._compose(axes, angles)
         axes, arms = self._turn(turned, axes, arms)
-        along = mix(self.chain, arms[..., 0, :, :] - arms[..., 1, :, :])
-        shift = place - self._gap(place, along) - state[..., at["position"]]
+        shift = place - self._gap(place, self._along(arms)) - state[..., at["position"]]
 
         # Rates: linear, where the joints are now.
         rates = self._solve(axes, arms, speed, self._gap(velocity, torch.zeros_like(velocity)), weight)
         speed = (self._turning(axes) @ rates.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 3))
         both = torch.stack((speed[..., self.parent, :], speed), dim=-3)
-        upper, lower = torch.linalg.cross(both, arms).unbind(-3)
-        push = velocity - self._gap(velocity, mix(self.chain, upper - lower)) - state[..., at["linear_velocity"]]
+        along = self._along(torch.linalg.cross(both, arms))
+        push = velocity - self._gap(velocity, along) - state[..., at["linear_velocity"]]
         spin = speed - state[..., at["angular_velocity"]]
         return torch.cat((shift, quaternion.log(turned), push, spin), dim=-1) * self.live
 

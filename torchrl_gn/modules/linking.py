@@ -60,14 +60,12 @@ class Linking(Float64Buffers):
             "spread": np.eye(3 * scene.num_nodes)[:, scene.live[:, 9:].ravel()],
             "live": scene.live,
         }
-        for name, value in values.items():
-            self.register_buffer(name, torch.as_tensor(value), persistent=False)
+        self.constants(values)
         # Of all arms and places those that turning can move: in the plane less than half of the products.
         levers = self._levers()
-        values = {"lever_arms": levers.any(2).any(1), "placed": levers.any(2).any(0)}
-        for name, used in values.items():
-            self.register_buffer(name, used.nonzero().flatten(), persistent=False)
-        self.register_buffer("levers", levers[self.lever_arms][:, self.placed].flatten(1), persistent=False)
+        used = levers.any(2)
+        self.constants({"lever_arms": used.any(1).nonzero().flatten(), "placed": used.any(0).nonzero().flatten()})
+        self.constants({"levers": levers[self.lever_arms][:, self.placed].flatten(1)})
 
     def forward(self, state: Tensor, delta: Tensor, std: Tensor, values: SceneValues) -> Tensor:
         """The nearest change that keeps pins together.
@@ -138,14 +136,18 @@ class Linking(Float64Buffers):
         both = torch.cat((turn, speed), dim=-1)
         turn, speed = torch.stack((both[..., self.parent, :], both), dim=-3).split(3, dim=-1)
         arms = quaternion.rotate_by(turn, arms)
-        upper, lower = torch.cat((arms, torch.linalg.cross(speed, arms)), dim=-1).unbind(-3)
-        return arms, mix(self.chain, upper - lower)
+        return arms, self._along(torch.cat((arms, torch.linalg.cross(speed, arms)), dim=-1))
+
+    def _along(self, pins: Tensor) -> Tensor:
+        """Sums ``[*B, N, F]`` from each linkage's root of what pins ``[*B, 2, N, F]`` add, upper less lower body."""
+        upper, lower = pins.unbind(-3)
+        return _mix(self.chain, upper - lower)
 
     def _gap(self, moved: Tensor, along: Tensor) -> Tensor:
         """How far predicted places or speeds ``[*B, N, F]`` are from where their linkages have them."""
         start = moved - along  # every body's opinion of its root's
         moves = self.root_moves.repeat(1, moved.shape[-1] // 3)
-        return start - torch.where(moves, mix(self.mean, start), mix(self.root, start))
+        return start - torch.where(moves, _mix(self.mean, start), _mix(self.root, start))
 
     def _levers(self) -> Tensor:
         """``[6 N, 3 N, L]``: velocities of bodies about their linkage's own for each live angular velocity, by arm."""
@@ -166,7 +168,7 @@ def position_weight(std: Tensor) -> Tensor:
     return std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)
 
 
-def mix(matrix: Tensor, values: Tensor) -> Tensor:
+def _mix(matrix: Tensor, values: Tensor) -> Tensor:
     """``[N, N]`` times ``[*B, N, F]``, as one product and not one for every sample."""
     return F.linear(values.mT.contiguous(), matrix.to(values.dtype)).mT
 

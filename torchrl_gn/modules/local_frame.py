@@ -50,8 +50,7 @@ class LocalFrame(Float64Buffers):
             # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
             "shifted": predicted[:, None] * invariant,
         }
-        for name, value in values.items():
-            self.register_buffer(name, value, persistent=False)
+        self.constants(values)
 
     def recentered(self, state: Tensor) -> Tensor:
         """State ``[*B, N, 13]`` with the bodies' mean position moved to 0 along invariant axes.

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.modules import MLP
 
-from torchrl_gn.modules.folded_core import Columns, map_tensors
+from torchrl_gn.modules.folded_core import Columns
 from torchrl_gn.modules.gn_block import GraphSize
 from torchrl_gn.modules.graph import Graph
 from torchrl_gn.modules.linear import ACTIVATIONS
@@ -131,10 +131,6 @@ class FoldedMLP:
         rows, factor = out
         changed = weight[:, rows] * factor[:, None], bias[:, rows] * factor + shift
         return replace(self, weights=tuple(parts), out=changed)
-
-    def snapshot(self, dtype: torch.dtype) -> FoldedMLP:
-        """Copy that shares no memory and passes no gradient to the weights."""
-        return map_tensors(self, lambda x: x.detach().to(dtype).clone(memory_format=torch.contiguous_format))
 
 
 def _flat(graph: Graph) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded, UnseenFeatureWarning
 from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
-from torchrl_gn.modules.folded_core import FoldedCore, copy_into
+from torchrl_gn.modules.folded_core import FoldedCore, copy_into, snapshot
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.scenes.scene_values import SceneValues
 
@@ -89,7 +89,7 @@ class SpecializedForwardModel(BoundForwardModel):
     def fold(self, static: TensorDictBase | None = None) -> Folded:
         """The snapshot, made again if anything it came from has changed."""
         if self._folded is None or not self._same(static) or not all(s.unchanged() for s in self._sources):
-            folded = self._fold(self.values if static is None else SceneValues.read(static, self.values))
+            folded = self._fold(self._read(static))
             if self._folded is None or not copy_into(self._folded, folded):
                 self._folded, self._compiled = folded, None
             self._folds += 1
@@ -131,7 +131,7 @@ class SpecializedForwardModel(BoundForwardModel):
             (self.rows, residual.std[self.rows]),
             residual.mean[self.rows],
         )
-        return Folded(small.snapshot(self.dtype), SceneValues(*(value.detach().clone() for value in values)))
+        return Folded(snapshot(small, self.dtype), SceneValues(*(value.detach().clone() for value in values)))
 
     def _residual(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         core = folded.core
