@@ -21,6 +21,7 @@ from torchrl_gn.modules import (
     StateLayout,
     UnseenFeatureWarning,
     quaternion,
+    specialize,
 )
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.systems import find_system
@@ -421,3 +422,14 @@ def test_joint_axes_turn_with_the_scene(scenes, make_model, random_states, rando
     turned[..., 3:7] = quaternion.product(turn, state[..., 3:7])
     matrix = quaternion.to_matrix(turn).reshape(3, 3)
     torch.testing.assert_close(bound.frame.features(turned, action, bound.values)[1][..., 1:4], axes @ matrix.T)
+
+
+def test_actions_beyond_the_limits_do_what_those_at_the_limits_do(scenes, make_model, random_states, random_actions):
+    scene = scenes["swimmer6"]
+    bound, state = make_model(scene).bind(scene), random_states(scene, 5)
+    action = 3 * random_actions(scene, 5)
+    low, high = torch.as_tensor(scene.action_low), torch.as_tensor(scene.action_high)
+    cut = torch.minimum(torch.maximum(action, low), high)
+    assert not torch.equal(action, cut)
+    for model in (bound, specialize(bound)):
+        assert torch.equal(model.step(state, action), model.step(state, cut))

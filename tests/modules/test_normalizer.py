@@ -214,3 +214,13 @@ def test_statistics_follow_shared_memory_and_meta_devices():
     empty = empty.to_empty(device="cpu")
     empty.load_state_dict(normalizer.state_dict())
     assert_same_statistics(empty, normalizer, rtol=0)
+
+
+def test_limit_cuts_off_what_is_far_outside():
+    normalizer = Normalizer(1, limit=3.0)
+    normalizer.update(torch.tensor([[-1.0], [1.0]]))
+    got = normalizer(torch.tensor([[-1e9], [0.5], [1e9], [float("nan")]])).flatten()
+    assert got[:3].tolist() == [-3, 0.5, 3]
+    assert got[3].isnan()
+    with pytest.raises(ValueError, match="limit=0"):
+        Normalizer(1, limit=0)

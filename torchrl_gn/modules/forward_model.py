@@ -28,6 +28,8 @@ CoreKind = Literal["gn", "mlp"]
 
 # Spreads below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 _DYNAMIC_FLOOR = 1e-9
+# Bodies this many spreads from all that training saw are shown as if they were that far only.
+_STATIC_LIMIT = 20.0
 
 
 @dataclass(frozen=True)
@@ -174,9 +176,9 @@ class ForwardModel(nn.Module):
         self.node_normalizer = Normalizer(encoded, floor=_DYNAMIC_FLOOR)
         self.dynamic_size = GraphSize(encoded, 7 if joint_axes else 1, 0)
         self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=_DYNAMIC_FLOOR)
-        self.static_node_normalizer = Normalizer(self.static_size.nodes)
-        self.static_edge_normalizer = Normalizer(self.static_size.edges)
-        self.static_global_normalizer = Normalizer(self.static_size.globals_)
+        self.static_node_normalizer = Normalizer(self.static_size.nodes, limit=_STATIC_LIMIT)
+        self.static_edge_normalizer = Normalizer(self.static_size.edges, limit=_STATIC_LIMIT)
+        self.static_global_normalizer = Normalizer(self.static_size.globals_, limit=_STATIC_LIMIT)
         # The network's output has the residual's scale; errors are weighed by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)

@@ -27,6 +27,8 @@ class LocalFrame(Float64Buffers):
         model: the model, whose options say what its network sees.
     """
 
+    action_low: Tensor
+    action_high: Tensor
     edge_action: Tensor
     joint_node: Tensor
     predicted: Tensor
@@ -43,6 +45,8 @@ class LocalFrame(Float64Buffers):
         self.recenters = bool(model.recenter and invariant.any() and predicted.any())
         edge_action = torch.as_tensor(scene.edge_action).long()
         values = {
+            "action_low": torch.as_tensor(scene.action_low),
+            "action_high": torch.as_tensor(scene.action_high),
             # A column of zeros behind the actions stands for joints without motor.
             "edge_action": torch.where(edge_action < 0, scene.num_actions, edge_action),
             "joint_node": torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2),
@@ -97,10 +101,12 @@ class LocalFrame(Float64Buffers):
 
         Args:
             state: ``[*B, N, 13]`` in the world frame.
-            action: ``[*B, A]``.
+            action: ``[*B, A]``; cut off at the motors' limits.
             values: numbers of the scene.
         """
         state = self.local(state, values)
+        # As motors do: what is beyond their limits has no effect, and the network never sees it.
+        action = action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype))
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
         controls = padded[..., self.edge_action].unsqueeze(-1)  # [*B, E, 1]
         if self.joint_axes:

@@ -26,9 +26,11 @@ class Normalizer(Float64Buffers):
         size: number of features ``F``.
         floor: standard deviations up to this are rounding noise: the feature counts as
             constant. (Spreads below 1e-7 of the mean always do.)
+        limit: normalised features are cut off at plus and minus this, so that a network is never asked about
+            what is far outside of all that it learned from.
 
     Raises:
-        ValueError: if the floor is negative or not finite.
+        ValueError: if the floor is negative or not finite, or the limit is not positive.
     """
 
     count: Tensor
@@ -37,11 +39,13 @@ class Normalizer(Float64Buffers):
     std: Tensor
     inverse_std: Tensor
 
-    def __init__(self, size: int, *, floor: float = 0.0) -> None:
+    def __init__(self, size: int, *, floor: float = 0.0, limit: float = math.inf) -> None:
         super().__init__()
         if not 0 <= floor < math.inf:
             raise ValueError(f"floor={floor} must be a finite standard deviation, 0 or above.")
-        self.size, self.floor = size, floor
+        if not limit > 0:
+            raise ValueError(f"limit={limit} must be above 0.")
+        self.size, self.floor, self.limit = size, floor, limit
         for name in ("count", "mean", "m2"):
             self.register_buffer(name, torch.zeros(size, dtype=torch.float64))
         for name in ("std", "inverse_std"):
@@ -114,10 +118,12 @@ class Normalizer(Float64Buffers):
             ``[..., F]``.
         """
         normalized = (features - self.mean.to(features.dtype)) * self.inverse_std.to(features.dtype)
+        if self.limit < math.inf:
+            normalized = normalized.clamp(-self.limit, self.limit)
         return normalized if dtype is None else normalized.to(dtype)
 
     def inverse(self, normalized: Tensor) -> Tensor:
-        """Undo :meth:`forward`: ``[..., F]`` to ``[..., F]``, in the dtype of the input."""
+        """Undo :meth:`forward` (but for the limit): ``[..., F]`` to ``[..., F]``, in the dtype of the input."""
         return normalized * self.std.to(normalized.dtype) + self.mean.to(normalized.dtype)
 
     def extra_repr(self) -> str:
