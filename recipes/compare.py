@@ -1,27 +1,23 @@
 """Train variants of the forward model for equal time, side by side, and compare their errors.
 
-    python recipes/compare.py [systems=[swimmer6,cheetah]] [minutes=3] [seeds=[0]] [only=[default,no linking]]
+    python recipes/compare.py [experiment=accuracy] [systems=[swimmer6,jaco]] [minutes=3] [seeds=[0]] [only=[default]]
 
-Every variant is a run of recipes/forward_model.py with the overrides that recipes/config/compare.yaml names, on the
-same data. Finished runs are kept and interrupted ones go on when the recipe is started again with the same run_dir;
-runs that fail are listed and the others go on. The table shows means over seeds and, with several, the
-half-range; the last column is the geometric mean of errors over systems and horizons, relative to the
-first variant. What came out: docs/results.md.
+Experiments (recipes/config/experiment): accuracy (what makes the difference), ablation (paper, SM Figure "Ablation
+study"), several_systems (paper, "Learning a forward model for multiple systems"), swimmers (paper, Figure "Zero-shot
+dynamics prediction"). Every variant is a run of recipes/forward_model.py with the overrides that the experiment
+names, on the same data: one for each of `systems`, or, with `train_on`, one for all that it lists. Finished runs are
+kept and interrupted ones go on when the recipe is started again with the same run_dir; runs that fail are listed and
+the others go on. Tables show means over seeds and, with several, the half-range; the last column is the geometric
+mean over systems, relative to the first variant. What came out: docs/results.md.
 
-Writes config.yaml, metrics.json, the table as table.md, and each run with its log to its run folder.
+Writes config.yaml, metrics.json, the tables as table.md, bars of the errors as errors.png, and each run with its log
+to its run folder.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 import math
-import re
-import shlex
-import subprocess
-import sys
-import time
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
@@ -29,143 +25,116 @@ from typing import Any, cast
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from torchrl_gn.atomic import atomic_path
+from torchrl_gn.evaluation import plot_bars
 from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training.sweep import Run, folder_name, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
-COLUMNS = {"one_step_error": "one-step", "rollout_error_100": "100 steps", "steps": "updates"}
+ERRORS = {"one_step_error": "one step", "rollout_error_100": "100 steps"}
 
 
 @dataclass(frozen=True)
-class Run:
-    """One training."""
+class Variant:
+    """What is compared: options, and the systems that one model is trained on (none: each of the experiment's)."""
 
-    system: str
+    name: str
+    overrides: tuple[str, ...] = ()
+    train_on: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, name: str, value: Any) -> Variant:
+        """From a list of overrides, or a mapping with ``train_on`` and ``overrides``."""
+        if isinstance(value, dict):
+            return cls(name, tuple(value.get("overrides", ())), tuple(value.get("train_on", ())))
+        return cls(name, tuple(value))
+
+
+@dataclass(frozen=True)
+class Training:
+    """A run, and which systems it is trained on."""
+
+    run: Run
     variant: str
-    seed: int
-    overrides: tuple[str, ...]
-    folder: Path
+    systems: tuple[str, ...]
 
-    @property
-    def metrics(self) -> dict[str, Any] | None:
-        """What it measured, if it is done."""
-        path = self.folder / "metrics.json"
-        return json.loads(path.read_text()) if path.exists() else None
-
-
-class Runner:
-    """Runs the recipe in processes of its own, and ends them with this one."""
-
-    def __init__(self) -> None:
-        self.processes: set[subprocess.Popen] = set()
-        self.stopped = False
-
-    def __call__(self, run: Run) -> int:
-        """Train, unless that is done; the exit code."""
-        if run.metrics is not None:
-            return 0
-        if self.stopped:
-            return 130
-        run.folder.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, str(RECIPE), f"run_dir={run.folder}", *run.overrides]
-        with (run.folder / "log.txt").open("a") as log:
-            log.write(f"$ {shlex.join(command)}\n")
-            log.flush()
-            # In a session of its own, so that Ctrl-C reaches it once, from here.
-            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-            self.processes.add(process)
-            try:
-                return process.wait()
-            finally:
-                self.processes.discard(process)
-
-    def stop(self) -> None:
-        """Tell all runs to end: they save themselves."""
-        self.stopped = True
-        for process in list(self.processes):
-            process.terminate()
+    def value(self, system: str, key: str) -> float | None:
+        """Number of a system that it measured; infinite if it diverged, None if there is none."""
+        metrics = self.run.metrics or {}
+        names = [f"{system}/{key}", f"{system} (zero-shot)/{key}", *([key] if self.systems == (system,) else [])]
+        for name in (name for name in names if name in metrics):
+            return math.inf if metrics[name] is None else float(metrics[name])
+        return None
 
 
-def all_runs(cfg: DictConfig, folder: Path) -> list[Run]:
-    """Every system, variant and seed, system by system, seed by seed."""
-    variants = cast(dict[str, list[str]], OmegaConf.to_container(cfg.variants))
+def all_trainings(cfg: DictConfig, folder: Path) -> list[Training]:
+    """Every variant and seed, system by system."""
+    given = cast(dict[str, Any], OmegaConf.to_container(cfg.variants))
+    variants = {name: Variant.read(name, value) for name, value in given.items()}
     chosen = list(variants) if cfg.only is None else list(cfg.only)
     unknown = [name for name in chosen if name not in variants]
     if unknown:
         raise ValueError(f"Variants {unknown} are not known; use some of {list(variants)}.")
-    runs = []
-    for seed, system, name in itertools.product(cfg.seeds, cfg.systems, chosen):
-        shared = [
-            f"system={system}",
-            f"seed={seed}",
-            f"minutes={cfg.minutes}",
-            f"clock={cfg.clock}",
-            f"threads={cfg.threads}",
-        ]
-        shared += [f"data.folder={Path(cfg.data_dir) / system}", *cfg.overrides]
-        # Hydra reads a comma in an override as a list.
-        path = folder / system / re.sub(r"[^\w.%-]+", "_", name) / f"seed{seed}"
-        runs.append(Run(system, name, seed, (*shared, *variants[name]), path))
-    return runs
+    trainings = []
+    for seed, name in itertools.product(cfg.seeds, chosen):
+        variant = variants[name]
+        for systems in [variant.train_on] if variant.train_on else [(system,) for system in cfg.systems]:
+            overrides = (
+                f"system=[{','.join(systems)}]" if variant.train_on else f"system={systems[0]}",
+                f"zero_shot=[{','.join(cfg.zero_shot)}]",
+                *(f"{option}={_plain(cfg[option])}" for option in ("minutes", "steps", "clock", "threads")),
+                f"seed={seed}",
+                f"data.folder={cfg.data_dir}",
+                *cfg.overrides,
+                *variant.overrides,
+            )
+            place = folder / folder_name("-".join(systems)) / folder_name(name) / f"seed{seed}"
+            run = Run(RECIPE, place, overrides, f"{', '.join(systems)}, {name}, seed {seed}")
+            trainings.append(Training(run, name, systems))
+    return trainings
 
 
-def train(runs: list[Run], jobs: int) -> list[Run]:
-    """Train ``jobs`` at a time; those that failed."""
-    runner, failed = Runner(), []
-    # The first of a system collects the data that the others share.
-    first = {run.system: run for run in reversed(runs) if run.metrics is None}
-    later = [run for run in runs if run is not first.get(run.system)]
-    with tqdm(total=len(runs), desc="training", unit="run", leave=False) as bar, ThreadPoolExecutor(jobs) as pool:
-        try:
-            for part in (list(first.values()), later):
-                futures = {pool.submit(runner, run): run for run in part}
-                for future in as_completed(futures):
-                    run = futures[future]
-                    if future.result():
-                        failed.append(run)
-                        tqdm.write(
-                            f"failed: {run.system}, {run.variant}, seed {run.seed}; see {run.folder / 'log.txt'}"
-                        )
-                    bar.update()
-        except KeyboardInterrupt:
-            runner.stop()
-            while runner.processes:
-                time.sleep(0.1)
-            raise
-    return failed
+def _plain(value: Any) -> str:
+    return "null" if value is None else str(value)
 
 
-def summarise(runs: list[Run]) -> tuple[list[str], dict[str, float]]:
-    """Table in Markdown, and metrics."""
-    systems, variants = (list(dict.fromkeys(getattr(run, key) for run in runs)) for key in ("system", "variant"))
-    metrics: dict[str, float] = {}
-    cells: dict[str, list[str]] = {variant: [] for variant in variants}
-    scores: dict[str, list[float]] = {variant: [] for variant in variants}
-    for system, column, variant in itertools.product(systems, COLUMNS, variants):
-        done = [r.metrics for r in runs if (r.system, r.variant) == (system, variant)]
-        values = [math.inf if m[column] is None else float(m[column]) for m in done if m is not None]
-        if not values:
-            cells[variant].append("-")
-            continue
-        spread = (max(values) - min(values)) / 2
-        metrics[f"{system}/{variant}/{column}"] = mean(values)
-        if column == "steps":
-            cells[variant].append(f"{mean(values):,.0f}")
-            continue
-        cells[variant].append(f"{mean(values):.1e}" + (f" ± {spread:.0e}" if len(values) > 1 else ""))
-        metrics[f"{system}/{variant}/{column}/half_range"] = spread
-        base = metrics.get(f"{system}/{variants[0]}/{column}")
-        if base:
-            scores[variant].append(math.log(mean(values) / base))
-    header = ["", *(f"{system}, {name}" for system in systems for name in COLUMNS.values()), "relative"]
-    lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
-    for variant in variants:
-        relative = math.exp(mean(scores[variant])) if scores[variant] else math.nan
-        metrics[f"relative/{variant}"] = relative
-        lines.append("| " + " | ".join([variant, *cells[variant], f"{relative:.2f}"]) + " |")
-    return lines, metrics
+def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str], dict[str, float], dict]:
+    """Tables in Markdown, metrics, and mean and half-range of every bar by error, system and variant."""
+    variants = list(dict.fromkeys(training.variant for training in trainings))
+    lines, metrics, bars = [], {}, {}
+    for key, title in [*ERRORS.items(), ("steps", "updates")]:
+        rows, first = [], {}
+        for variant in variants:
+            cells, logs = [], []
+            for system in columns:
+                own = [t for t in trainings if t.variant == variant]
+                if key == "steps":
+                    found = [(t.run.metrics or {}).get(key) for t in own if system in t.systems]
+                else:
+                    found = [t.value(system, key) for t in own]
+                values = [float(value) for value in found if value is not None]
+                if not values:
+                    cells.append("-")
+                    continue
+                center, spread = mean(values), (max(values) - min(values)) / 2
+                metrics[f"{system}/{variant}/{key}"] = center
+                if key == "steps":
+                    cells.append(f"{center:,.0f}")
+                    continue
+                cells.append(f"{center:.1e}" + (f" ± {spread:.0e}" if len(values) > 1 else ""))
+                metrics[f"{system}/{variant}/{key}/half_range"] = spread
+                bars.setdefault(title, {}).setdefault(variant, {})[system] = (center, spread)
+                if first.setdefault(system, center) > 0:
+                    logs.append(math.log(center / first[system]) if math.isfinite(center) else math.inf)
+            if key != "steps":
+                relative = math.exp(mean(logs)) if logs and math.isfinite(mean(logs)) else math.nan
+                metrics[f"relative/{variant}/{key}"] = relative
+                cells.append(f"{relative:.2f}")
+            rows.append("| " + " | ".join([variant, *cells]) + " |")
+        header = [title, *columns, *(["relative"] if key != "steps" else [])]
+        lines += ["| " + " | ".join(header) + " |", "|---" * len(header) + "|", *rows, ""]
+    return lines[:-1], metrics, bars
 
 
 @hydra.main(config_path="config", config_name="compare", version_base="1.3")
@@ -174,18 +143,20 @@ def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "compare")
     if cfg.data_dir is None:
         cfg.data_dir = str(folder.data)
-    runs = all_runs(cfg, folder.path)
+    trainings = all_trainings(cfg, folder.path)
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    failed = train(runs, cfg.jobs)
-    lines, metrics = summarise(runs)
+    failed = run_all([training.run for training in trainings], cfg.jobs)
+    lines, metrics, bars = summarise(trainings, [*cfg.systems, *cfg.zero_shot])
     with atomic_path(folder.file("table.md")) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
+    if bars:
+        plot_bars(bars, folder.file("errors.png"))
     folder.write_metrics({**metrics, "failed": len(failed)}, seed=cfg.seeds[0])
     print("\n".join(lines))
     for path in folder.written:
         print(path)
     if failed:
-        raise ValueError(f"{len(failed)} of {len(runs)} runs failed; see their log.txt. Start again to go on.")
+        raise ValueError(f"{len(failed)} of {len(trainings)} runs failed; see their log.txt. Start again to go on.")
 
 
 if __name__ == "__main__":

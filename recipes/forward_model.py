@@ -1,32 +1,41 @@
-"""Train a graph-network forward model of one system and say how well it predicts.
+"""Train a graph-network forward model and say how well it predicts.
 
     python recipes/forward_model.py [system=swimmer6] [minutes=4] [key=value ...]
+    python recipes/forward_model.py system=[pendulum,cartpole,acrobot,swimmer6] zero_shot=[swimmer9]
 
 Collects random trajectories of the true physics, trains the forward model on them, and
 evaluates one-step and rollout errors on trajectories never trained on (paper: Figures
 "Evaluation rollout in a Swimmer6" and "One-step and 100-step rollout errors"). Leaves
 config.yaml, metrics.json, the checkpoint, a figure of predicted against true states and a
 video in its run folder, `run_dir=PATH`. Ctrl-C saves everything; the same `run_dir` goes on.
-`parametrized=true` trains on random variants of the system instead, each sequence of its own (paper: SM
-"Datasets"), and evaluates on variants never trained on and on the standard system.
+Of several systems, each has an equal share of every batch (paper: "Learning a forward model for multiple
+systems"); `zero_shot` systems are only evaluated (paper: Figure "Zero-shot dynamics prediction").
+`parametrized=true` trains on random variants of the systems instead, each sequence of its own (paper: SM
+"Datasets"), and evaluates on variants never trained on and on the standard systems; of several systems, those
+without variants stay as they are.
 All options with their defaults: recipes/config/forward_model.yaml. What came out, and how
 long it took: docs/results.md.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, cast
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
 from tqdm import tqdm
 
-from torchrl_gn.data import collect_trajectories, create_dataset, trajectory_buffer
-from torchrl_gn.evaluation import evaluate_errors, plot_training_curve, report
+from torchrl_gn.data import TrajectoryDataset, collect_trajectories, create_dataset, trajectory_buffer
+from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_training_curve, report, summary
 from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel
-from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
+from torchrl_gn.scenes import Scene, has_variants, load_scene
 from torchrl_gn.training import (
     Budget,
     RunFolder,
@@ -39,7 +48,41 @@ from torchrl_gn.training import (
 )
 
 # A run may go on with more time, another logger or other threads, and nothing else.
-MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds", "patience")
+MAY_CHANGE = (
+    "minutes",
+    "steps",
+    "clock",
+    "threads",
+    "logger",
+    "run_dir",
+    "checkpoint_seconds",
+    "patience",
+    "zero_shot",
+)
+
+
+@dataclass
+class Task:
+    """A system to train on.
+
+    Attributes:
+        scene: the system.
+        dataset: its random trajectories.
+        train: trajectories to train on, the data set's or a mixture with others.
+    """
+
+    scene: Scene
+    dataset: TrajectoryDataset
+    train: TensorDictBase
+
+    @property
+    def parametrized(self) -> bool:
+        """Whether its sequences are of variants."""
+        return "static" in self.train.keys()
+
+    def bind(self, model: ForwardModel) -> BoundForwardModel:
+        """Join the weights to the scene, or to its variants, whose numbers come with the samples."""
+        return model.bind(self.scene, static_key="static" if self.parametrized else None)
 
 
 def options(cfg: DictConfig) -> dict[str, Any]:
@@ -47,35 +90,91 @@ def options(cfg: DictConfig) -> dict[str, Any]:
     return cast(dict[str, Any], OmegaConf.to_container(cfg))
 
 
-def make_model(cfg: DictConfig, scene: Scene) -> ForwardModel:
+def load_scenes(names: str | ListConfig, timestep: float | None) -> list[Scene]:
+    """Scenes of one name or several."""
+    names = ListConfig([names]) if isinstance(names, str) else names
+    return [load_scene(name, timestep=timestep) for name in names]
+
+
+def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]:
+    """Collect the data of every system, or find them there."""
+    if cfg.data.extra is not None and (len(scenes) > 1 or cfg.parametrized):
+        raise ValueError("data.extra holds trajectories of one system without variants; name that one.")
+    tasks = []
+    for scene in scenes:
+        parametrized = cfg.parametrized and (len(scenes) == 1 or has_variants(scene))
+        with tqdm(desc=f"collecting data of {scene.name}", unit=" trajectories", leave=False) as bar:
+
+            def show(done: int, total: int, bar=bar) -> None:
+                bar.total = total
+                bar.update(done - bar.n)
+
+            dataset = create_dataset(
+                folder / f"{scene.name}{'_variants' if parametrized else ''}",
+                scene,
+                train=cfg.data.train,
+                validation=cfg.data.validation,
+                test=cfg.data.test,
+                steps=cfg.data.length,
+                seed=cfg.data.seed,
+                variants=(cfg.data.variants or cfg.data.train) if parametrized else None,
+                progress=show,
+            )
+        tasks.append(Task(scene, dataset, mixture(cfg, dataset)))
+    return tasks
+
+
+def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
+    """Half of the training trajectories, and as many of `data.extra`."""
+    if cfg.data.extra is None:
+        return dataset.train
+    extra = TensorDict.load_memmap(cfg.data.extra)
+    count = min(len(extra), (len(dataset.train) + 1) // 2)
+    halves = [cast(TensorDict, data[:count]).select("state", "action") for data in (dataset.train, extra)]
+    return cast(TensorDictBase, torch.cat(cast(list, halves)))
+
+
+def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
     """A model with fresh weights."""
-    items = (scene.num_nodes, scene.num_edges) if cfg.model.core == "mlp" else None
-    return ForwardModel(FeatureSet.of(scene), items=items, **options(cfg.model))
+    if cfg.model.core == "mlp" and len(scenes) > 1:
+        raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
+    items = (scenes[0].num_nodes, scenes[0].num_edges) if cfg.model.core == "mlp" else None
+    return ForwardModel(FeatureSet.of(scenes[0]), items=items, **options(cfg.model))
 
 
-def bind(cfg: DictConfig, model: ForwardModel, scene: Scene) -> BoundForwardModel:
-    """Join the weights to the scene, or to its variants, whose numbers come with the samples."""
-    return model.bind(scene, static_key="static" if cfg.parametrized else None)
+def make_buffer(cfg: DictConfig, tasks: list[Task], batch_size: int, window: int, seed: int) -> ReplayBuffer:
+    """Transitions of one system, or equal shares of several."""
+    share = max(1, batch_size // len(tasks))
+    buffers = [
+        trajectory_buffer(task.train, batch_size=share, window=window, seed=seed + 1000 * index)
+        for index, task in enumerate(tasks)
+    ]
+    if len(buffers) == 1:
+        return buffers[0]
+    return ReplayBufferEnsemble(*buffers, batch_size=share * len(tasks), sample_from_all=True)
 
 
-def make_trainer(cfg: DictConfig, model: ForwardModel, scene, dataset) -> Trainer:
+def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task]) -> Trainer:
     """Wire data, loss and optimiser together."""
-    bound = bind(cfg, model, scene)
-    noise = torch.Generator().manual_seed(cfg.seed)
-    loss = ForwardModelLoss(bound, noise=cfg.noise, generator=noise)
-    train = dataset.train
-    buffer = trajectory_buffer(train, batch_size=cfg.batch_size, seed=cfg.seed)
+    losses = []
+    for index, task in enumerate(tasks):
+        noise = torch.Generator().manual_seed(cfg.seed + 1000 * index)
+        losses.append(ForwardModelLoss(task.bind(model), noise=cfg.noise, generator=noise))
     unroll = None
     if cfg.unroll_fraction > 0:
-        unroll = trajectory_buffer(train, batch_size=cfg.unroll_batch_size, window=cfg.unroll_steps, seed=cfg.seed + 1)
-    validation = dataset.validation
+        unroll = make_buffer(cfg, tasks, cfg.unroll_batch_size, cfg.unroll_steps, cfg.seed + 1)
 
     def validate() -> float:
-        return evaluate_errors(bound, validation, horizons=(20,), one_step=False)["rollout_error_20"].total
+        """Geometric mean over the systems, so that each counts by its own scale."""
+        errors = [
+            evaluate_errors(loss.model, task.dataset.validation, horizons=(20,), one_step=False)["rollout_error_20"]
+            for loss, task in zip(losses, tasks, strict=True)
+        ]
+        return math.exp(sum(math.log(max(error.total, 1e-300)) for error in errors) / len(errors))
 
     return Trainer(
-        loss,
-        buffer,
+        losses[0] if len(losses) == 1 else SeveralScenesLoss(losses),
+        make_buffer(cfg, tasks, cfg.batch_size, 1, cfg.seed),
         make_optimizer(model.core, cfg.optimizer, lr=cfg.lr),
         Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
@@ -85,13 +184,28 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, scene, dataset) -> Traine
     )
 
 
-def train(trainer: Trainer, curves: dict[str, list], run: RunFolder, tracker: Tracker, cfg: DictConfig) -> None:
+def fit_normalizers(cfg: DictConfig, trainer: Trainer, tasks: list[Task]) -> None:
+    """Take samples of every system into the statistics."""
+    samples = [trajectory_buffer(task.train, batch_size=20_000, seed=cfg.seed).sample() for task in tasks]
+    if isinstance(trainer.loss, SeveralScenesLoss):
+        trainer.loss.fit_normalizers(samples)
+    else:
+        trainer.loss.fit_normalizers(samples[0])
+
+
+def train(
+    trainer: Trainer,
+    curves: dict[str, list],
+    run: RunFolder,
+    tracker: Tracker,
+    cfg: DictConfig,
+    scenes: list[Scene],
+) -> None:
     """Train with a progress bar, saving now and then and on Ctrl-C; extends the curves."""
 
     def save() -> None:
         state = {**trainer.state_dict(), "curves": curves}
-        scene = trainer.loss.model.scene
-        save_checkpoint(run.checkpoint, trainer.model, scene=scene, config=options(cfg), training=state)
+        save_checkpoint(run.checkpoint, trainer.model, scene=scenes, config=options(cfg), training=state)
 
     saved, losses = trainer.seconds, []
     bar = tqdm(total=100, initial=int(100 * trainer.fraction), unit="%", desc="training", leave=False)
@@ -120,71 +234,73 @@ def train(trainer: Trainer, curves: dict[str, list], run: RunFolder, tracker: Tr
     save()
 
 
+def evaluate(
+    cfg: DictConfig, model: ForwardModel, tasks: list[Task], unseen: list[Scene], folder: Path
+) -> tuple[dict[str, ErrorTable], list[Path]]:
+    """Error tables of every system by name, and figures and videos of those trained on."""
+    tables, files = {}, []
+    for task in tasks:
+        name, test = task.scene.name, task.dataset.test
+        place = folder if len(tasks) == 1 else folder / name
+        scene = task.dataset.scene_of("test", 0)
+        tables[name], written = report(task.bind(model), test, place, scene=scene)
+        files += written
+    others = {f"standard {task.scene.name}": task.scene for task in tasks if task.parametrized}
+    others |= {f"{scene.name} (zero-shot)": scene for scene in unseen}
+    for name, scene in tqdm(others.items(), desc="evaluating", disable=not others, leave=False):
+        sequences = collect_trajectories(scene, cfg.data.test, cfg.data.length, cfg.data.seed, split=3)
+        tables[name] = evaluate_errors(model.bind(scene), sequences)
+    if len(tables) > 1:
+        files.append(plot_errors(tables, folder / "errors.png"))
+    return tables, list(dict.fromkeys(files))
+
+
 @hydra.main(version_base=None, config_path="config", config_name="forward_model")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
-    scene = load_scene(cfg.system, timestep=cfg.timestep)
+    scenes, unseen = load_scenes(cfg.system, cfg.timestep), load_scenes(cfg.zero_shot, cfg.timestep)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)  # refuse a bad budget before anything is written
     run = RunFolder(cfg.run_dir, "forward_model")
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
         run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
+    model = begun.model if begun else make_model(cfg, scenes)
     run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"forward_model-{scene.name}", config=options(cfg))
+    names = "-".join(scene.name for scene in scenes)
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"forward_model-{names}", config=options(cfg))
 
-    with tqdm(desc="collecting data", unit=" trajectories", leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        dataset = create_dataset(
-            cfg.data.folder or run.data,
-            scene,
-            train=cfg.data.train,
-            validation=cfg.data.validation,
-            test=cfg.data.test,
-            steps=cfg.data.length,
-            seed=cfg.data.seed,
-            variants=(cfg.data.variants or cfg.data.train) if cfg.parametrized else None,
-            progress=show,
-        )
-    model = begun.model if begun else make_model(cfg, scene)
-    trainer = make_trainer(cfg, model, scene, dataset)
+    tasks = make_tasks(cfg, scenes, Path(cfg.data.folder) if cfg.data.folder else run.data)
+    trainer = make_trainer(cfg, model, tasks)
     if begun:
         trainer.load_state_dict(begun.training)
     else:
-        sample = trajectory_buffer(dataset.train, batch_size=20_000, seed=cfg.seed).sample()
-        trainer.loss.fit_normalizers(sample)
+        fit_normalizers(cfg, trainer, tasks)
     curves = begun.training["curves"] if begun else {"seconds": [], "loss": []}
-    train(trainer, curves, run, tracker, cfg)
+    train(trainer, curves, run, tracker, cfg, scenes)
 
-    table, files = report(bind(cfg, model, scene), dataset.test, run.path, scene=dataset.scene_of("test", 0))
-    tables = {"": table}
-    if cfg.parametrized:
-        sequences = collect_trajectories(scene, cfg.data.test, cfg.data.length, cfg.data.seed, split=3)
-        tables["standard/"] = evaluate_errors(model.bind(scene), sequences)
+    tables, files = evaluate(cfg, model, tasks, unseen, run.path)
     if curves["seconds"]:
         curve = {"loss": (curves["seconds"], curves["loss"])}
         files.append(plot_training_curve(curve, run.path / "training.png", ylabel="loss"))
-    metrics = run.write_metrics(
-        {
-            **{f"{prefix}{name}": value for prefix, of in tables.items() for name, value in of.to_metrics().items()},
-            "steps": trainer.step,
-            "training_seconds": trainer.seconds,
-            "outside_model_share": trainer.outside_share(),
-        },
-        seed=cfg.seed,
-    )
+    # One system's errors have plain names, those of several begin with the system's.
+    metrics = tables[scenes[0].name].to_metrics() if len(scenes) == 1 else {}
+    if len(tables) > 1:
+        metrics |= {f"{name}/{key}": value for name, of in tables.items() for key, value in of.to_metrics().items()}
+    metrics |= {
+        "validation_error": trainer.best,
+        "steps": trainer.step,
+        "training_seconds": trainer.seconds,
+        "outside_model_share": trainer.outside_share(),
+    }
+    metrics = run.write_metrics(metrics, seed=cfg.seed)
     tracker.log(metrics, trainer.step)
-    tracker.log_table("errors", table.rows())
+    for name, table in tables.items():
+        tracker.log_table(f"errors of {name}", table.rows())
     tracker.log_files(files)
     tracker.close()
-    print(table)
-    if cfg.parametrized:
-        print(f"\nThe standard {scene.name}:\n{tables['standard/']}")
+    print(tables[scenes[0].name] if len(tables) == 1 else summary(tables))
     for path in [*files, run.path / "metrics.json", run.checkpoint]:
         print(path)
 

@@ -12,9 +12,11 @@ from torchrl_gn.atomic import atomic_path
 from torchrl_gn.evaluation import (
     ErrorTable,
     PredictionError,
+    plot_bars,
     plot_body_trajectory,
     plot_errors,
     plot_training_curve,
+    summary,
 )
 from torchrl_gn.evaluation.figures import _align_signs, _node_index
 
@@ -95,6 +97,22 @@ def test_training_curve_and_errors(tmp_path):
     tables = {"a": table(0.01, 0.2), "b": table(3.0, math.inf), "c": table(0.0, 1.0)}
     assert is_picture(plot_errors(tables, tmp_path / "errors.png"))
     assert is_picture(plot_errors(tables, tmp_path / "one.png", errors=["one_step_error"]))
+    rows = summary(tables).splitlines()
+    assert [row.split() for row in rows[2:]] == [
+        ["a", "1.00e-02", "0.200"],
+        ["b", "3.000", "inf"],
+        ["c", "0.000", "1.000"],
+        ["constant", "prediction", "1.000", "1.000"],
+        *([["b,", "rollout_error_100:", *row.split()[2:]] for row in rows[6:]]),
+    ]
+
+
+def test_bars(tmp_path):
+    bars = {"GN": {"a": (0.01, 0.001), "b": (math.inf, 0.0)}, "MLP": {"a": (0.5, 0.0)}}
+    assert is_picture(plot_bars({"one step": bars, "100 steps": bars}, tmp_path / "bars.png"))
+    with pytest.raises(ValueError, match="at least one bar"):
+        plot_bars({"one step": {"GN": {}}}, tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
 
 
 def test_bad_input_is_named(scenes, tmp_path):

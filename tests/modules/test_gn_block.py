@@ -22,7 +22,7 @@ def algorithm_1(block: GNBlock, graph: Graph) -> Graph:
         edges.append(block.edge_mlp(torch.cat((globals_, graph.nodes[sender], graph.nodes[receiver], edge))))
         received[receiver] = received[receiver] + edges[-1]
     nodes = [block.node_mlp(torch.cat((globals_, n, r))) for n, r in zip(graph.nodes, received, strict=True)]
-    out = globals_[:0]
+    out = globals_  # passes through where it is not updated
     if block.global_mlp is not None:
         out = block.global_mlp(torch.cat((globals_, sum(nodes), sum(received))))
     stacked = torch.stack(edges) if edges else torch.zeros(0, block.out_size.edges, dtype=globals_.dtype)

@@ -33,6 +33,7 @@ def unit_scale(loss: ForwardModelLoss) -> None:
     normalizer = loss.model.model.delta_normalizer
     one = torch.ones(12, dtype=torch.float64)
     normalizer.load_state_dict({"count": one, "mean": 0 * one, "m2": one})
+    loss.error_weight = None
 
 
 def by_hand(loss: ForwardModelLoss, delta: Tensor, target: Tensor) -> dict[str, Tensor]:

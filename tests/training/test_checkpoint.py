@@ -10,6 +10,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import checkpoint as module
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.checkpoint import CheckpointError, load_checkpoint, package_versions, save_checkpoint
@@ -164,12 +165,25 @@ def test_files_that_are_not_ours(tmp_path):
     refused(path, "damaged")
 
 
-def test_a_newer_format_asks_for_an_update(tmp_path, make_model, scene, monkeypatch):
+def test_a_newer_format_or_older_format_says_what_to_do(tmp_path, make_model, scene, monkeypatch):
     path = tmp_path / "new.safetensors"
     with monkeypatch.context() as patch:
         patch.setattr(module, "FORMAT", module.FORMAT + 1)
         save_checkpoint(path, make_model(), scene=scene)
-    refused(path, rf"has format {module.FORMAT + 1}, this version reads up to {module.FORMAT}; update torchrl_gn")
+    refused(path, rf"has format {module.FORMAT + 1}, this version reads format {module.FORMAT}; update torchrl_gn")
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "FORMAT", module.FORMAT - 1)
+        save_checkpoint(path, make_model(), scene=scene)
+    refused(path, rf"has format {module.FORMAT - 1}, .* train again")
+
+
+def test_a_model_of_several_scenes_names_them(tmp_path, make_model, scene):
+    path = tmp_path / "several.safetensors"
+    save_checkpoint(path, make_model(), scene=[scene, load_scene("swimmer3")])
+    loaded = load_checkpoint(path)
+    assert [each.name for each in loaded.scenes()] == [scene.name, "swimmer3"]
+    with pytest.raises(CheckpointError, match="several scenes, .*'swimmer3'.*; say which one"):
+        loaded.scene()
 
 
 def test_what_cannot_be_stored_is_named_and_leaves_the_old_file(saved, make_model, scene):

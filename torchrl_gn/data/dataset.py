@@ -83,7 +83,8 @@ def create_dataset(
 
     The default sizes are the paper's. Data depend on the scene, sizes, ``steps``, ``seed``, ``variants``
     and ``knot_interval`` alone. They are written in chunks; after an interruption the same call goes on
-    where it stopped and gives the same bits. Splits have independent seeds. Unstable simulations
+    where it stopped and gives the same bits. Of several processes that want one data set at a time the
+    first makes it and the others wait. Splits have independent seeds. Unstable simulations
     are drawn again and counted.
 
     Args:
@@ -131,27 +132,28 @@ def create_dataset(
         "variants": None if variants is None else index(variants),
         "parameters": ranges,
     }
-    if files.exists():
-        manifest = files.read()
-        _check_same(files, manifest, request)
-        files.verify(manifest)
-    else:
-        manifest = {
-            "format": FORMAT,
-            "request": request,
-            "description": _description(scene),
-            "entries": {
-                "state": [steps + 1, scene.num_nodes, 13],
-                "action": [steps, scene.num_actions],
-                "physics": [steps + 1, scene.physics_size],
-                **({} if ranges is None else _variant_entries(scene, len(ranges))),
-            },
-            "versions": package_versions(),
-            "chunks": {split: [] for split in SPLITS},
-        }
-        files.create(manifest)
-    if not files.is_complete(manifest):
-        _collect_missing(files, manifest, scene, num_threads, progress)
+    with files.lock():
+        if files.exists():
+            manifest = files.read()
+            _check_same(files, manifest, request)
+            files.verify(manifest)
+        else:
+            manifest = {
+                "format": FORMAT,
+                "request": request,
+                "description": _description(scene),
+                "entries": {
+                    "state": [steps + 1, scene.num_nodes, 13],
+                    "action": [steps, scene.num_actions],
+                    "physics": [steps + 1, scene.physics_size],
+                    **({} if ranges is None else _variant_entries(scene, len(ranges))),
+                },
+                "versions": package_versions(),
+                "chunks": {split: [] for split in SPLITS},
+            }
+            files.create(manifest)
+        if not files.is_complete(manifest):
+            _collect_missing(files, manifest, scene, num_threads, progress)
     return _open(files, manifest, scene)
 
 

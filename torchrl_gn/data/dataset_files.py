@@ -15,11 +15,14 @@ import math
 import os
 import sys
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import torch
+from filelock import FileLock
 from tensordict import TensorDict
 
 from torchrl_gn.data.errors import DatasetError
@@ -50,6 +53,17 @@ class DatasetFiles:
         self._temporary = root / "manifest.json.tmp"
         if sys.byteorder != "little":
             raise NotImplementedError("Data sets are little-endian.")
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other processes from making the same data set; they wait. Nobody does where nothing can be written."""
+        root = self.root.absolute()
+        root.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(root.parent, os.W_OK):
+            yield
+            return
+        with FileLock(root.with_name(f".{root.name}.lock")):
+            yield
 
     def exists(self) -> bool:
         """Whether a data set is there.

@@ -3,8 +3,10 @@
 from torchrl_gn.evaluation.energy import kinetic_energy as kinetic_energy
 from torchrl_gn.evaluation.error_table import ErrorTable as ErrorTable
 from torchrl_gn.evaluation.error_table import PredictionError as PredictionError
+from torchrl_gn.evaluation.error_table import summary as summary
 from torchrl_gn.evaluation.errors import evaluate_errors as evaluate_errors
 from torchrl_gn.evaluation.errors import squared_errors as squared_errors
+from torchrl_gn.evaluation.figures import plot_bars as plot_bars
 from torchrl_gn.evaluation.figures import plot_body_trajectory as plot_body_trajectory
 from torchrl_gn.evaluation.figures import plot_errors as plot_errors
 from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -87,25 +88,42 @@ class ErrorTable:
 
     def to_table(self) -> str:
         """Errors relative to the constant prediction as lines of text, one column an error."""
-        rows = self.rows()
-        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-        lines = [
-            "  ".join(
-                [
-                    row[0].ljust(widths[0]),
-                    *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
-                ]
-            )
-            for row in rows
+        return "\n".join([*_aligned(self.rows()), *self._divergences()])
+
+    def _divergences(self) -> list[str]:
+        return [
+            f"{error.name}: {error.diverged} of {error.sequences} sequences diverged"
+            for error in self.errors.values()
+            if error.diverged
         ]
-        lines.insert(1, "-" * len(lines[0]))
-        for error in self.errors.values():
-            if error.diverged:
-                lines.append(f"{error.name}: {error.diverged} of {error.sequences} sequences diverged")
-        return "\n".join(lines)
 
     def __str__(self) -> str:
         return self.to_table()
+
+
+def summary(tables: Mapping[str, ErrorTable]) -> str:
+    """Total errors of several tables as lines of text, one row a table.
+
+    Args:
+        tables: by label, with the same errors.
+    """
+    first = next(iter(tables.values()))
+    titles = (name.replace("_error", "").replace("_", " ") for name in first.errors)
+    rows = [("relative squared error", *titles)]
+    rows += [(label, *(_number(table[name].total) for name in first.errors)) for label, table in tables.items()]
+    rows.append(("constant prediction", *(_number(1.0) for _ in first.errors)))
+    notes = [f"{label}, {line}" for label, table in tables.items() for line in table._divergences()]
+    return "\n".join([*_aligned(rows), *notes])
+
+
+def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
+    """Rows of cells as lines, the first ruled off."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = [
+        "  ".join((row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))))
+        for row in rows
+    ]
+    return [lines[0], "-" * len(lines[0]), *lines[1:]]
 
 
 def _number(value: float) -> str:

@@ -246,6 +246,63 @@ def plot_errors(
     return _save(figure, path)
 
 
+def plot_bars(
+    panels: Mapping[str, Mapping[str, Mapping[str, tuple[float, float]]]],
+    path: str | os.PathLike,
+    *,
+    ylabel: str = "squared error / constant prediction's",
+) -> Path:
+    """Groups of bars on a logarithmic axis (paper, figure "One-step and rollout errors for different models").
+
+    One panel below the other, in each a group for every system, in each group a bar for every model, with a
+    dashed line at 1, the constant prediction. What is not finite reaches the top, hatched.
+
+    Args:
+        panels: ``(height, half-range)`` by system, by model, by the panel's title; a system that a model lacks
+            leaves a gap.
+        path: file to write; its suffix is the format.
+        ylabel: name of the vertical axis.
+
+    Returns:
+        The written path.
+
+    Raises:
+        ValueError: if there is nothing to draw.
+    """
+    models = list(dict.fromkeys(model for panel in panels.values() for model in panel))
+    groups = list(dict.fromkeys(group for panel in panels.values() for bars in panel.values() for group in bars))
+    heights = [height for panel in panels.values() for bars in panel.values() for height, _ in bars.values()]
+    if not heights:
+        raise ValueError("plot_bars needs at least one bar.")
+    finite = [height for height in heights if math.isfinite(height) and height > 0] + [1.0]
+    bottom, top = 10.0 ** math.floor(math.log10(0.8 * min(finite))), 3 * max(finite)
+    figure = _figure((max(6.0, 1.6 + 0.22 * len(groups) * (len(models) + 1)), 3.4 * len(panels) + 0.3 * len(models)))
+    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    width = 0.84 / len(models)
+    for axes, (title, panel) in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels.items(), strict=True):
+        for number, model in enumerate(models):
+            # Colours repeat after a while, then lighter.
+            look = {"color": colors[number % len(colors)], "alpha": 0.9 if number < len(colors) else 0.45}
+            axes.bar(0, 0, label=model, **look)
+            for group, (height, spread) in panel.get(model, {}).items():
+                place = groups.index(group) + (number - (len(models) - 1) / 2) * width
+                known = math.isfinite(height)
+                axes.bar(place, max(height, bottom) if known else top, width, hatch=None if known else "//", **look)
+                if known and spread > 0:
+                    axes.errorbar(place, height, min(spread, 0.999 * height), color=palette.INK, linewidth=1)
+        axes.axhline(1.0, color=palette.INK, linestyle="--", linewidth=1)
+        axes.set_xticks(range(len(groups)), groups, rotation=30 if len(groups) > 6 else 0, fontsize=9)
+        axes.set_xlim(-0.6, len(groups) - 0.4)
+        axes.set_yscale("log")
+        axes.set_ylim(bottom, top)
+        axes.set_ylabel(ylabel, fontsize=8)
+        axes.set_title(title, fontsize=10)
+        _clean(axes)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(models)), fontsize=8, frameon=False)
+    return _save(figure, path)
+
+
 def _node_index(scene: Scene, node: int | str | None) -> int:
     if node is None:
         moving = np.flatnonzero(scene.predicted)

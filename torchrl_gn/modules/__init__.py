@@ -1,5 +1,6 @@
 """Graph networks, state maths and forward models."""
 
+from torchrl_gn.modules.ablated_core import AblatedCore as AblatedCore
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel as BoundForwardModel
 from torchrl_gn.modules.bound_forward_model import UnseenFeatureWarning as UnseenFeatureWarning
 from torchrl_gn.modules.core import GNCore as GNCore

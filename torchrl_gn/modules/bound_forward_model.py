@@ -20,6 +20,7 @@ from torchrl_gn.modules.local_frame import LocalFrame
 from torchrl_gn.scenes.scene_values import SceneValues, topology
 
 if TYPE_CHECKING:
+    from torchrl_gn.modules.ablated_core import UnfoldedCore
     from torchrl_gn.modules.folded_core import FoldedCore
     from torchrl_gn.modules.forward_model import ForwardModel
     from torchrl_gn.modules.mlp_core import FoldedMLP
@@ -38,7 +39,7 @@ class Folded(NamedTuple):
         values: the numbers of the scene, or of every sample's.
     """
 
-    core: FoldedCore | FoldedMLP | None
+    core: FoldedCore | FoldedMLP | UnfoldedCore | None
     values: SceneValues
 
 

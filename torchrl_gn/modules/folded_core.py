@@ -216,7 +216,6 @@ def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -
     edge_index = static.edge_index
     sn, se, sg = static.nodes.shape[-1], static.edges.shape[-1], static.globals_.shape[-1]
     first, second = core.first, core.second
-    assert first.global_mlp is not None
     num_nodes, num_edges = static.nodes.shape[-2], edge_index.shape[1]
     dtype = _first_layer(first.edge_mlp)[0].dtype
 
@@ -290,7 +289,8 @@ def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -
     )
 
 
-def _factors(mlp: nn.Sequential, weights: tuple[Tensor, ...], table: Tensor) -> Factors:
+def _factors(mlp: nn.Sequential | None, weights: tuple[Tensor, ...], table: Tensor) -> Factors:
+    assert mlp is not None
     hidden = [layer for layer in list(mlp)[2:-1:2] if isinstance(layer, nn.Linear)]
     return Factors(weights, table, tuple((layer.weight, layer.bias) for layer in hidden))
 
@@ -359,13 +359,15 @@ def _broadcast(parts) -> list[Tensor]:
     return [part.expand(-1, batch, -1) for part in parts]
 
 
-def _first_layer(mlp: nn.Sequential) -> tuple[Tensor, Tensor]:
+def _first_layer(mlp: nn.Sequential | None) -> tuple[Tensor, Tensor]:
+    assert mlp is not None
     layer = mlp[0]
     assert isinstance(layer, nn.Linear)
     return layer.weight, layer.bias
 
 
-def _last_layer(mlp: nn.Sequential) -> tuple[Tensor, Tensor]:
+def _last_layer(mlp: nn.Sequential | None) -> tuple[Tensor, Tensor]:
+    assert mlp is not None
     layer = mlp[-1]
     assert isinstance(layer, nn.Linear)
     return layer.weight, layer.bias

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_gn.modules.ablated_core import AblatedCore, UnfoldedCore
 from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.folded_core import FoldedCore
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
 
 Static = Literal["none", "scene", "inferred"]
-CoreKind = Literal["gn", "mlp"]
+CoreKind = Literal["gn", "mlp", "interaction_network", "no_edge_update", "no_node_update", "no_global_update"]
 
 # Spreads below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 _DYNAMIC_FLOOR = 1e-9
@@ -96,8 +97,11 @@ class ForwardModel(nn.Module):
         link: keep bodies that joints pin together together: of the predicted positions and
             velocities only those of each linkage as a whole are used, the rest follows
             from the orientations and angular velocities. The paper lets bodies drift apart.
-        core: ``"gn"``, two graph networks, or their rival ``"mlp"``, one MLP over the flattened graph
-            (paper, SM "MLP baseline architectures").
+        core: ``"gn"``, two graph networks; their rival ``"mlp"``, one MLP over the flattened graph
+            (paper, SM "MLP baseline architectures"); or what they are without one of their parts
+            (:class:`~torchrl_gn.modules.AblatedCore`; paper, SM Figure "Ablation study of the architecture"):
+            ``"interaction_network"``, ``"no_edge_update"``, ``"no_node_update"`` or ``"no_global_update"``.
+        skip: whether the second graph network also reads what the first read.
         latent: features of the graph between the two GN blocks.
         edge_hidden: hidden sizes of the edge MLPs.
         node_hidden: hidden sizes of the node MLPs.
@@ -125,6 +129,7 @@ class ForwardModel(nn.Module):
         align: bool = True,
         link: bool = True,
         core: CoreKind = "gn",
+        skip: bool = True,
         latent: int = 128,
         edge_hidden: Sequence[int] = (128, 128),
         node_hidden: Sequence[int] = (128, 128),
@@ -158,6 +163,7 @@ class ForwardModel(nn.Module):
             "align": align,
             "link": link,
             "core": core,
+            "skip": skip,
             "latent": latent,
             "edge_hidden": list(edge_hidden),
             "node_hidden": list(node_hidden),
@@ -183,15 +189,20 @@ class ForwardModel(nn.Module):
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         in_size, out = self.dynamic_size + self.static_size, layout.delta_size
-        self.core: GNCore | MLPCore
-        if core == "gn":
-            hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
-            self.core = GNCore(in_size, out, latent=latent, activation=activation, **hidden)
-        elif items is None:
-            raise ValueError("core='mlp' needs items, the numbers of nodes and edges of its scene.")
-        else:
+        self.core: GNCore | MLPCore | AblatedCore
+        if core == "mlp":
+            if items is None:
+                raise ValueError("core='mlp' needs items, the numbers of nodes and edges of its scene.")
             nodes, edges = items
             self.core = MLPCore(in_size, out, items=(nodes, edges), hidden=mlp_hidden, activation=activation)
+            return
+        hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
+        if core == "gn" and skip:
+            self.core = GNCore(in_size, out, latent=latent, activation=activation, **hidden)
+        else:
+            ablation = "none" if core == "gn" else core
+            sizes = {"latent": latent, "activation": activation, **hidden}
+            self.core = AblatedCore(in_size, out, ablation=ablation, skip=skip, **sizes)
 
     def values_of(self, scene: Scene) -> SceneValues:
         """What the model reads of a scene; zeros where it reads an inferred graph.
@@ -228,7 +239,7 @@ class ForwardModel(nn.Module):
 
         return BoundForwardModel(self, scene, strict=strict, plain=plain, static_key=static_key)
 
-    def fold(self, static: Graph, predicted: Tensor) -> FoldedCore | FoldedMLP:
+    def fold(self, static: Graph, predicted: Tensor) -> FoldedCore | FoldedMLP | UnfoldedCore:
         """The core for one scene, differentiable in the weights.
 
         Args:
@@ -237,7 +248,7 @@ class ForwardModel(nn.Module):
         """
         return self.core.fold(self.dynamic_size, predicted, static)
 
-    def forward(self, dynamic: Graph, folded: FoldedCore | FoldedMLP) -> Tensor:
+    def forward(self, dynamic: Graph, folded: FoldedCore | FoldedMLP | UnfoldedCore) -> Tensor:
         """Predicted residual change, in SI units.
 
         Args:

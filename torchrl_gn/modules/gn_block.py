@@ -38,8 +38,8 @@ class GNBlock(MessagePassing):
 
     Args:
         in_size: features of the input graph.
-        out_size: features of the output graph; with ``globals_=0`` the global update is
-            neither built nor computed.
+        out_size: features of the output graph; where one is 0, that update is neither built nor
+            computed and the input's features pass through.
         edge_hidden: hidden sizes of the edge MLP.
         node_hidden: hidden sizes of the node MLP.
         global_hidden: hidden sizes of the global MLP.
@@ -59,36 +59,38 @@ class GNBlock(MessagePassing):
         super().__init__(aggr="sum", node_dim=-2)
         self.in_size, self.out_size = in_size, out_size
         g, n, e = in_size.globals_, in_size.nodes, in_size.edges
+        edges, nodes = out_size.edges or e, out_size.nodes or n
         self.edge_mlp = _mlp(g + 2 * n + e, edge_hidden, out_size.edges, activation)
-        self.node_mlp = _mlp(g + n + out_size.edges, node_hidden, out_size.nodes, activation)
-        self.global_mlp = None
-        if out_size.globals_:
-            self.global_mlp = _mlp(g + out_size.nodes + out_size.edges, global_hidden, out_size.globals_, activation)
+        self.node_mlp = _mlp(g + n + edges, node_hidden, out_size.nodes, activation)
+        self.global_mlp = _mlp(g + nodes + edges, global_hidden, out_size.globals_, activation)
 
     def forward(self, graph: Graph) -> Graph:
         """``[*B, N, F]``, ``[*B, E, F]``, ``[*B, F]`` features in, the same shapes out."""
-        # edge_updater_type: (nodes: Tensor, edges: Tensor, globals_: Tensor)
-        edges = self.edge_updater(graph.edge_index, nodes=graph.nodes, edges=graph.edges, globals_=graph.globals_)
-        num_nodes = graph.nodes.shape[-2]
-        # propagate_type: (edges: Tensor)
-        received = self.propagate(graph.edge_index, edges=edges, size=(num_nodes, num_nodes))
-        globals_ = graph.globals_
-        nodes = self.node_mlp(torch.cat((_per_item(globals_, num_nodes), graph.nodes, received), dim=-1))
-        if self.global_mlp is None:
-            globals_ = globals_[..., :0]
-        else:
+        nodes, edges, globals_, edge_index = graph.nodes, graph.edges, graph.globals_, graph.edge_index
+        num_nodes = nodes.shape[-2]
+        if self.edge_mlp is not None:
+            # edge_updater_type: (nodes: Tensor, edges: Tensor, globals_: Tensor)
+            edges = self.edge_updater(edge_index, nodes=nodes, edges=edges, globals_=globals_)
+        if self.node_mlp is not None:
+            # propagate_type: (edges: Tensor)
+            received = self.propagate(edge_index, edges=edges, size=(num_nodes, num_nodes))
+            nodes = self.node_mlp(torch.cat((_per_item(globals_, num_nodes), nodes, received), dim=-1))
+        if self.global_mlp is not None:
             globals_ = self.global_mlp(torch.cat((globals_, nodes.sum(-2), edges.sum(-2)), dim=-1))
-        return Graph(nodes, edges, globals_, graph.edge_index)
+        return Graph(nodes, edges, globals_, edge_index)
 
     def edge_update(self, nodes_j: Tensor, nodes_i: Tensor, edges: Tensor, globals_: Tensor) -> Tensor:
         globals_ = _per_item(globals_, edges.shape[-2])
+        assert self.edge_mlp is not None
         return self.edge_mlp(torch.cat((globals_, nodes_j, nodes_i, edges), dim=-1))
 
     def message(self, edges: Tensor) -> Tensor:
         return edges
 
 
-def _mlp(in_features: int, hidden: Sequence[int], out_features: int, activation: str) -> MLP:
+def _mlp(in_features: int, hidden: Sequence[int], out_features: int, activation: str) -> MLP | None:
+    if not out_features:
+        return None
     return MLP(in_features, out_features, num_cells=list(hidden), activation_class=ACTIVATIONS[activation])
 
 

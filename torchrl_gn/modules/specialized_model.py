@@ -11,10 +11,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from torchrl_gn.modules.ablated_core import AblatedCore
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded, UnseenFeatureWarning
 from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
 from torchrl_gn.modules.folded_core import FoldedCore, copy_into, snapshot
 from torchrl_gn.modules.graph import Graph, graph_concat
+from torchrl_gn.modules.mlp_core import FoldedMLP
 from torchrl_gn.scenes.scene_values import SceneValues
 
 
@@ -125,6 +127,7 @@ class SpecializedForwardModel(BoundForwardModel):
         core = copy.deepcopy(model.core).double()
         static = self.static_graph(values, torch.float64)
         full = core.fold(model.dynamic_size, self.predicted_nodes, static)
+        assert isinstance(full, (FoldedCore, FoldedMLP))  # specialize() refuses others
         small = full.reduced(
             (self.node_columns, nodes.inverse_std[self.node_columns]),
             (self.edge_columns, edges.inverse_std[self.edge_columns]),
@@ -135,7 +138,7 @@ class SpecializedForwardModel(BoundForwardModel):
 
     def _residual(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         core = folded.core
-        assert core is not None
+        assert isinstance(core, (FoldedCore, FoldedMLP))
         encoded, controls = self.frame.features(state, action, folded.values)
         nodes = _centered(encoded, self.model.node_normalizer.mean, self.node_columns)
         edges = _centered(controls, self.model.edge_normalizer.mean, self.edge_columns)
@@ -208,7 +211,10 @@ def specialize(
 
     Raises:
         RuntimeError: to compile for a CPU without a C++ compiler.
+        TypeError: for a core of the ablation study, which cannot be folded.
     """
+    if isinstance(bound.model.core, AblatedCore):
+        raise TypeError("The cores of the ablation study cannot be specialised; use the bound model.")
     return SpecializedForwardModel(bound, dtype=dtype, compile=compile)
 
 

@@ -1,3 +1,4 @@
 """TorchRL loss modules."""
 
 from torchrl_gn.objectives.forward_model_loss import ForwardModelLoss as ForwardModelLoss
+from torchrl_gn.objectives.several_scenes_loss import SeveralScenesLoss as SeveralScenesLoss

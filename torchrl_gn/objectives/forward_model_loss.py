@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import BoundForwardModel, Normalizer, SpecializedForwardModel, quaternion
+from torchrl_gn.modules import BoundForwardModel, ForwardModel, Normalizer, SpecializedForwardModel, quaternion
 
 
 class ForwardModelLoss(LossModule):
@@ -25,7 +25,7 @@ class ForwardModelLoss(LossModule):
     fed its own predictions and each step's target is the change from what it was
     fed to the true next state; gradients flow through the whole window.
 
-    Each component's error is divided by the variance of its change and averaged over
+    Each component's error is divided by the variance of its change in this scene and averaged over
     live channels, nodes and samples; the loss is the mean of the components.
 
     Orientation: the paper prints :math:`1 - \cos^2(q_e \cdot q_p)`, which is not zero for
@@ -66,6 +66,7 @@ class ForwardModelLoss(LossModule):
 
     model: BoundForwardModel
     noise_scale: Tensor
+    error_weight: Tensor | None
 
     def __init__(
         self, model: BoundForwardModel, *, noise: float = 0.0, generator: torch.Generator | None = None
@@ -79,6 +80,12 @@ class ForwardModelLoss(LossModule):
         self.noise = noise
         self.generator = generator
         self.register_buffer("noise_scale", torch.zeros(model.layout.delta_size, dtype=torch.float64))
+        self.register_buffer("error_weight", None)
+
+    @property
+    def forward_model(self) -> ForwardModel:
+        """The weights that are trained."""
+        return self.model.model
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         pass
@@ -96,7 +103,7 @@ class ForwardModelLoss(LossModule):
 
     @torch.no_grad()
     def fit_normalizers(self, tensordict: TensorDictBase) -> None:
-        """Set the model's normalisers and the noise scale from transitions, once before training.
+        """Set this loss's scales from transitions, and take them into the model's statistics; once before training.
 
         Args:
             tensordict: ``[B]`` clean transitions, some thousands.
@@ -111,8 +118,25 @@ class ForwardModelLoss(LossModule):
             if component.kind == "add":
                 scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]].cpu()
         self.noise_scale.copy_(scale)
+        noisy = self._perturb(state)
         model.update_static_normalizers(static)
-        model.update_dynamic_normalizers(self._perturb(state), action, next_state, static)
+        model.update_dynamic_normalizers(noisy, action, next_state, static)
+        # The model's statistics are of all scenes that share it, and would make light of errors in slow ones.
+        change = Normalizer(layout.delta_size, floor=1e-9)
+        change.update(layout.delta(noisy, next_state).cpu(), model.live.cpu())
+        self.error_weight = change.inverse_std.to(self.noise_scale.device)
+
+    def training_state(self) -> dict:
+        """What a training that goes on later needs of this loss."""
+        generator = None if self.generator is None else self.generator.get_state()
+        return {"noise_scale": self.noise_scale, "error_weight": self.error_weight, "generator": generator}
+
+    def load_training_state(self, state: dict) -> None:
+        """Go on from what :meth:`training_state` gave."""
+        self.noise_scale.copy_(state["noise_scale"])
+        self.error_weight = state["error_weight"]
+        if self.generator is not None and state["generator"] is not None:
+            self.generator.set_state(state["generator"])
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -178,7 +202,8 @@ class ForwardModelLoss(LossModule):
 
     def _scale(self, like: Tensor) -> Tensor:
         """``[N, 12]`` weights: one over the spread of each live channel, 0 for dead ones."""
-        return (self.model.model.delta_normalizer.inverse_std * self.model.live).to(like.dtype)
+        weight = self.forward_model.delta_normalizer.inverse_std if self.error_weight is None else self.error_weight
+        return (weight * self.model.live).to(like.dtype)
 
     def _live_components(self) -> Tensor:
         layout = self.model.layout

@@ -12,7 +12,7 @@ from torchrl_gn.scenes.load import load_scene, scene_from_description
 from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
 from torchrl_gn.scenes.scene_values import SceneValues
 from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange
-from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters, sample_variants
+from torchrl_gn.scenes.variants import has_variants, make_variants, parameter_ranges, sample_parameters, sample_variants
 
 __all__ = [
     "SYSTEMS",
@@ -24,6 +24,7 @@ __all__ = [
     "SceneValues",
     "StaticGraph",
     "UnsupportedSceneError",
+    "has_variants",
     "load_scene",
     "make_variants",
     "parameter_ranges",

@@ -35,6 +35,12 @@ def parameter_ranges(system: str) -> dict[str, ParameterRange]:
     return dict(_varied(system).ranges)
 
 
+def has_variants(scene: Scene) -> bool:
+    """Whether a scene is a standard system of which random variants can be made."""
+    system = find_system(scene.origin.get("system", ""))
+    return system is not None and system.vary is not None and "parameters" not in scene.origin
+
+
 def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -> np.ndarray:
     """Draw parameters uniformly in their ranges, each on its own.
 

@@ -7,7 +7,7 @@ import importlib.metadata
 import json
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,8 @@ from torchrl_gn.scenes import Scene, scene_from_description
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
 """Where a run folder keeps its checkpoint."""
 
-FORMAT = 1
-"""Version of the checkpoint format that this package writes, and the newest it reads."""
+FORMAT = 2
+"""Version of the checkpoint format that this package writes and reads."""
 
 _PACKAGES = (
     "torchrl_gn",
@@ -49,21 +49,32 @@ class Checkpoint:
 
     Attributes:
         model: the forward model with its weights and normalisers.
-        scene_description: description of the scene it was trained on.
+        scene_descriptions: descriptions of the scenes it was trained on.
         config: configuration of the run that made it.
         versions: package versions of that run.
         training: nested state of the training, empty if only the model was saved.
     """
 
     model: ForwardModel
-    scene_description: dict
+    scene_descriptions: list[dict]
     config: dict
     versions: dict
     training: dict = field(default_factory=dict)
 
+    def scenes(self) -> list[Scene]:
+        """The scenes that the model was trained on, built again."""
+        return [scene_from_description(description) for description in self.scene_descriptions]
+
     def scene(self) -> Scene:
-        """The scene that the model was trained on, built again."""
-        return scene_from_description(self.scene_description)
+        """The one scene that the model was trained on, built again.
+
+        Raises:
+            CheckpointError: if it was trained on several.
+        """
+        if len(self.scene_descriptions) != 1:
+            names = [scene.name for scene in self.scenes()]
+            raise CheckpointError(f"The model was trained on several scenes, {names}; say which one to use.")
+        return scene_from_description(self.scene_descriptions[0])
 
 
 def package_versions() -> dict[str, str]:
@@ -81,7 +92,7 @@ def save_checkpoint(
     path: str | os.PathLike,
     model: ForwardModel,
     *,
-    scene: Scene,
+    scene: Scene | Sequence[Scene],
     config: Mapping[str, Any] | None = None,
     training: Mapping[str, Any] | None = None,
 ) -> None:
@@ -90,7 +101,7 @@ def save_checkpoint(
     Args:
         path: file to write, ``.safetensors``.
         model: the forward model.
-        scene: the scene it is trained on.
+        scene: the scene, or scenes, it is trained on.
         config: configuration of the run, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
     """
@@ -101,7 +112,7 @@ def save_checkpoint(
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     description = {
         "model": model.description(),
-        "scene": scene.description(),
+        "scenes": [each.description() for each in ([scene] if isinstance(scene, Scene) else scene)],
         "config": dict(config or {}),
         "versions": package_versions(),
         "training": plain,
@@ -134,9 +145,10 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
         raise CheckpointError(f"Checkpoint {path} is damaged ({error}); use another or train again.") from error
     if not {"format", "description", "sha256"} <= metadata.keys():
         raise CheckpointError(f"{path} is a safetensors file, but no checkpoint of torchrl_gn.")
-    if int(metadata["format"]) > FORMAT:
+    if int(metadata["format"]) != FORMAT:
+        what = "update torchrl_gn" if int(metadata["format"]) > FORMAT else "train again"
         raise CheckpointError(
-            f"Checkpoint {path} has format {metadata['format']}, this version reads up to {FORMAT}; update torchrl_gn."
+            f"Checkpoint {path} has format {metadata['format']}, this version reads format {FORMAT}; {what}."
         )
     text = metadata["description"]
     if _digest(tensors, text) != metadata["sha256"]:
@@ -151,7 +163,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     model.load_state_dict(weights)
     return Checkpoint(
         model=model,
-        scene_description=description["scene"],
+        scene_descriptions=description["scenes"],
         config=description["config"],
         versions=description["versions"],
         training=_unflatten(description["training"], tensors),

@@ -10,7 +10,7 @@ import torch
 from torchrl.data import ReplayBuffer
 
 from torchrl_gn.modules import fast_matmul
-from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 
@@ -41,7 +41,7 @@ class Trainer:
     progress, logs and saves checkpoints where it likes, and may stop at any step.
 
     Args:
-        loss: the loss; its model is what is trained.
+        loss: the loss, of one scene or several; its model is what is trained.
         buffer: replay buffer of transitions.
         optimizer: optimiser of the model's weights.
         budget: when to stop.
@@ -58,7 +58,7 @@ class Trainer:
 
     def __init__(
         self,
-        loss: ForwardModelLoss,
+        loss: ForwardModelLoss | SeveralScenesLoss,
         buffer: ReplayBuffer,
         optimizer: ScheduledOptimizer,
         budget: Budget,
@@ -74,7 +74,7 @@ class Trainer:
         self.loss, self.buffer, self.optimizer, self.budget = loss, buffer, optimizer, budget
         self.unroll, self.unroll_fraction = unroll, unroll_fraction
         self.validate, self.validations, self.patience = validate, validations, patience
-        self.model = loss.model.model
+        self.model = loss.forward_model
         self.step, self.seconds = 0, 0.0
         self.best, self.since_best, self.validated = math.inf, 0, 0
         self.best_weights: dict[str, torch.Tensor] = {}
@@ -166,9 +166,8 @@ class Trainer:
         buffers = {"main": self.buffer, "unroll": self.unroll}
         return {
             "optimizer": self.optimizer.state_dict(),
-            "noise_scale": self.loss.noise_scale,
+            "loss": self.loss.training_state(),
             "samplers": {name: buffer.sampler.state_dict() for name, buffer in buffers.items() if buffer is not None},
-            "noise_generator": None if self.loss.generator is None else self.loss.generator.get_state(),
             "best_weights": self.best_weights,
             "progress": {
                 "step": self.step,
@@ -183,12 +182,10 @@ class Trainer:
     def load_state_dict(self, state: dict) -> None:
         """Go on from what :meth:`state_dict` gave."""
         self.optimizer.load_state_dict(state["optimizer"])
-        self.loss.noise_scale.copy_(state["noise_scale"])
+        self.loss.load_training_state(state["loss"])
         self.buffer.sampler.load_state_dict(state["samplers"]["main"])
         if self.unroll is not None and "unroll" in state["samplers"]:
             self.unroll.sampler.load_state_dict(state["samplers"]["unroll"])
-        if self.loss.generator is not None and state["noise_generator"] is not None:
-            self.loss.generator.set_state(state["noise_generator"])
         self.best_weights = dict(state["best_weights"])
         progress = state["progress"]
         self.step, self.seconds, self.spent = progress["step"], progress["seconds"], dict(progress["spent"])

@@ -1,0 +1,180 @@
+"""How well models trained on random control predict a swimmer that swims on purpose.
+
+    python recipes/data_shift.py [system=swimmer6] [minutes=4] [seeds=[0]] [run_dir=PATH]
+
+Finds a gait, waves of control that travel along the body, that carries the true swimmer far (cross-entropy
+method), and lets it swim with variations of it. Graph networks and an MLP are then trained for equal time on random
+trajectories, and on a mixture with as many in which the swimmer swims, and compared on trajectories of their training,
+of random control never trained on, and of swimming (paper, Figure "Swimmer6 prediction errors ... for data in the
+training set, in the validation set, and data from DDPG agent trajectories"). Finished runs are kept; the same run_dir
+goes on. What came out: docs/results.md.
+
+Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, a video of the gait as
+gait.gif, and each run with its log to its run folder.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+from statistics import mean
+
+import hydra
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict, TensorDictBase
+from tqdm import tqdm
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.data import Simulator, create_dataset, sample_start_states
+from torchrl_gn.evaluation import evaluate_errors, plot_bars, rollout_video
+from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
+from torchrl_gn.training.sweep import Run, run_all
+
+RECIPE = Path(__file__).with_name("forward_model.py")
+ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
+LOW, HIGH = np.array([0.1, 0.2, -np.pi]), np.array([1.0, 2.0, np.pi])  # of a wave: height, Hz, lag from joint to joint
+
+
+def waves(scene: Scene, gaits: np.ndarray, steps: int, phase: np.ndarray) -> np.ndarray:
+    """Controls ``[n, T, A]`` of gaits ``[n, 3]`` (height as a share of the bounds, Hz, lag), from phases ``[n]``."""
+    time = np.arange(steps) * scene.timestep
+    height, frequency, lag = (column[:, None, None] for column in gaits.T)
+    angle = 2 * np.pi * frequency * time[None, :, None] - lag * np.arange(scene.num_actions) + phase[:, None, None]
+    middle, half = (scene.action_high + scene.action_low) / 2, (scene.action_high - scene.action_low) / 2
+    return middle + half * height * np.sin(angle)
+
+
+def distance(states: torch.Tensor) -> np.ndarray:
+    """How far the middle of the bodies gets ``[n]``, metres."""
+    middle = states[:, :, 1:, :3].mean(2)
+    return (middle[:, -1] - middle[:, 0]).norm(dim=-1).numpy()
+
+
+def find_gait(scene: Scene, cfg: DictConfig, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """The gait that carries the swimmer farthest, and how far."""
+    simulator, center, spread = Simulator(scene), (LOW + HIGH) / 2, (HIGH - LOW) / 2
+    for _ in tqdm(range(cfg.search.generations), desc="looking for a gait", leave=False):
+        gaits = np.clip(rng.normal(center, spread, (cfg.search.population, 3)), LOW, HIGH)
+        # Every gait from several starts, so that none is lucky.
+        every = np.repeat(gaits, cfg.search.starts, axis=0)
+        starts = np.tile(sample_start_states(scene, cfg.search.starts, rng), (len(gaits), 1))
+        actions = waves(scene, every, cfg.search.steps, np.zeros(len(every)))
+        far = distance(simulator.rollout(starts, actions)["state"]).reshape(len(gaits), -1).mean(1)
+        elite = gaits[np.argsort(-far)[: max(2, len(gaits) // 8)]]
+        center, spread = elite.mean(0), elite.std(0) + 1e-3
+    return center, float(np.sort(far)[::-1][: len(elite)].mean())
+
+
+def swim(scene: Scene, gait: np.ndarray, count: int, steps: int, rng: np.random.Generator) -> TensorDict:
+    """Trajectories ``[count]`` of variations of a gait, begun when the swimmer has got going."""
+    gaits = np.clip(gait * rng.uniform(0.8, 1.2, (count, 3)), LOW, HIGH)
+    gaits[:, 2] *= rng.choice([-1, 1], count)  # to either end
+    going = 100
+    actions = waves(scene, gaits, going + steps, rng.uniform(0, 2 * np.pi, count))
+    half = (scene.action_high - scene.action_low) / 2
+    actions = np.clip(actions + 0.1 * half * rng.normal(size=actions.shape), scene.action_low, scene.action_high)
+    found = Simulator(scene).rollout(sample_start_states(scene, count, rng), actions)
+    if not bool(found["stable"].all()):
+        raise ValueError(f"{int((~found['stable']).sum())} of {count} simulations of {scene.name!r} are unstable.")
+    action = torch.from_numpy(actions[:, going:])
+    return TensorDict({"state": found["state"][:, going:].clone(), "action": action}, [count])
+
+
+def make_runs(cfg: DictConfig, folder: Path, swimming: Path) -> dict[tuple[str, str], list[Run]]:
+    """Trainings of every network on either data, one for each seed."""
+    runs = {}
+    networks = {"GN": [], "MLP": ["model.core=mlp", *cfg.mlp]}
+    data = {"random": [], "mixture": [f"data.extra={swimming}"]}
+    for network, trained_on in itertools.product(networks, data):
+        place = folder / f"{network}_{trained_on}"
+        options = (f"system={cfg.system}", f"minutes={cfg.minutes}", f"clock={cfg.clock}", f"threads={cfg.threads}")
+        options += (*(f"data.{name}={size}" for name, size in cfg.random.items()), f"data.length={cfg.length}")
+        options += (f"data.folder={cfg.data_dir}", *cfg.overrides, *networks[network], *data[trained_on])
+        runs[network, trained_on] = [
+            Run(RECIPE, place / f"seed{seed}", (*options, f"seed={seed}"), f"{network} on {trained_on} data")
+            for seed in cfg.seeds
+        ]
+    return runs
+
+
+def table(results: dict[tuple[str, str], dict[str, dict[str, list[float]]]]) -> list[str]:
+    """Means by network and training, test data and error, with the ratio to the error on random training data."""
+    tests = list(next(iter(results.values())))
+    lines = []
+    for key, title in ERRORS.items():
+        lines += [f"| {title} | " + " | ".join(tests) + " |", "|---" * (len(tests) + 1) + "|"]
+        for (network, trained_on), of in results.items():
+            base = mean(of[tests[0]][key])
+            cells = [f"{mean(of[test][key]):.1e} ({mean(of[test][key]) / base:.2g})" for test in tests]
+            lines.append(f"| {network}, {trained_on} | " + " | ".join(cells) + " |")
+        lines.append("")
+    return lines[:-1]
+
+
+@hydra.main(config_path="config", config_name="data_shift", version_base="1.3")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    torch.set_num_threads(cfg.threads)
+    folder = RunFolder(cfg.run_dir, "data_shift")
+    if cfg.data_dir is None:
+        cfg.data_dir = str(folder.data)
+    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    scene, rng = load_scene(cfg.system), np.random.default_rng(cfg.seed)
+    gait, far = find_gait(scene, cfg, rng)
+    swimming = {name: swim(scene, gait, cfg.swimming[name], cfg.length, rng) for name in ("train", "test")}
+    place = folder.path / "swimming"
+    swimming["train"].memmap(place, copy_existing=True)
+    state = swimming["test"]["state"][0]
+    rollout_video(scene, state, state, folder.file("gait.gif"))
+
+    runs = make_runs(cfg, folder.path, place)
+    failed = run_all([run for of in runs.values() for run in of], cfg.jobs)
+    sizes = [int(cfg.random[name]) for name in ("train", "validation", "test")]
+    dataset = create_dataset(Path(cfg.data_dir) / scene.name, scene, *sizes, steps=cfg.length)
+    count = cfg.sequences
+    tests: dict[str, TensorDictBase] = {
+        "random, trained on": dataset.train[:count],
+        "random, new": dataset.test[:count],
+        "swimming, new": swimming["test"][:count],
+    }
+    results: dict[tuple[str, str], dict[str, dict[str, list[float]]]] = {}
+    done = [(key, run) for key, of in runs.items() for run in of if run.metrics is not None]
+    for key, run in tqdm(done, desc="evaluating", leave=False):
+        model = load_checkpoint(run.folder).model.bind(scene)
+        for test, trajectories in tests.items():
+            errors = evaluate_errors(model, trajectories)
+            for error in ERRORS:
+                found = results.setdefault(key, {}).setdefault(test, {}).setdefault(error, [])
+                found.append(errors[error].total)
+
+    metrics: dict[str, float | int] = {"failed": len(failed), "gait/distance": far}
+    metrics |= {f"gait/{name}": float(value) for name, value in zip(("height", "Hz", "lag"), gait, strict=True)}
+    bars: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
+    for (network, trained_on), of in results.items():
+        for test, error in itertools.product(tests, ERRORS):
+            found = of[test][error]
+            center, spread = mean(found), (max(found) - min(found)) / 2
+            metrics[f"{network}/{trained_on}/{test}/{error}"] = center
+            metrics[f"{network}/{trained_on}/{test}/{error}/half_range"] = spread
+            if math.isfinite(center):
+                bars.setdefault(ERRORS[error], {}).setdefault(f"{network}, {trained_on}", {})[test] = (center, spread)
+    lines = table(results) if results else []
+    with atomic_path(folder.file("table.md")) as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
+    if bars:
+        plot_bars(bars, folder.file("errors.png"))
+    folder.write_metrics(metrics, seed=cfg.seed)
+    print(f"The gait: {far:.2f} m in {cfg.search.steps * scene.timestep:g} s.")
+    print("\n".join(lines))
+    for path in folder.written:
+        print(path)
+    if failed:
+        raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
+
+
+if __name__ == "__main__":
+    main()

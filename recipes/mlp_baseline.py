@@ -1,0 +1,129 @@
+"""Graph networks against the best of many MLPs, system by system.
+
+    python recipes/mlp_baseline.py [systems=[pendulum,swimmer6]] [minutes=4] [seeds=[0]]
+
+For every system the MLPs of the paper's five sizes are trained with every optimiser and rate of the sweep for
+`screen_minutes` (paper, SM "MLP baseline architectures"); the `keep` best on validation rollouts are trained for
+`minutes`, and the best of these is the baseline. It and the graph network, with the same normalisers, features, state
+update, data and training time, are then compared over all seeds (paper, Figure "Prediction errors ... between the best
+MLP baseline and the best GN model"). Finished runs are kept; the same run_dir goes on. What came out: docs/results.md.
+
+Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, and each run with its log
+to its run folder.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+from statistics import mean
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.evaluation import plot_bars
+from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training.sweep import Run, best, folder_name, run_all
+
+RECIPE = Path(__file__).with_name("forward_model.py")
+ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
+
+
+def make_run(cfg: DictConfig, folder: Path, system: str, name: str, options: list[str], minutes: float, seed: int):
+    """A training of one network on one system."""
+    shared = [f"system={system}", f"minutes={minutes}", f"seed={seed}", f"clock={cfg.clock}", f"threads={cfg.threads}"]
+    place = folder / system / folder_name(name) / f"minutes{minutes}_seed{seed}"
+    overrides = (*shared, f"data.folder={cfg.data_dir}", *cfg.overrides, *options)
+    return Run(RECIPE, place, overrides, f"{system}, {name}, {minutes} minutes, seed {seed}")
+
+
+def candidates(cfg: DictConfig) -> dict[str, list[str]]:
+    """Options of every MLP of the sweep by its name."""
+    found = {}
+    for (layers, cells), optimizer in itertools.product(cfg.sizes, cfg.optimizers):
+        hidden = "[" + ",".join([str(cells)] * layers) + "]"
+        options = ["model.core=mlp", f"model.mlp_hidden={hidden}", *optimizer]
+        found[f"MLP {layers} x {cells}, {', '.join(optimizer)}"] = options
+    return found
+
+
+def values(runs: list[Run], key: str) -> list[float]:
+    """One number of every finished run; infinite where it diverged."""
+    done = [run.metrics for run in runs]
+    return [math.inf if metrics[key] is None else float(metrics[key]) for metrics in done if metrics is not None]
+
+
+@hydra.main(config_path="config", config_name="mlp_baseline", version_base="1.3")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    folder = RunFolder(cfg.run_dir, "mlp_baseline")
+    if cfg.data_dir is None:
+        cfg.data_dir = str(folder.data)
+    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    mlps, first = candidates(cfg), cfg.seeds[0]
+
+    def runs(system: str, names: list[str], minutes: float, seeds: list[int]) -> list[Run]:
+        known = {**mlps, "GN": []}
+        every = itertools.product(names, seeds)
+        return [make_run(cfg, folder.path, system, name, known[name], minutes, seed) for name, seed in every]
+
+    names = list(mlps)
+    screened = {system: runs(system, names, cfg.screen_minutes, [first]) for system in cfg.systems}
+    failed = run_all([run for of in screened.values() for run in of], cfg.jobs, desc="screening")
+    long = {}
+    for system, of in screened.items():
+        kept = [names[of.index(run)] for run in best(of, "validation_error", cfg.keep)]
+        long[system] = dict(zip(kept, runs(system, kept, cfg.minutes, [first]), strict=True))
+    failed += run_all([run for of in long.values() for run in of.values()], cfg.jobs, desc="training the best")
+    winners = {
+        system: next(name for name, run in of.items() if [run] == best(list(of.values()), "validation_error"))
+        for system, of in long.items()
+        if best(list(of.values()), "validation_error")
+    }
+    seeds = list(cfg.seeds)
+    final = {
+        (system, kind): runs(system, [name], cfg.minutes, seeds)
+        for system, winner in winners.items()
+        for kind, name in (("GN", "GN"), ("MLP", winner))
+    }
+    failed += run_all([run for of in final.values() for run in of], cfg.jobs, desc="training over seeds")
+
+    metrics: dict[str, float | int | str] = {"failed": len(failed)}
+    bars: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
+    header = ["system", *(f"{kind}, {title}" for title in ERRORS.values() for kind in ("GN", "MLP", "ratio"))]
+    lines = ["| " + " | ".join([*header, "best MLP", "updates"]) + " |", "|---" * (len(header) + 2) + "|"]
+    for system, winner in winners.items():
+        cells = []
+        for key, title in ERRORS.items():
+            centers = {}
+            for kind in ("GN", "MLP"):
+                found = values(final[system, kind], key)
+                if not found:
+                    cells.append("-")
+                    continue
+                centers[kind], spread = mean(found), (max(found) - min(found)) / 2
+                metrics[f"{system}/{kind}/{key}"], metrics[f"{system}/{kind}/{key}/half_range"] = centers[kind], spread
+                bars.setdefault(title, {}).setdefault(kind, {})[system] = (centers[kind], spread)
+                cells.append(f"{centers[kind]:.1e} ± {spread:.0e}")
+            ratio = centers["MLP"] / centers["GN"] if len(centers) == 2 else math.nan
+            metrics[f"{system}/ratio/{key}"] = ratio
+            cells.append(f"{ratio:.2g}")
+        steps = " / ".join(f"{mean(values(final[system, kind], 'steps') or [0]):,.0f}" for kind in ("GN", "MLP"))
+        metrics[f"{system}/best"] = winner
+        lines.append("| " + " | ".join([system, *cells, winner, steps]) + " |")
+    with atomic_path(folder.file("table.md")) as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
+    if bars:
+        plot_bars(bars, folder.file("errors.png"))
+    folder.write_metrics(metrics, seed=first)
+    print("\n".join(lines))
+    for path in folder.written:
+        print(path)
+    if failed:
+        raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
+
+
+if __name__ == "__main__":
+    main()

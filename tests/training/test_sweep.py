@@ -1,0 +1,47 @@
+"""Runs side by side: done ones are kept, failed ones told, the best found."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from torchrl_gn.training.sweep import Run, best, folder_name, run_all
+
+RECIPE = """
+import json, pathlib, sys
+options = dict(option.split("=", 1) for option in sys.argv[1:])
+print("value", options["value"])
+folder = pathlib.Path(options["run_dir"])
+(folder / "times").open("a").write("x")
+(folder / "metrics.json").write_text(json.dumps({"error": json.loads(options["value"])}))
+"""
+
+
+@pytest.fixture
+def make_run(tmp_path):
+    recipe = tmp_path / "recipe.py"
+    recipe.write_text(RECIPE)
+
+    def make(value: str) -> Run:
+        return Run(recipe, tmp_path / folder_name(f"value {value}"), (f"value={value}",), f"value {value}")
+
+    return make
+
+
+def test_each_runs_once_and_failures_do_not_stop_the_others(make_run, capsys):
+    runs = [make_run(value) for value in ("3", "oops", "1", "null", "2", "3")]
+    assert run_all(runs, jobs=2) == [runs[1]]
+    assert "failed: value oops; see" in capsys.readouterr().out
+    assert "JSONDecodeError" in (runs[1].folder / "log.txt").read_text()
+    assert runs[1].metrics is None and runs[2].metrics == {"error": 1}
+    run_all(runs, jobs=2)
+    assert (runs[0].folder / "times").read_text() == "x"
+    assert [run.name for run in best(runs, "error", 3)] == ["value 1", "value 2", "value 3"]
+    assert best(runs, "error", 9)[-1] == runs[3]  # without a number: it diverged
+
+
+def test_folder_names_are_safe():
+    assert folder_name("noise 0.3 %, [a,b]") == "noise_0.3_%_a_b"
+    assert json.dumps(folder_name("x")) and Path(folder_name("no skip")).name == "no_skip"

@@ -1,0 +1,116 @@
+"""Runs of a recipe side by side, each in a process of its own, kept when they are done."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a recipe.
+
+    Attributes:
+        recipe: the recipe's file.
+        folder: its run folder, and what tells it from other runs.
+        overrides: options of the recipe.
+        name: what a person is told that it is.
+    """
+
+    recipe: Path
+    folder: Path
+    overrides: tuple[str, ...]
+    name: str
+
+    @property
+    def metrics(self) -> dict[str, Any] | None:
+        """What it measured, if it is done."""
+        path = self.folder / "metrics.json"
+        return json.loads(path.read_text()) if path.exists() else None
+
+
+def folder_name(text: str) -> str:
+    """A text as a folder's name that Hydra does not misread (it takes a comma for a list)."""
+    return re.sub(r"[^\w.%-]+", "_", text).strip("_")
+
+
+def run_all(runs: Iterable[Run], jobs: int, *, desc: str = "training") -> list[Run]:
+    """Run those that are not done yet, ``jobs`` at a time, with a progress bar.
+
+    Runs that fail are told and the others go on; what they print is in ``log.txt`` of their
+    folder. Ctrl-C tells all of them to end, and they save what they have.
+
+    Args:
+        runs: the runs; equal ones run once.
+        jobs: how many at a time.
+        desc: what they do.
+
+    Returns:
+        Those that failed.
+    """
+    runs, processes, failed = list(dict.fromkeys(runs)), _Processes(), []
+    with tqdm(total=len(runs), desc=desc, unit="run", leave=False) as bar, ThreadPoolExecutor(jobs) as pool:
+        futures = {pool.submit(processes.run, run): run for run in runs}
+        try:
+            for future in as_completed(futures):
+                run = futures[future]
+                if future.result():
+                    failed.append(run)
+                    tqdm.write(f"failed: {run.name}; see {run.folder / 'log.txt'}")
+                bar.update()
+        except KeyboardInterrupt:
+            processes.stop()
+            raise
+    return failed
+
+
+class _Processes:
+    """Starts processes, and ends them with this one."""
+
+    def __init__(self) -> None:
+        self.running: set[subprocess.Popen] = set()
+        self.stopped = False
+
+    def run(self, run: Run) -> int:
+        if run.metrics is not None:
+            return 0
+        if self.stopped:
+            return 130
+        run.folder.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]
+        with (run.folder / "log.txt").open("a") as log:
+            log.write(f"$ {shlex.join(command)}\n")
+            log.flush()
+            # In a session of its own, so that Ctrl-C reaches it once, from here.
+            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            self.running.add(process)
+            try:
+                return process.wait()
+            finally:
+                self.running.discard(process)
+
+    def stop(self) -> None:
+        self.stopped = True
+        for process in list(self.running):
+            process.terminate()
+        while self.running:
+            time.sleep(0.1)
+
+
+def best(runs: Sequence[Run], metric: str, count: int = 1) -> list[Run]:
+    """The ``count`` finished runs with the smallest ``metric``, best first; those without a number come last."""
+    done = [(run, run.metrics) for run in runs]
+    values = [(run, metrics[metric]) for run, metrics in done if metrics is not None]
+    ranked = sorted(values, key=lambda entry: float("inf") if entry[1] is None else entry[1])
+    return [run for run, _ in ranked[:count]]
