@@ -26,10 +26,8 @@ from typing import Any, cast
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_gn.atomic import atomic_path
-from torchrl_gn.evaluation import plot_bars
 from torchrl_gn.training import RunFolder, clean_exit
-from torchrl_gn.training.sweep import Run, folder_name, run_all
+from torchrl_gn.training.sweep import Run, folder_name, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_100": "100 steps"}
@@ -147,16 +145,7 @@ def main(cfg: DictConfig) -> None:
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
     failed = run_all([training.run for training in trainings], cfg.jobs)
     lines, metrics, bars = summarise(trainings, [*cfg.systems, *cfg.zero_shot])
-    with atomic_path(folder.file("table.md")) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
-    if bars:
-        plot_bars(bars, folder.file("errors.png"))
-    folder.write_metrics({**metrics, "failed": len(failed)}, seed=cfg.seeds[0])
-    print("\n".join(lines))
-    for path in folder.written:
-        print(path)
-    if failed:
-        raise ValueError(f"{len(failed)} of {len(trainings)} runs failed; see their log.txt. Start again to go on.")
+    report_sweep(folder, lines, bars, metrics, failed, seed=cfg.seeds[0])
 
 
 if __name__ == "__main__":

@@ -27,12 +27,11 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
-from torchrl_gn.atomic import atomic_path
 from torchrl_gn.data import Simulator, create_dataset, sample_start_states
-from torchrl_gn.evaluation import evaluate_errors, plot_bars, rollout_video
+from torchrl_gn.evaluation import evaluate_errors, rollout_video
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
-from torchrl_gn.training.sweep import Run, run_all
+from torchrl_gn.training.sweep import Run, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
@@ -127,7 +126,7 @@ def main(cfg: DictConfig) -> None:
     gait, far = find_gait(scene, cfg, rng)
     swimming = {name: swim(scene, gait, cfg.swimming[name], cfg.length, rng) for name in ("train", "test")}
     place = folder.path / "swimming"
-    swimming["train"].memmap(place, copy_existing=True)
+    swimming["train"].memmap(str(place), copy_existing=True)
     state = swimming["test"]["state"][0]
     rollout_video(scene, state, state, folder.file("gait.gif"))
 
@@ -151,7 +150,7 @@ def main(cfg: DictConfig) -> None:
                 found = results.setdefault(key, {}).setdefault(test, {}).setdefault(error, [])
                 found.append(errors[error].total)
 
-    metrics: dict[str, float | int] = {"failed": len(failed), "gait/distance": far}
+    metrics: dict[str, float | int] = {"gait/distance": far}
     metrics |= {f"gait/{name}": float(value) for name, value in zip(("height", "Hz", "lag"), gait, strict=True)}
     bars: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
     for (network, trained_on), of in results.items():
@@ -163,17 +162,8 @@ def main(cfg: DictConfig) -> None:
             if math.isfinite(center):
                 bars.setdefault(ERRORS[error], {}).setdefault(f"{network}, {trained_on}", {})[test] = (center, spread)
     lines = table(results) if results else []
-    with atomic_path(folder.file("table.md")) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
-    if bars:
-        plot_bars(bars, folder.file("errors.png"))
-    folder.write_metrics(metrics, seed=cfg.seed)
     print(f"The gait: {far:.2f} m in {cfg.search.steps * scene.timestep:g} s.")
-    print("\n".join(lines))
-    for path in folder.written:
-        print(path)
-    if failed:
-        raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
+    report_sweep(folder, lines, bars, metrics, failed, seed=cfg.seed)
 
 
 if __name__ == "__main__":

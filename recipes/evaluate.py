@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.evaluation import report
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
+from torchrl_gn.training.progress import collecting
 
 
 @hydra.main(version_base=None, config_path="config", config_name="evaluate")
@@ -27,11 +27,7 @@ def main(cfg: DictConfig) -> None:
     model = checkpoint.model.bind(scene, strict=cfg.strict)
     run = RunFolder(cfg.run_dir, "evaluate")
     run.write_config(OmegaConf.to_yaml(cfg))
-    with tqdm(total=cfg.sequences, desc="collecting test data", leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.update(done - bar.n)
-
+    with collecting("test data") as show:
         test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, progress=show)
     table, files = report(model, test, run.path)
     run.write_metrics(table.to_metrics(), seed=cfg.seed)

@@ -46,6 +46,7 @@ from torchrl_gn.training import (
     make_optimizer,
     save_checkpoint,
 )
+from torchrl_gn.training.progress import collecting, train_with_progress
 
 # A run may go on with more time, another logger or other threads, and nothing else.
 MAY_CHANGE = (
@@ -103,12 +104,7 @@ def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]
     tasks = []
     for scene in scenes:
         parametrized = cfg.parametrized and (len(scenes) == 1 or has_variants(scene))
-        with tqdm(desc=f"collecting data of {scene.name}", unit=" trajectories", leave=False) as bar:
-
-            def show(done: int, total: int, bar=bar) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
+        with collecting(f"data of {scene.name}") as show:
             dataset = create_dataset(
                 folder / f"{scene.name}{'_variants' if parametrized else ''}",
                 scene,
@@ -193,47 +189,6 @@ def fit_normalizers(cfg: DictConfig, trainer: Trainer, tasks: list[Task]) -> Non
         trainer.loss.fit_normalizers(samples[0])
 
 
-def train(
-    trainer: Trainer,
-    curves: dict[str, list],
-    run: RunFolder,
-    tracker: Tracker,
-    cfg: DictConfig,
-    scenes: list[Scene],
-) -> None:
-    """Train with a progress bar, saving now and then and on Ctrl-C; extends the curves."""
-
-    def save() -> None:
-        state = {**trainer.state_dict(), "curves": curves}
-        save_checkpoint(run.checkpoint, trainer.model, scene=scenes, config=options(cfg), training=state)
-
-    saved, losses = trainer.seconds, []
-    bar = tqdm(total=100, initial=int(100 * trainer.fraction), unit="%", desc="training", leave=False)
-    try:
-        for progress in trainer.run():
-            losses.append(progress.loss)
-            if progress.step % 100 == 0:
-                mean = sum(losses) / len(losses)
-                losses.clear()
-                curves["seconds"].append(progress.seconds)
-                curves["loss"].append(mean)
-                tracker.log({"train/loss": mean, "train/seconds": progress.seconds}, progress.step)
-                bar.set_postfix(step=progress.step, loss=f"{mean:.2e}", best20=f"{trainer.best:.2e}")
-                bar.update(int(100 * progress.fraction) - bar.n)
-            if progress.validation is not None:
-                tracker.log({"validation/rollout_error_20": progress.validation}, progress.step)
-            if progress.seconds - saved > cfg.checkpoint_seconds:
-                save()
-                saved = progress.seconds
-    except KeyboardInterrupt:
-        save()
-        raise
-    finally:
-        bar.close()
-    trainer.restore_best()
-    save()
-
-
 def evaluate(
     cfg: DictConfig, model: ForwardModel, tasks: list[Task], unseen: list[Scene], folder: Path
 ) -> tuple[dict[str, ErrorTable], list[Path]]:
@@ -278,7 +233,12 @@ def main(cfg: DictConfig) -> None:
     else:
         fit_normalizers(cfg, trainer, tasks)
     curves = begun.training["curves"] if begun else {"seconds": [], "loss": []}
-    train(trainer, curves, run, tracker, cfg, scenes)
+
+    def save() -> None:
+        state = {**trainer.state_dict(), "curves": curves}
+        save_checkpoint(run.checkpoint, model, scene=scenes, config=options(cfg), training=state)
+
+    train_with_progress(trainer, curves, save, tracker, checkpoint_seconds=cfg.checkpoint_seconds)
 
     tables, files = evaluate(cfg, model, tasks, unseen, run.path)
     if curves["seconds"]:

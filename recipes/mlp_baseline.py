@@ -22,10 +22,8 @@ from statistics import mean
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_gn.atomic import atomic_path
-from torchrl_gn.evaluation import plot_bars
 from torchrl_gn.training import RunFolder, clean_exit
-from torchrl_gn.training.sweep import Run, best, folder_name, run_all
+from torchrl_gn.training.sweep import Run, best, folder_name, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
@@ -90,7 +88,7 @@ def main(cfg: DictConfig) -> None:
     }
     failed += run_all([run for of in final.values() for run in of], cfg.jobs, desc="training over seeds")
 
-    metrics: dict[str, float | int | str] = {"failed": len(failed)}
+    metrics: dict[str, float | int | str] = {}
     bars: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
     header = ["system", *(f"{kind}, {title}" for title in ERRORS.values() for kind in ("GN", "MLP", "ratio"))]
     lines = ["| " + " | ".join([*header, "best MLP", "updates"]) + " |", "|---" * (len(header) + 2) + "|"]
@@ -113,16 +111,7 @@ def main(cfg: DictConfig) -> None:
         steps = " / ".join(f"{mean(values(final[system, kind], 'steps') or [0]):,.0f}" for kind in ("GN", "MLP"))
         metrics[f"{system}/best"] = winner
         lines.append("| " + " | ".join([system, *cells, winner, steps]) + " |")
-    with atomic_path(folder.file("table.md")) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
-    if bars:
-        plot_bars(bars, folder.file("errors.png"))
-    folder.write_metrics(metrics, seed=first)
-    print("\n".join(lines))
-    for path in folder.written:
-        print(path)
-    if failed:
-        raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
+    report_sweep(folder, lines, bars, metrics, failed, seed=first)
 
 
 if __name__ == "__main__":

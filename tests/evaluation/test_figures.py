@@ -15,10 +15,11 @@ from torchrl_gn.evaluation import (
     plot_bars,
     plot_body_trajectory,
     plot_errors,
+    plot_motions,
     plot_training_curve,
     summary,
 )
-from torchrl_gn.evaluation.figures import _align_signs, _node_index
+from torchrl_gn.evaluation.motion_figures import _align_signs, _node_index, _turned
 
 from .conftest import moving_states
 
@@ -105,6 +106,16 @@ def test_training_curve_and_errors(tmp_path):
         ["constant", "prediction", "1.000", "1.000"],
         *([["b,", "rollout_error_100:", *row.split()[2:]] for row in rows[6:]]),
     ]
+
+
+def test_motions_count_whole_turns(scenes, tmp_path):
+    angle = torch.linspace(0, 9, 40, dtype=torch.float64)
+    turned = torch.stack((torch.cos(angle / 2), 0 * angle, torch.sin(angle / 2), 0 * angle), 1)
+    np.testing.assert_allclose(_turned(turned, turned[:1], 1), angle)
+    states = moving_states(scenes["swimmer6"], 40).expand(3, -1, -1, -1)
+    panels = {"with control": (states, states[:, 20:])}
+    path = plot_motions(panels, scenes["swimmer6"], tmp_path / "motions.png", labels=("a", "b", "c"))
+    assert is_picture(path)
 
 
 def test_bars(tmp_path):

@@ -17,6 +17,13 @@ STEPS = 60
 BAD_ACTIONS = {"not finite": 1e308, "out of range": 1e9}
 
 
+@pytest.fixture(autouse=True)
+def no_limits(swimmer, monkeypatch) -> None:
+    """Let actions through as they are, to make rollouts diverge when wanted."""
+    for name, value in (("action_low", -math.inf), ("action_high", math.inf)):
+        monkeypatch.setitem(swimmer.frame._buffers, name, torch.full_like(getattr(swimmer.frame, name), value))
+
+
 @pytest.fixture
 def sizes(swimmer, monkeypatch) -> list[int]:
     """Batch sizes and lengths of the rollouts that the model is asked for."""

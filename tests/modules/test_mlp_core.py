@@ -65,7 +65,7 @@ def test_bad_options_are_named(scenes):
     features = FeatureSet.of(scenes["pendulum"])
     with pytest.raises(ValueError, match="core='mlp' needs items"):
         ForwardModel(features, core="mlp")
-    with pytest.raises(ValueError, match=r"core='transformer' is not known; use one of \['gn', 'mlp', "):
+    with pytest.raises(ValueError, match=r"core='transformer' is not known; use one of \['gn', 'recurrent', 'mlp', "):
         ForwardModel(features, core="transformer")
     with pytest.raises(ValueError, match="activation='sigmoid' is not known"):
         ForwardModel(features, activation="sigmoid")

@@ -320,7 +320,7 @@ def test_batches_that_do_not_fit_are_named(make_loss, windows):
 
 
 @pytest.mark.parametrize(
-    ("name", "static"), [("cartpole", "scene"), ("swimmer3", "scene"), ("cheetah", "none"), ("jaco", "scene")]
+    ("name", "static"), [("cartpole", "scene"), ("swimmer3", "scene"), ("cheetah", "scene"), ("jaco", "scene")]
 )
 def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name, static):
     torch.manual_seed(0)

@@ -42,16 +42,16 @@ def test_it_is_the_mean_of_the_scenes_losses(losses, buffer):
     for name, each in zip(NAMES, alone, strict=True):
         assert torch.equal(out[f"scene_{name}"], each["loss_forward_model"])
     out["loss_forward_model"].backward()
-    assert all(weight.grad.abs().sum() > 0 for weight in loss.forward_model.core.parameters() if weight.ndim == 2)
+    assert all(weight.grad.abs().sum() > 0 for weight in loss.trained.core.parameters() if weight.ndim == 2)
 
 
 def test_every_scene_counts_by_its_own_scale(losses, buffer):
     """Errors are weighed as where a scene is trained on alone, while the network's output is scaled for all."""
     batch = buffer.sample()
     SeveralScenesLoss(losses).fit_normalizers(batch)
-    shared = losses[0].forward_model.delta_normalizer
+    shared = losses[0].trained.delta_normalizer
     for loss, part in zip(losses, batch.unbind(0), strict=True):
-        model = ForwardModel.from_description(loss.forward_model.description()).double()
+        model = ForwardModel.from_description(loss.trained.description()).double()
         alone = ForwardModelLoss(model.bind(loss.model.scene))
         alone.fit_normalizers(part)
         assert torch.equal(loss.error_weight, model.delta_normalizer.inverse_std)

@@ -50,3 +50,10 @@ def test_json_round_trips_and_refuses_what_json_cannot_hold(tmp_path):
         with pytest.raises(ValueError, match="metrics.json: .* finite numbers only"):
             write_json(path, {"loss": bad})
     assert json.loads(path.read_text()) == values
+
+
+def test_the_file_is_as_readable_as_any(tmp_path):
+    (tmp_path / "usual").write_text("text")
+    with atomic_path(tmp_path / "file") as temporary:
+        temporary.touch(mode=0o600)
+    assert (tmp_path / "file").stat().st_mode == (tmp_path / "usual").stat().st_mode

@@ -5,11 +5,15 @@ from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.dataset import TrajectoryDataset, create_dataset, load_dataset
 from torchrl_gn.data.errors import DatasetError, UnstableSimulationError
 from torchrl_gn.data.replay import TrajectoryStorage, WindowSampler, trajectory_buffer
+from torchrl_gn.data.robot_log import LogReport, RobotLog, load_robot_log, log_chain, log_trajectories
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.simulated_log import simulate_log
 from torchrl_gn.data.start_states import sample_start_states
 
 __all__ = [
     "DatasetError",
+    "LogReport",
+    "RobotLog",
     "Simulator",
     "TrajectoryDataset",
     "TrajectoryStorage",
@@ -18,7 +22,11 @@ __all__ = [
     "collect_trajectories",
     "create_dataset",
     "load_dataset",
+    "load_robot_log",
+    "log_chain",
+    "log_trajectories",
     "sample_start_states",
+    "simulate_log",
     "spline_controls",
     "trajectory_buffer",
 ]

@@ -22,6 +22,7 @@ def trajectory_buffer(
     window: int = 1,
     seed: int | None = None,
     capacity: int | None = None,
+    elsewhere: tuple[int, int] | None = None,
 ) -> TensorDictReplayBuffer:
     """Replay buffer that draws transitions, or windows of them, from trajectories.
 
@@ -45,6 +46,9 @@ def trajectory_buffer(
         seed: seed of the draws. Default: drawn from torch's global generator.
         capacity: number of trajectories to make room for in memory, to ``extend`` the buffer with
             more of equal shape, the oldest giving way. Default: the buffer is read-only.
+        elsewhere: ``(count, length)``: every draw also has so many windows of that length from other
+            times of its trajectory (paper, SM "End-to-end training algorithm for System ID"); they follow the
+            first along the second dimension, ``[batch_size, window + count * length]``.
 
     Raises:
         KeyError: ``state`` or ``action`` is missing.
@@ -61,7 +65,9 @@ def trajectory_buffer(
     """
     if batch_size < 1 or window < 1:
         raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
-    trajectories = _checked(trajectories, window)
+    if elsewhere is not None and min(elsewhere) < 1:
+        raise ValueError(f"elsewhere must be a count and a length of at least 1, got {elsewhere}")
+    trajectories = _checked(trajectories, max(window, elsewhere[1] if elsewhere else 1))
     count = len(trajectories)
     if capacity is None:
         storage, writer = TrajectoryStorage(trajectories), ImmutableDatasetWriter()
@@ -70,9 +76,8 @@ def trajectory_buffer(
     else:
         room = trajectories.apply(lambda x: x.new_zeros(capacity, *x.shape[1:]), batch_size=[capacity])
         storage, writer = TrajectoryStorage(room, writable=True), TensorDictRoundRobinWriter()
-    buffer = TensorDictReplayBuffer(
-        storage=storage, sampler=WindowSampler(window, seed), writer=writer, batch_size=batch_size
-    )
+    sampler = WindowSampler(window, seed, elsewhere=elsewhere)
+    buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, writer=writer, batch_size=batch_size)
     if capacity is not None:
         buffer.extend(trajectories.copy())
     return buffer
@@ -147,10 +152,11 @@ class WindowSampler(Sampler):
     Args:
         window: consecutive transitions in one draw.
         seed: seed of the draws. Default: drawn from torch's global generator.
+        elsewhere: number and length of further windows of the same trajectory in one draw.
     """
 
-    def __init__(self, window: int = 1, seed: int | None = None):
-        self.window = window
+    def __init__(self, window: int = 1, seed: int | None = None, *, elsewhere: tuple[int, int] | None = None):
+        self.window, self.elsewhere = window, elsewhere
         self._generator = torch.Generator()
         self._generator.manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
@@ -166,10 +172,21 @@ class WindowSampler(Sampler):
         drawn = torch.randint(len(storage) * starts, (batch_size,), generator=self._generator)
         trajectory = drawn.div(starts, rounding_mode="floor")
         time = drawn - trajectory * starts
-        if self.window > 1:
+        if self.window > 1 or self.elsewhere:
             time = time[:, None] + torch.arange(self.window)
+            if self.elsewhere:
+                time = torch.cat((time, self._others(time[:, 0], storage.steps)), dim=1)
             trajectory = trajectory[:, None].expand_as(time)
         return (trajectory, time), {}
+
+    def _others(self, start: Tensor, steps: int) -> Tensor:
+        """Times ``[B, count * length]`` of windows that start anywhere but where the first does."""
+        assert self.elsewhere is not None
+        count, length = self.elsewhere
+        starts = steps - length + 1
+        drawn = torch.randint(max(starts - 1, 1), (len(start), count), generator=self._generator)
+        drawn = drawn + (drawn >= start[:, None]) if starts > 1 else drawn
+        return (drawn[..., None] + torch.arange(length)).flatten(1)
 
     def _empty(self) -> None:
         """Nothing is remembered between draws."""

@@ -39,7 +39,9 @@ class ModelEnv(ModelBasedEnvBase):
 
     ``reset()`` draws true start states and observes them; ``reset(tensordict,
     set_state=True)`` starts from the TensorDict's ``state``. A model that reads static values of
-    every sample (``static_key``) gets those of the TensorDict, or else its scene's.
+    every sample (``static_key``) gets those of the TensorDict, or else its scene's (of an inferred
+    graph zeros: nothing is known). A recurrent model's ``memory`` is carried along, from the
+    TensorDict's or from nothing.
 
     Args:
         model: module with ``in_keys`` holding ``"state"`` and ``"action"``, ``out_keys`` holding
@@ -103,18 +105,25 @@ class ModelEnv(ModelBasedEnvBase):
         reset = TensorDict({"state": state}, batch_size=shape)
         key = getattr(self.world_model, "static_key", None)
         if key is not None:
-            own = cast(TensorDictBase, self.world_model.values.tensordict())
             static = tensordict.get(key, None)
-            if static is not None:
+            if static is None:
+                static = cast(TensorDictBase, self.world_model.own_static()).expand(shape)
+            else:
                 require_finite(static, f"{self}: {key!r}")
-            reset.set(key, own.expand(shape) if static is None else static)
+            reset.set(key, static)
+        if "memory" in self.world_model.in_keys:
+            memory = tensordict.get("memory", None)
+            if memory is None:
+                memory = cast(TensorDictBase, self.world_model.own_memory()).expand(shape).clone()
+            reset.set("memory", memory)
         return reset.to(self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state = read(tensordict, "state", (self.scene.num_nodes, 13), self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         # The model writes into its input: give it a shallow copy.
-        prediction = self.world_model(tensordict.select(*self.world_model.in_keys))["next", "state"]
+        predicted = self.world_model(tensordict.select(*self.world_model.in_keys))["next"]
+        prediction = predicted["state"]
         stable = prediction.isfinite().flatten(-2).all(-1, keepdim=True)
         next_state = torch.where(stable.unsqueeze(-1), prediction, state)
         reward = step_reward(self.reward, state, action, next_state, tensordict.get("task", None))
@@ -124,6 +133,8 @@ class ModelEnv(ModelBasedEnvBase):
             "done": ~stable,
             "terminated": ~stable,
         }
+        if "memory" in predicted.keys():
+            entries["memory"] = predicted["memory"]
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def any_done(self, tensordict: TensorDictBase) -> bool:

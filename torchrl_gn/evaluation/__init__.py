@@ -7,10 +7,14 @@ from torchrl_gn.evaluation.error_table import summary as summary
 from torchrl_gn.evaluation.errors import evaluate_errors as evaluate_errors
 from torchrl_gn.evaluation.errors import squared_errors as squared_errors
 from torchrl_gn.evaluation.figures import plot_bars as plot_bars
-from torchrl_gn.evaluation.figures import plot_body_trajectory as plot_body_trajectory
 from torchrl_gn.evaluation.figures import plot_errors as plot_errors
 from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve
+from torchrl_gn.evaluation.identification import identification_errors as identification_errors
+from torchrl_gn.evaluation.identification import linear_probe as linear_probe
+from torchrl_gn.evaluation.motion_figures import plot_body_trajectory as plot_body_trajectory
+from torchrl_gn.evaluation.motion_figures import plot_joints as plot_joints
+from torchrl_gn.evaluation.motion_figures import plot_motions as plot_motions
 from torchrl_gn.evaluation.report import report as report
 from torchrl_gn.evaluation.rollout import GuardedRollout as GuardedRollout
 from torchrl_gn.evaluation.rollout import guarded_rollout as guarded_rollout

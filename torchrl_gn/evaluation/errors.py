@@ -21,7 +21,7 @@ from torch import Tensor
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
 from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout, predict
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import BoundForwardModel, quaternion
+from torchrl_gn.modules import BoundForwardModel, BoundRecurrentModel, quaternion
 from torchrl_gn.modules.state_layout import BODY_STATE, StateLayout
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ def evaluate_errors(
     *,
     horizons: Sequence[int] = (20, 100),
     one_step: bool = True,
+    warm_up: int = 0,
     batch_size: int = 1000,
     keep: int = 0,
     scene: Scene | None = None,
@@ -90,6 +91,8 @@ def evaluate_errors(
             the model reads them, static values ``[M]`` at its ``static_key``; may lie on disk (memory-mapped).
         horizons: lengths of the rollouts to measure, at most ``T``.
         one_step: whether to measure the one-step error, which takes a prediction of every step.
+        warm_up: steps at the begin of every trajectory that are not predicted, but given to a recurrent model to
+            remember; all else starts behind them, for any model.
         batch_size: number of states that the model gets in one call.
         keep: number of predicted rollouts to return in the table.
         scene: which nodes count and which components are live; default ``model.scene``.
@@ -108,8 +111,12 @@ def evaluate_errors(
     layout: StateLayout = getattr(model, "layout", BODY_STATE)
     horizons = sorted({int(horizon) for horizon in horizons})
     states, actions = trajectories.get("state"), trajectories.get("action")
-    _check(states, actions, horizons, batch_size, scene, layout)
-    steps, horizon = actions.shape[1], max(horizons, default=0)
+    if horizons and horizons[0] < 1:
+        raise ValueError(f"Horizons must be at least 1 step, got {horizons[0]}.")
+    if warm_up < 0:
+        raise ValueError(f"warm_up={warm_up} must not be negative.")
+    _check(states, actions, [warm_up + horizon for horizon in horizons], batch_size, scene, layout)
+    steps, horizon = actions.shape[1] - warm_up, max(horizons, default=0)
     predicted = torch.as_tensor(scene.predicted, device=device or states.device)
     single = _Sums(1, layout, predicted)
     rollouts = _Sums(horizon, layout, predicted)
@@ -121,14 +128,16 @@ def evaluate_errors(
     with torch.no_grad(), _evaluation_mode(model):
         size = max(1, batch_size // steps)
         for state, action, own in _batches(states, actions, static, size, device, layout) if one_step else ():
-            flat = state[:, :-1].flatten(0, 1)
-            each = None if own is None else own.unsqueeze(1).expand(len(state), steps).reshape(-1)
-            prediction = predict(model, flat, action.flatten(0, 1), each)
-            valid = single.add(0, prediction, state[:, 1:].flatten(0, 1), flat)
+            prediction = _single_steps(model, state[:, :-1], action, own)[:, warm_up:].flatten(0, 1)
+            flat, truth = state[:, warm_up:-1].flatten(0, 1), state[:, warm_up + 1 :].flatten(0, 1)
+            valid = single.add(0, prediction, truth, flat)
             single.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
         for state, action, own in _batches(states, actions, static, batch_size, device, layout) if horizons else ():
-            wanted = max(0, min(keep - sum(map(len, kept)), len(state)))
-            guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own)
+            wanted, memory = max(0, min(keep - sum(map(len, kept)), len(state))), None
+            if warm_up and isinstance(model, BoundRecurrentModel):
+                _, memory = model.observe(state[:, :warm_up], action[:, :warm_up], own)
+            state, action = state[:, warm_up:], action[:, warm_up:]
+            guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own, memory=memory)
             kept.append(_add_rollouts(guarded, state, rollouts, wanted))
 
     dead = _dead_components(scene, layout)
@@ -139,6 +148,17 @@ def evaluate_errors(
         name = f"rollout_error_{length}"
         errors[name] = rollouts.error(name, length, len(states), length, dead)
     return ErrorTable(errors, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])))
+
+
+def _single_steps(
+    model: TensorDictModuleBase, states: Tensor, actions: Tensor, static: TensorDictBase | None
+) -> Tensor:
+    """Prediction from each of the states ``[B, T, N, 13]``; a recurrent model remembers those before it."""
+    if isinstance(model, BoundRecurrentModel):
+        return model.observe(states, actions, static)[0]
+    batch = actions.shape[:2]
+    each = None if static is None else static.unsqueeze(1).expand(batch).reshape(-1)
+    return predict(model, states.flatten(0, 1), actions.flatten(0, 1), each).unflatten(0, batch)
 
 
 class _Sums:
@@ -246,8 +266,6 @@ def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Sce
         raise ValueError(
             f"Actions must be {list(expected)} to go with states {list(states.shape)}, got {list(actions.shape)}."
         )
-    if horizons and horizons[0] < 1:
-        raise ValueError(f"Horizons must be at least 1 step, got {horizons[0]}.")
     if horizons and horizons[-1] > expected[1]:
         raise ValueError(
             f"A rollout of {horizons[-1]} steps needs trajectories of {horizons[-1] + 1} states, got {states.shape[1]}."

@@ -1,91 +1,18 @@
-"""Figures of predictions, training and errors, drawn without a display or global pyplot state."""
+"""Figures of numbers: errors, training, run time."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from torch import Tensor
 
-from torchrl_gn.atomic import atomic_path
 from torchrl_gn.evaluation import palette
+from torchrl_gn.evaluation.canvas import clean, new_figure, save
 from torchrl_gn.evaluation.error_table import ErrorTable
-from torchrl_gn.modules.state_layout import BODY_STATE
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from torchrl_gn.scenes import Scene
-
-_PANELS = (
-    ("position", "position [m]", "xyz"),
-    ("orientation", "orientation quaternion", "wxyz"),
-    ("linear_velocity", "linear velocity [m/s]", "xyz"),
-    ("angular_velocity", "angular velocity [rad/s]", "xyz"),
-)
-
-
-def plot_body_trajectory(
-    truth: Tensor,
-    prediction: Tensor,
-    scene: Scene,
-    path: str | os.PathLike,
-    *,
-    node: int | str | None = None,
-) -> Path:
-    """Predicted against true state of one body (paper, figure "Evaluation rollout in a Swimmer6").
-
-    Four panels: position, quaternion, linear and angular velocity. Quaternion signs
-    are chosen so that the true one runs without jumps and the predicted one follows it.
-
-    Args:
-        truth: ``[T + 1, N, 13]`` true states.
-        prediction: ``[T + 1, N, 13]`` predicted states; values that are not finite leave gaps.
-        scene: whose states they are.
-        path: file to write; its suffix (``.png``, ``.pdf``, ``.svg``) is the format.
-        node: index or name of the body; default the middle moving one (link 3 of Swimmer6, as in the paper).
-
-    Returns:
-        The written path.
-
-    Raises:
-        ValueError: if the shapes differ or do not fit the scene, or it has no such node.
-    """
-    expected = (scene.num_nodes, BODY_STATE.size)
-    if truth.ndim != 3 or truth.shape != prediction.shape or truth.shape[1:] != expected:
-        raise ValueError(
-            f"Truth and prediction of scene {scene.name!r} must both be [T + 1, {scene.num_nodes}, 13],"
-            f" got {list(truth.shape)} and {list(prediction.shape)}."
-        )
-    index = _node_index(scene, node)
-    true, predicted = (states[:, index].detach().double().cpu().numpy() for states in (truth, prediction))
-    where = BODY_STATE.slices["orientation"]
-    true, predicted = _align_signs(true.copy(), predicted.copy(), where)
-    time = np.arange(len(true)) * scene.timestep
-
-    figure = _figure((9.0, 5.6))
-    for axes, (name, label, channels) in zip(figure.subplots(2, 2, sharex=True).flat, _PANELS, strict=True):
-        values = BODY_STATE.slices[name]
-        for channel, letter in enumerate(channels):
-            # The scalar part takes the fourth colour, so that x, y and z keep theirs.
-            color = palette.AXES["xyzw".index(letter)]
-            axes.plot(time, true[:, values][:, channel], color=color, linewidth=3.2, alpha=0.35)
-            axes.plot(time, predicted[:, values][:, channel], color=color, linewidth=1.2, linestyle=(0, (4, 1.5)))
-            axes.plot([], [], color=color, label=letter)
-        _widen(axes, np.concatenate((true[:, values], predicted[:, values])))
-        axes.set_title(label, loc="left", fontsize=10, color=palette.INK)
-        axes.legend(ncols=len(channels), fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1.01, 0.98))
-        axes.margins(x=0.01)
-        _clean(axes)
-    for axes in figure.axes[2:]:
-        axes.set_xlabel("time [s]", fontsize=9)
-    figure.suptitle(f"{scene.name}, {scene.node_names[index]}: truth (wide, pale) and prediction (dashed)", fontsize=11)
-    return _save(figure, path)
 
 
 def plot_loglog(
@@ -104,7 +31,7 @@ def plot_loglog(
     Returns:
         The written path.
     """
-    figure = _figure((4.2 * len(panels) + 0.6, 3.8))
+    figure = new_figure((4.2 * len(panels) + 0.6, 3.8))
     colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
     for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for number, (label, (x, y)) in enumerate(lines.items()):
@@ -113,7 +40,7 @@ def plot_loglog(
         axes.set_ylabel(ylabel)
         axes.grid(alpha=0.25, which="both")
         axes.legend(frameon=False)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def plot_training_curve(
@@ -148,7 +75,7 @@ def plot_training_curve(
     longest = max(x.max() for x, _ in kept.values())
     unit, scale = ("h", 3600) if longest > 3 * 3600 else ("min", 60) if longest > 180 else ("s", 1)
 
-    figure = _figure((7.0, 4.2))
+    figure = new_figure((7.0, 4.2))
     axes = figure.subplots()
     colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
     for number, (label, (x, y)) in enumerate(kept.items()):
@@ -166,8 +93,8 @@ def plot_training_curve(
     axes.set_xlabel(f"training time [{unit}]")
     axes.set_ylabel(ylabel)
     axes.legend(frameon=False, fontsize=9)
-    _clean(axes)
-    return _save(figure, path)
+    clean(axes)
+    return save(figure, path)
 
 
 def plot_errors(
@@ -199,12 +126,13 @@ def plot_errors(
         missing = [name for name in names if name not in table.errors]
         if missing:
             raise ValueError(f"Table {label!r} lacks the errors {missing}; it has {list(table.errors)}.")
-    figure = _figure((max(6.0, 1.5 + len(names) * (1.2 + 0.75 * len(tables))), 4.2))
+    figure = new_figure((max(6.0, 1.5 + len(names) * (1.2 + 0.75 * len(tables))), 4.2))
     panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     shown = [t[name] for t in tables.values() for name in names]
     finite = [v for e in shown for v in (e.total, *e.components.values()) if math.isfinite(v) and v > 0] + [1.0]
     bottom, top = 10.0 ** math.floor(math.log10(0.8 * min(finite))), 3 * max(finite)
-    markers = dict(zip(BODY_STATE.names, "osD^", strict=True))
+    components = dict.fromkeys(component for error in shown for component in error.components)
+    markers = dict(zip(components, itertools.cycle("osD^v<>"), strict=False))
     for axes, name in zip(panels, names, strict=True):
         for place, table in enumerate(tables.values()):
             error = table[name]
@@ -223,15 +151,14 @@ def plot_errors(
                 )
             for component, value in error.components.items():
                 if bottom < value < top:
-                    marker = markers.get(component, ".")
-                    axes.plot(place, value, marker, color=palette.INK, markersize=4, markerfacecolor="w")
+                    axes.plot(place, value, markers[component], color=palette.INK, markersize=4, markerfacecolor="w")
         axes.axhline(1.0, color=palette.INK, linestyle="--", linewidth=1)
         axes.set_xticks(range(len(tables)), tables.keys(), rotation=30 if len(tables) > 3 else 0, fontsize=9)
         axes.set_xlim(-0.6, len(tables) - 0.4)
         axes.set_title(name.replace("_error", "").replace("_", " "), fontsize=10)
         axes.set_yscale("log")
         axes.set_ylim(bottom, top)
-        _clean(axes)
+        clean(axes)
     panels[0].set_ylabel("squared error / constant prediction's")
     for component, marker in markers.items():
         panels[-1].plot([], [], marker, color=palette.INK, markerfacecolor="w", label=component.replace("_", " "))
@@ -243,7 +170,7 @@ def plot_errors(
         fontsize=8,
         frameon=False,
     )
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def plot_bars(
@@ -276,7 +203,7 @@ def plot_bars(
         raise ValueError("plot_bars needs at least one bar.")
     finite = [height for height in heights if math.isfinite(height) and height > 0] + [1.0]
     bottom, top = 10.0 ** math.floor(math.log10(0.8 * min(finite))), 3 * max(finite)
-    figure = _figure((max(6.0, 1.6 + 0.22 * len(groups) * (len(models) + 1)), 3.4 * len(panels) + 0.3 * len(models)))
+    figure = new_figure((max(6.0, 1.6 + 0.22 * len(groups) * (len(models) + 1)), 3.4 * len(panels) + 0.3 * len(models)))
     colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
     width = 0.84 / len(models)
     for axes, (title, panel) in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels.items(), strict=True):
@@ -297,61 +224,7 @@ def plot_bars(
         axes.set_ylim(bottom, top)
         axes.set_ylabel(ylabel, fontsize=8)
         axes.set_title(title, fontsize=10)
-        _clean(axes)
+        clean(axes)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(models)), fontsize=8, frameon=False)
-    return _save(figure, path)
-
-
-def _node_index(scene: Scene, node: int | str | None) -> int:
-    if node is None:
-        moving = np.flatnonzero(scene.predicted)
-        if not len(moving):
-            raise ValueError(f"Nothing moves in scene {scene.name!r}.")
-        return int(moving[(len(moving) - 1) // 2])
-    if isinstance(node, str):
-        if node not in scene.node_names:
-            raise ValueError(f"Scene {scene.name!r} has no node {node!r}, only {list(scene.node_names)}.")
-        return scene.node_names.index(node)
-    if not 0 <= node < scene.num_nodes:
-        raise ValueError(f"Scene {scene.name!r} has nodes 0 to {scene.num_nodes - 1}, not {node}.")
-    return node
-
-
-def _align_signs(true: np.ndarray, predicted: np.ndarray, where: slice) -> tuple[np.ndarray, np.ndarray]:
-    q, p = true[:, where], predicted[:, where]
-    # The product of all sign changes so far undoes every jump between q and -q.
-    jumps = np.where((q[1:] * q[:-1]).sum(-1) < 0, -1.0, 1.0)
-    q[1:] *= np.cumprod(jumps)[:, None]
-    p *= np.where(np.nan_to_num(p * q).sum(-1) < 0, -1.0, 1.0)[:, None]
-    return true, predicted
-
-
-def _widen(axes: Axes, values: np.ndarray) -> None:
-    """Keep a panel in which nothing moves from zooming into rounding errors."""
-    finite = values[np.isfinite(values)]
-    if finite.size and np.ptp(finite) < 1e-6:
-        axes.set_ylim(finite.mean() - 0.1, finite.mean() + 0.1)
-
-
-def _figure(size: tuple[float, float]) -> Figure:
-    # Here, not at the top: training imports this package and need not load matplotlib.
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=size, layout="constrained", facecolor="white")
-
-
-def _clean(axes: Axes) -> None:
-    axes.grid(color=palette.GRID, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8, color=palette.MUTED)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(palette.MUTED)
-
-
-def _save(figure: Figure, path: str | os.PathLike) -> Path:
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
-    return Path(path)
+    return save(figure, path)

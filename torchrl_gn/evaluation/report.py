@@ -9,7 +9,8 @@ from tensordict import TensorDictBase
 
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import evaluate_errors
-from torchrl_gn.evaluation.figures import plot_body_trajectory, plot_errors
+from torchrl_gn.evaluation.figures import plot_errors
+from torchrl_gn.evaluation.motion_figures import plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
 from torchrl_gn.modules import BoundForwardModel
 from torchrl_gn.scenes import Scene

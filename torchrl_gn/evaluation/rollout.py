@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import BoundForwardModel
+from torchrl_gn.modules import BoundForwardModel, BoundRecurrentModel
 
 
 def predict(model: TensorDictModuleBase, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> Tensor:
@@ -94,6 +94,7 @@ def guarded_rollout(
     actions: Tensor,
     static: TensorDictBase | None = None,
     *,
+    memory: TensorDictBase | None = None,
     limit: float = 1000.0,
     every: int = 25,
 ) -> GuardedRollout:
@@ -113,6 +114,7 @@ def guarded_rollout(
         state: ``[*B, N, 13]`` start states; they themselves are not judged.
         actions: ``[*B, T, A]``.
         static: as for :func:`rollout`.
+        memory: ``[*B]``, what a :class:`~torchrl_gn.modules.BoundRecurrentModel` remembers of before the start.
         limit: how far out of the range of the training a state may be.
         every: steps between two looks (each waits for a GPU). The batch is then narrowed to what goes on; a
             compiled model keeps its batch, for which it was compiled, and stops when all have
@@ -135,13 +137,20 @@ def guarded_rollout(
     current, actions = state.reshape(size, *state.shape[-2:]), actions.reshape(size, *actions.shape[-2:])
     if static is not None and static.ndim:
         static = static.reshape(size)
+    if memory is not None:
+        memory = memory.reshape(size)
     ranges = _ranges(model, limit)
     rows = torch.arange(size, device=state.device)
     good = torch.full_like(rows, steps)
     states = current.new_empty(size, steps + 1, *current.shape[1:])
     states[:, 0] = current
     for first in range(0, steps, every):
-        predicted = _unchecked(model, current, actions[:, first : first + every], static)[:, 1:]
+        now = actions[:, first : first + every]
+        if isinstance(model, BoundRecurrentModel):
+            predicted, memory = model.rollout_and_memory(current, now, static, memory)
+        else:
+            predicted = _unchecked(model, current, now, static)
+        predicted = predicted[:, 1:]
         current, count = predicted[:, -1], predicted.shape[1]
         states[rows, first + 1 : first + 1 + count] = predicted
         fine = _good(model, predicted, ranges)
@@ -155,6 +164,7 @@ def guarded_rollout(
         if not getattr(model, "compile_steps", False):
             rows, current, actions = rows[going], current[going], actions[going]
             static = static[going] if static is not None and static.ndim else static
+            memory = None if memory is None else memory[going]
     if bool((good < steps).any()):
         time = torch.arange(steps + 1, device=state.device)
         states = states[torch.arange(size, device=state.device)[:, None], torch.minimum(time, good[:, None])]

@@ -7,8 +7,8 @@ from typing import Literal, get_args
 
 from torch import Tensor, nn
 
-from torchrl_gn.modules.gn_block import GNBlock, GraphSize
-from torchrl_gn.modules.graph import Graph, graph_concat
+from torchrl_gn.modules.gn_block import GNBlock
+from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
 from torchrl_gn.modules.linear import ACTIVATIONS
 
 Ablation = Literal["none", "interaction_network", "no_edge_update", "no_node_update", "no_global_update"]

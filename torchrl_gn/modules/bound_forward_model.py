@@ -55,7 +55,9 @@ class BoundForwardModel(TensorDictModuleBase):
     With a ``static_key`` every sample may be another variant of the scene (lengths, masses, ...):
     the module then also reads a TensorDict of the entries of
     :class:`~torchrl_gn.scenes.scene_values.SceneValues`, as :meth:`static_of` gives them or an
-    inference model writes them. Without one, samples that bring other values are refused.
+    inference model writes them. Without one, samples that bring other values are refused. A model with
+    ``static="none"`` or ``"inferred"`` never reads a sample's true values, nor does anything around
+    its network: bodies are then not linked, for their lengths are hidden.
 
     Args:
         model: the shared weights.
@@ -109,7 +111,9 @@ class BoundForwardModel(TensorDictModuleBase):
         self._register("predicted_nodes", torch.as_tensor(scene.predicted).nonzero().flatten())
         self.frame = LocalFrame(scene, model)
         pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
-        self.linking = make_linking(scene) if model.link and pinned else None
+        # Pins are where lengths say, which are hidden from a model of variants that does not read them.
+        hidden = static_key is not None and model.static != "scene"
+        self.linking = make_linking(scene) if model.link and pinned and not hidden else None
         for name, value in model.values_of(scene)._asdict().items():
             self._register(f"static_{name}", value)
         self._check_unseen(strict)
@@ -123,8 +127,25 @@ class BoundForwardModel(TensorDictModuleBase):
         return SceneValues(*(getattr(self, f"static_{name}") for name in SceneValues._fields))
 
     def _read(self, static: TensorDictBase | None) -> SceneValues:
-        """Numbers that samples bring, or the scene's own."""
-        return self.values if static is None else SceneValues.read(static, self.values)
+        """Numbers that samples bring, or the scene's own.
+
+        Raises:
+            ValueError: if the model infers its static graph and they are true parameters.
+        """
+        if static is None:
+            return self.values
+        given = set(map(str, static.keys()))
+        if self.model.static == "inferred" and not given <= {"nodes", "edges", "globals_"}:
+            raise ValueError(
+                f"The model reads an inferred static graph; {sorted(given - {'nodes', 'edges', 'globals_'})} are true"
+                " parameters, which it must not see. Give what an inference model wrote."
+            )
+        return SceneValues.read(static, self.values)
+
+    def own_static(self) -> TensorDict:
+        """What a sample of the scene itself has at the ``static_key``, without batch; zeros of an inferred graph."""
+        own = self.values.tensordict()
+        return own.select("nodes", "edges", "globals_") if self.model.static == "inferred" else own
 
     def static_of(self, scene: Scene) -> TensorDict:
         """Static values of a variant of this scene, to give samples at the ``static_key``.
@@ -201,19 +222,22 @@ class BoundForwardModel(TensorDictModuleBase):
     def static_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """The static values that samples bring; None where they are the scene's own.
 
+        Of a model that does not read the true static parameters nothing of the samples' own scenes gets here.
+
         Raises:
             KeyError: if the model reads them and they are missing.
             ValueError: if the model does not read them and they are not its scene's.
         """
         static = tensordict.get("static" if self.static_key is None else self.static_key, None)
         if self.static_key is not None:
+            if self.model.static == "none":
+                return None
             if static is None:
                 raise KeyError(
                     f"The model reads each sample's static values at {self.static_key!r}; give static_of(scene),"
                     " or bind without static_key."
                 )
-            # A model without static features still links bodies by their own lengths.
-            return static.exclude("nodes", "edges", "globals_") if self.model.static == "none" else static
+            return static
         if isinstance(static, TensorDictBase):
             self._refuse_others(static)
         return None
@@ -285,7 +309,11 @@ class BoundForwardModel(TensorDictModuleBase):
         return self._delta(state, action, folded or self.fold())
 
     def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
-        residual, values = self._residual(state, action, folded).to(state.dtype), folded.values
+        return self._settled(state, self._residual(state, action, folded), folded.values)
+
+    def _settled(self, state: Tensor, residual: Tensor, values: SceneValues) -> Tensor:
+        """Change of the state ``[*B, N, 12]`` from what the network predicts, in the world frame."""
+        residual = residual.to(state.dtype)
         turn = self.frame.heading_turn(state, values)
         if turn is not None:
             residual = self.layout.turn_delta(residual, turn)
@@ -376,13 +404,15 @@ class BoundForwardModel(TensorDictModuleBase):
         encoded, controls = self.frame.features(state, action, values)
         self.model.node_normalizer.update(encoded)
         self.model.edge_normalizer.update(controls)
+        self.model.delta_normalizer.update(self.layout.delta(state, next_state), self.live)
+        self.model.residual_normalizer.update(self.residual(state, next_state, values), self.live)
+
+    def residual(self, state: Tensor, next_state: Tensor, values: SceneValues | None = None) -> Tensor:
+        """What the network should have predicted of a transition ``[*B, N, 12]``, in the local frame, in SI units."""
         delta = self.layout.delta(state, next_state)
-        self.model.delta_normalizer.update(delta, self.live)
         residual = self.layout.residual(state, delta, self.timestep) if self.model.integrate else delta
-        turn = self.frame.heading_turn(state, values)
-        if turn is not None:
-            residual = self.layout.turn_delta(residual, quaternion.conjugate(turn))
-        self.model.residual_normalizer.update(residual, self.live)
+        turn = self.frame.heading_turn(state, values or self.values)
+        return residual if turn is None else self.layout.turn_delta(residual, quaternion.conjugate(turn))
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"

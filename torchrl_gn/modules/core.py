@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from torchrl_gn.modules.folded_core import FoldedCore, fold_core
-from torchrl_gn.modules.gn_block import GNBlock, GraphSize
-from torchrl_gn.modules.graph import Graph, graph_concat
+from torchrl_gn.modules.gn_block import GNBlock
+from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
 from torchrl_gn.modules.linear import ACTIVATIONS
 
 

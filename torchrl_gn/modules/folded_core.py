@@ -28,8 +28,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchrl_gn.modules.gn_block import GraphSize
-from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.graph import Graph, GraphSize
 from torchrl_gn.modules.linear import linear, product
 
 if TYPE_CHECKING:

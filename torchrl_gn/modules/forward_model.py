@@ -13,10 +13,10 @@ from torchrl_gn.modules.ablated_core import AblatedCore, UnfoldedCore
 from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.folded_core import FoldedCore
-from torchrl_gn.modules.gn_block import GraphSize
-from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.graph import Graph, GraphSize
 from torchrl_gn.modules.mlp_core import FoldedMLP, MLPCore
 from torchrl_gn.modules.normalizer import Normalizer
+from torchrl_gn.modules.recurrent_core import RecurrentCore
 from torchrl_gn.modules.state_layout import BODY_STATE, Component, Encoding, StateLayout
 from torchrl_gn.scenes.scene_values import SceneValues
 
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
 
 Static = Literal["none", "scene", "inferred"]
-CoreKind = Literal["gn", "mlp", "interaction_network", "no_edge_update", "no_node_update", "no_global_update"]
+CoreKind = Literal[
+    "gn", "recurrent", "mlp", "interaction_network", "no_edge_update", "no_node_update", "no_global_update"
+]
 
 # Spreads below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 _DYNAMIC_FLOOR = 1e-9
@@ -90,6 +92,7 @@ class ForwardModel(nn.Module):
             it, so that it need not learn to turn them; the paper shows the control alone.
         contacts: show the network how far each body's points are from the plane that they can touch, and
             how they move, so that it need not compute that; the paper shows it positions alone.
+        controls: how many controls act at a joint; several only without ``joint_axes``.
         recenter: make the prediction independent of where a translation-invariant scene
             is (paper: on for single systems, off when several train together).
         align: make the prediction independent of how a rotation-invariant scene is turned
@@ -97,11 +100,13 @@ class ForwardModel(nn.Module):
         link: keep bodies that joints pin together together: of the predicted positions and
             velocities only those of each linkage as a whole are used, the rest follows
             from the orientations and angular velocities. The paper lets bodies drift apart.
-        core: ``"gn"``, two graph networks; their rival ``"mlp"``, one MLP over the flattened graph
-            (paper, SM "MLP baseline architectures"); or what they are without one of their parts
+        core: ``"gn"``, two graph networks; ``"recurrent"``, these with a memory
+            (:class:`~torchrl_gn.modules.RecurrentCore`); their rival ``"mlp"``, one MLP over the flattened
+            graph (paper, SM "MLP baseline architectures"); or what they are without one of their parts
             (:class:`~torchrl_gn.modules.AblatedCore`; paper, SM Figure "Ablation study of the architecture"):
             ``"interaction_network"``, ``"no_edge_update"``, ``"no_node_update"`` or ``"no_global_update"``.
         skip: whether the second graph network also reads what the first read.
+        memory: numbers of node, edge and global features that a recurrent core remembers.
         latent: features of the graph between the two GN blocks.
         edge_hidden: hidden sizes of the edge MLPs.
         node_hidden: hidden sizes of the node MLPs.
@@ -125,11 +130,13 @@ class ForwardModel(nn.Module):
         integrate: bool = True,
         joint_axes: bool = True,
         contacts: bool = True,
+        controls: int = 1,
         recenter: bool = True,
         align: bool = True,
         link: bool = True,
         core: CoreKind = "gn",
         skip: bool = True,
+        memory: Sequence[int] = (20, 20, 20),
         latent: int = 128,
         edge_hidden: Sequence[int] = (128, 128),
         node_hidden: Sequence[int] = (128, 128),
@@ -159,11 +166,13 @@ class ForwardModel(nn.Module):
             "integrate": integrate,
             "joint_axes": joint_axes,
             "contacts": contacts,
+            "controls": controls,
             "recenter": recenter,
             "align": align,
             "link": link,
             "core": core,
             "skip": skip,
+            "memory": list(memory),
             "latent": latent,
             "edge_hidden": list(edge_hidden),
             "node_hidden": list(node_hidden),
@@ -180,7 +189,9 @@ class ForwardModel(nn.Module):
         else:
             self.static_size = GraphSize(len(names.nodes), len(names.edges), len(names.globals_))
         self.node_normalizer = Normalizer(encoded, floor=_DYNAMIC_FLOOR)
-        self.dynamic_size = GraphSize(encoded, 7 if joint_axes else 1, 0)
+        if joint_axes and controls != 1:
+            raise ValueError(f"joint_axes=True takes one control at each joint, not controls={controls}.")
+        self.dynamic_size = GraphSize(encoded, 7 if joint_axes else controls, 0)
         self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=_DYNAMIC_FLOOR)
         self.static_node_normalizer = Normalizer(self.static_size.nodes, limit=_STATIC_LIMIT)
         self.static_edge_normalizer = Normalizer(self.static_size.edges, limit=_STATIC_LIMIT)
@@ -189,7 +200,7 @@ class ForwardModel(nn.Module):
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         in_size, out = self.dynamic_size + self.static_size, layout.delta_size
-        self.core: GNCore | MLPCore | AblatedCore
+        self.core: GNCore | RecurrentCore | MLPCore | AblatedCore
         if core == "mlp":
             if items is None:
                 raise ValueError("core='mlp' needs items, the numbers of nodes and edges of its scene.")
@@ -197,7 +208,10 @@ class ForwardModel(nn.Module):
             self.core = MLPCore(in_size, out, items=(nodes, edges), hidden=mlp_hidden, activation=activation)
             return
         hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
-        if core == "gn" and skip:
+        if core == "recurrent":
+            sizes = {"latent": latent, "activation": activation, **hidden}
+            self.core = RecurrentCore(self.dynamic_size, self.static_size, out, memory=memory, **sizes)
+        elif core == "gn" and skip:
             self.core = GNCore(in_size, out, latent=latent, activation=activation, **hidden)
         else:
             ablation = "none" if core == "gn" else core
@@ -236,8 +250,10 @@ class ForwardModel(nn.Module):
             TensorDict module ``state, action -> ("next", "state")`` that shares these weights.
         """
         from torchrl_gn.modules.bound_forward_model import BoundForwardModel
+        from torchrl_gn.modules.bound_recurrent_model import BoundRecurrentModel
 
-        return BoundForwardModel(self, scene, strict=strict, plain=plain, static_key=static_key)
+        kind = BoundRecurrentModel if isinstance(self.core, RecurrentCore) else BoundForwardModel
+        return kind(self, scene, strict=strict, plain=plain, static_key=static_key)
 
     def fold(self, static: Graph, predicted: Tensor) -> FoldedCore | FoldedMLP | UnfoldedCore:
         """The core for one scene, differentiable in the weights.

@@ -3,27 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch_geometric.nn import MessagePassing
 from torchrl.modules import MLP
 
-from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.graph import Graph, GraphSize
 from torchrl_gn.modules.linear import ACTIVATIONS
-
-
-@dataclass(frozen=True)
-class GraphSize:
-    """Numbers of features of a graph's nodes, edges and globals."""
-
-    nodes: int
-    edges: int
-    globals_: int
-
-    def __add__(self, other: GraphSize) -> GraphSize:
-        return GraphSize(self.nodes + other.nodes, self.edges + other.edges, self.globals_ + other.globals_)
 
 
 class GNBlock(MessagePassing):

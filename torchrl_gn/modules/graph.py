@@ -10,6 +10,18 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
+class GraphSize:
+    """Numbers of features of a graph's nodes, edges and globals."""
+
+    nodes: int
+    edges: int
+    globals_: int
+
+    def __add__(self, other: GraphSize) -> GraphSize:
+        return GraphSize(self.nodes + other.nodes, self.edges + other.edges, self.globals_ + other.globals_)
+
+
+@dataclass(frozen=True)
 class Graph:
     """Graphs ``G = (g, {n_i}, {e_j, s_j, r_j})`` that share one topology (paper, "Model").
 
@@ -24,6 +36,15 @@ class Graph:
     edges: Tensor
     globals_: Tensor
     edge_index: Tensor
+
+    def zeros(self, size: GraphSize) -> Graph:
+        """Graph of the same topology and batch whose features are all 0."""
+        return Graph(
+            self.nodes.new_zeros(*self.nodes.shape[:-1], size.nodes),
+            self.edges.new_zeros(*self.edges.shape[:-1], size.edges),
+            self.globals_.new_zeros(*self.globals_.shape[:-1], size.globals_),
+            self.edge_index,
+        )
 
 
 def graph_concat(first: Graph, second: Graph) -> Graph:

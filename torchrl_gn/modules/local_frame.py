@@ -44,16 +44,18 @@ class LocalFrame(Float64Buffers):
         invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
         self.recenters = bool(model.recenter and invariant.any() and predicted.any())
         edge_action = torch.as_tensor(scene.edge_action).long()
+        edge_action = edge_action.unsqueeze(-1) if edge_action.ndim == 1 else edge_action  # [E, C]
         values = {
             "action_low": torch.as_tensor(scene.action_low),
             "action_high": torch.as_tensor(scene.action_high),
             # A column of zeros behind the actions stands for joints without motor.
             "edge_action": torch.where(edge_action < 0, scene.num_actions, edge_action),
-            "joint_node": torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2),
             "predicted": predicted,
             # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
             "shifted": predicted[:, None] * invariant,
         }
+        if self.joint_axes:
+            values["joint_node"] = torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2)
         self.constants(values)
 
     def recentered(self, state: Tensor) -> Tensor:
@@ -106,9 +108,10 @@ class LocalFrame(Float64Buffers):
         """
         state = self.local(state, values)
         # As motors do: what is beyond their limits has no effect, and the network never sees it.
-        action = action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype))
+        # (0 * action: an infinite action gives no number, as it should, and not the motor's limit.)
+        action = action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype)) + 0 * action
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
-        controls = padded[..., self.edge_action].unsqueeze(-1)  # [*B, E, 1]
+        controls = padded[..., self.edge_action]  # [*B, E, C]
         if self.joint_axes:
             axes = self._joint_axes(state, values)
             controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]

@@ -11,8 +11,7 @@ from torch.nn import functional as F
 from torchrl.modules import MLP
 
 from torchrl_gn.modules.folded_core import Columns
-from torchrl_gn.modules.gn_block import GraphSize
-from torchrl_gn.modules.graph import Graph
+from torchrl_gn.modules.graph import Graph, GraphSize
 from torchrl_gn.modules.linear import ACTIVATIONS
 
 

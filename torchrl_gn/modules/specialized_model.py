@@ -17,6 +17,7 @@ from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
 from torchrl_gn.modules.folded_core import FoldedCore, copy_into, snapshot
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.mlp_core import FoldedMLP
+from torchrl_gn.modules.recurrent_core import RecurrentCore
 from torchrl_gn.scenes.scene_values import SceneValues
 
 
@@ -211,10 +212,11 @@ def specialize(
 
     Raises:
         RuntimeError: to compile for a CPU without a C++ compiler.
-        TypeError: for a core of the ablation study, which cannot be folded.
+        TypeError: for a recurrent core, or one of the ablation study.
     """
-    if isinstance(bound.model.core, AblatedCore):
-        raise TypeError("The cores of the ablation study cannot be specialised; use the bound model.")
+    if isinstance(bound.model.core, (AblatedCore, RecurrentCore)):
+        kind = "the ablation study" if isinstance(bound.model.core, AblatedCore) else "recurrent models"
+        raise TypeError(f"The cores of {kind} cannot be specialised; use the bound model.")
     return SpecializedForwardModel(bound, dtype=dtype, compile=compile)
 
 

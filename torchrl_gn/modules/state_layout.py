@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -279,3 +280,16 @@ BODY_STATE = StateLayout(
     )
 )
 """State of a rigid body in the world frame: metres, unit quaternion, m/s, rad/s (13 channels)."""
+
+
+def joint_layout(extras: Sequence[str] = ()) -> StateLayout:
+    """State of a robot's body by its joint alone (paper, SM "Real JACO").
+
+    Args:
+        extras: names of further channels that were logged of every joint.
+
+    Returns:
+        Cosine and sine of the joint's angle, its velocity in rad/s, and the extras (``3 + extras`` channels).
+    """
+    angle, velocity = Component("angle", 2, "circle", rate="velocity"), Component("velocity", 1)
+    return StateLayout((angle, velocity, *(Component(name, 1) for name in extras)))

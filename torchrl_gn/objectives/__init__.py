@@ -1,4 +1,5 @@
 """TorchRL loss modules."""
 
 from torchrl_gn.objectives.forward_model_loss import ForwardModelLoss as ForwardModelLoss
+from torchrl_gn.objectives.identification_loss import IdentificationLoss as IdentificationLoss
 from torchrl_gn.objectives.several_scenes_loss import SeveralScenesLoss as SeveralScenesLoss

@@ -13,7 +13,14 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import BoundForwardModel, ForwardModel, Normalizer, SpecializedForwardModel, quaternion
+from torchrl_gn.modules import (
+    BoundForwardModel,
+    BoundRecurrentModel,
+    ForwardModel,
+    Normalizer,
+    SpecializedForwardModel,
+    quaternion,
+)
 
 
 class ForwardModelLoss(LossModule):
@@ -23,7 +30,9 @@ class ForwardModelLoss(LossModule):
     input to the clean next state, so the model also learns to put slightly
     dislocated bodies back together. With windows of several steps the model is
     fed its own predictions and each step's target is the change from what it was
-    fed to the true next state; gradients flow through the whole window.
+    fed to the true next state; gradients flow through the whole window. The first ``forced`` steps are fed
+    the true states instead ("teacher forcing"; paper, SM "Recurrent one-step predictions": all of them), which pays
+    for a recurrent model, whose memory is carried through the window.
 
     Each component's error is divided by the variance of its change in this scene and averaged over
     live channels, nodes and samples; the loss is the mean of the components.
@@ -41,6 +50,7 @@ class ForwardModelLoss(LossModule):
         noise: standard deviation of the input noise, in units of each state channel's own
             standard deviation (radians for orientations). None on dead channels.
         generator: source of the noise; the global one if None (a run then cannot resume bit for bit).
+        forced: steps of a window, at its begin, that are fed the true state, with noise.
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` steps in a row,
     ``action`` ``[B, (H,) A]``, ``("next", "state")`` like ``state``; with a model that reads them the
@@ -69,7 +79,12 @@ class ForwardModelLoss(LossModule):
     error_weight: Tensor | None
 
     def __init__(
-        self, model: BoundForwardModel, *, noise: float = 0.0, generator: torch.Generator | None = None
+        self,
+        model: BoundForwardModel,
+        *,
+        noise: float = 0.0,
+        generator: torch.Generator | None = None,
+        forced: int = 1,
     ) -> None:
         super().__init__()
         if not 0 <= noise < math.inf:
@@ -79,11 +94,14 @@ class ForwardModelLoss(LossModule):
         self.model = model
         self.noise = noise
         self.generator = generator
+        if forced < 1:
+            raise ValueError(f"forced={forced} must be at least 1: the first state is always a true one.")
+        self.forced = forced
         self.register_buffer("noise_scale", torch.zeros(model.layout.delta_size, dtype=torch.float64))
         self.register_buffer("error_weight", None)
 
     @property
-    def forward_model(self) -> ForwardModel:
+    def trained(self) -> ForwardModel:
         """The weights that are trained."""
         return self.model.model
 
@@ -110,7 +128,7 @@ class ForwardModelLoss(LossModule):
         """
         model, layout = self.model, self.model.layout
         state, action, next_state = self._read(tensordict)
-        static = self._read_static(tensordict)
+        static = self._read_static(tensordict) if model.model.static == "scene" else None
         clean = Normalizer(layout.size, floor=1e-9)
         clean.update(self.model.frame.recentered(state)[..., model.predicted_nodes, :])
         scale = torch.ones(layout.delta_size, dtype=torch.float64)
@@ -153,13 +171,18 @@ class ForwardModelLoss(LossModule):
         if state.ndim == 3:
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
         layout, steps = self.model.layout, state.shape[1]
-        current = self._perturb(state[:, 0])
+        current, memory = self._perturb(state[:, 0]), None
         errors, folded = state.new_zeros(len(layout.components)), self.model.fold(static)
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
-            delta = self.model.delta(current, action[:, step], folded)
+            if isinstance(self.model, BoundRecurrentModel):
+                delta, memory = self.model.delta_and_memory(current, action[:, step], folded, memory)
+            else:
+                delta = self.model.delta(current, action[:, step], folded)
             errors = errors + self._component_errors(delta, target)
-            if step + 1 < steps:
+            if step + 1 < self.forced:
+                current = self._perturb(state[:, min(step + 1, steps - 1)])
+            elif step + 1 < steps:
                 current = layout.apply(current, delta)
         errors = errors / steps
         live = self._live_components()
@@ -202,7 +225,7 @@ class ForwardModelLoss(LossModule):
 
     def _scale(self, like: Tensor) -> Tensor:
         """``[N, 12]`` weights: one over the spread of each live channel, 0 for dead ones."""
-        weight = self.forward_model.delta_normalizer.inverse_std if self.error_weight is None else self.error_weight
+        weight = self.trained.delta_normalizer.inverse_std if self.error_weight is None else self.error_weight
         return (weight * self.model.live).to(like.dtype)
 
     def _live_components(self) -> Tensor:

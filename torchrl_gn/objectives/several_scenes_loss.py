@@ -38,7 +38,7 @@ class SeveralScenesLoss(LossModule):
         super().__init__()
         if not losses:
             raise ValueError("SeveralScenesLoss needs at least one loss.")
-        if any(loss.forward_model is not losses[0].forward_model for loss in losses):
+        if any(loss.trained is not losses[0].trained for loss in losses):
             raise ValueError("The losses must be of one model, bound to several scenes.")
         self.names = [loss.model.scene.name for loss in losses]
         if len(set(self.names)) < len(losses):
@@ -54,9 +54,9 @@ class SeveralScenesLoss(LossModule):
         return cast("list[ForwardModelLoss]", list(self.losses))
 
     @property
-    def forward_model(self) -> ForwardModel:
+    def trained(self) -> ForwardModel:
         """The weights that are trained."""
-        return self.of_scenes[0].forward_model
+        return self.of_scenes[0].trained
 
     @property
     def in_keys(self) -> list:

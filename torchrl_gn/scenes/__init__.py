@@ -8,6 +8,7 @@ Example:
 """
 
 from torchrl_gn.scenes.errors import SceneChangedWarning, SceneError, UnsupportedSceneError
+from torchrl_gn.scenes.joint_chain import JointChain, chain_states
 from torchrl_gn.scenes.load import load_scene, scene_from_description
 from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
 from torchrl_gn.scenes.scene_values import SceneValues
@@ -17,6 +18,7 @@ from torchrl_gn.scenes.variants import has_variants, make_variants, parameter_ra
 __all__ = [
     "SYSTEMS",
     "Attachment",
+    "JointChain",
     "ParameterRange",
     "Scene",
     "SceneChangedWarning",
@@ -24,6 +26,7 @@ __all__ = [
     "SceneValues",
     "StaticGraph",
     "UnsupportedSceneError",
+    "chain_states",
     "has_variants",
     "load_scene",
     "make_variants",

@@ -7,12 +7,13 @@ import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 
 from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.errors import SceneChangedWarning
+from torchrl_gn.scenes.joint_chain import JointChain
 from torchrl_gn.scenes.mjcf_source import is_mjcf_text, read_mjcf, rebuild_mjcf
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
@@ -82,6 +83,9 @@ def scene_from_description(description: dict) -> Scene:
         SceneChangedWarning: if the rebuilt scene has other physics, as another version of
             MuJoCo or of the model files can give it.
     """
+    if "joint_chain" in description:
+        # It has all of a scene that models and errors read.
+        return cast(Scene, JointChain.from_description(description))
     system = find_system(description["system"]) if "system" in description else None
     if system is None and "system" in description:
         raise ValueError(_unknown(description["system"]))

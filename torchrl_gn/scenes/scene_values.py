@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from torch import Tensor
 from torchrl_gn.scenes.contact_points import contact_slots
 from torchrl_gn.scenes.joint_axes import joint_axes
 from torchrl_gn.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.joint_chain import JointChain
 
 
 class SceneValues(NamedTuple):
@@ -42,8 +45,10 @@ class SceneValues(NamedTuple):
     contact_radius: Tensor
 
     @classmethod
-    def of(cls, scene: Scene) -> SceneValues:
+    def of(cls, scene: Scene | JointChain) -> SceneValues:
         """All numbers of a scene."""
+        if not isinstance(scene, Scene):
+            return scene.values()
         heading, (offset, radius, _) = scene.heading, contact_slots(scene)
         values = {
             "nodes": scene.static.nodes,

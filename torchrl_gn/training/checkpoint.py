@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.modules import ForwardModel
+from torchrl_gn.modules import ForwardModel, IdentifyingModel
 from torchrl_gn.scenes import Scene, scene_from_description
 
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
@@ -39,6 +39,13 @@ _PACKAGES = (
 )
 
 
+KINDS: dict[str, type[ForwardModel] | type[IdentifyingModel]] = {
+    "forward_model": ForwardModel,
+    "identifying_model": IdentifyingModel,
+}
+"""What checkpoints hold, by the name that they call it."""
+
+
 class CheckpointError(ValueError):
     """A checkpoint that cannot be used: missing, damaged, of a newer format, or not ours."""
 
@@ -48,18 +55,31 @@ class Checkpoint:
     """What a checkpoint file holds.
 
     Attributes:
-        model: the forward model with its weights and normalisers.
+        trained: the model with its weights and normalisers.
         scene_descriptions: descriptions of the scenes it was trained on.
         config: configuration of the run that made it.
         versions: package versions of that run.
+        metrics: what was measured of the model.
         training: nested state of the training, empty if only the model was saved.
     """
 
-    model: ForwardModel
+    trained: ForwardModel | IdentifyingModel
     scene_descriptions: list[dict]
     config: dict
     versions: dict
+    metrics: dict = field(default_factory=dict)
     training: dict = field(default_factory=dict)
+
+    @property
+    def model(self) -> ForwardModel:
+        """The forward model.
+
+        Raises:
+            CheckpointError: if it is another kind of model.
+        """
+        if not isinstance(self.trained, ForwardModel):
+            raise CheckpointError(f"The checkpoint holds a {type(self.trained).__name__}, no ForwardModel.")
+        return self.trained
 
     def scenes(self) -> list[Scene]:
         """The scenes that the model was trained on, built again."""
@@ -90,19 +110,21 @@ def package_versions() -> dict[str, str]:
 
 def save_checkpoint(
     path: str | os.PathLike,
-    model: ForwardModel,
+    model: ForwardModel | IdentifyingModel,
     *,
     scene: Scene | Sequence[Scene],
     config: Mapping[str, Any] | None = None,
+    metrics: Mapping[str, Any] | None = None,
     training: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a checkpoint, atomically and without pickle.
 
     Args:
         path: file to write, ``.safetensors``.
-        model: the forward model.
+        model: the model.
         scene: the scene, or scenes, it is trained on.
         config: configuration of the run, plain JSON-able values.
+        metrics: what was measured of the model, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
     """
     tensors: dict[str, Tensor] = {}
@@ -111,10 +133,12 @@ def save_checkpoint(
         tensors[f"model.{name}"] = value
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     description = {
+        "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind)),
         "model": model.description(),
-        "scenes": [each.description() for each in ([scene] if isinstance(scene, Scene) else scene)],
+        "scenes": [each.description() for each in (scene if isinstance(scene, Sequence) else [scene])],
         "config": dict(config or {}),
         "versions": package_versions(),
+        "metrics": dict(metrics or {}),
         "training": plain,
     }
     text = json.dumps(description, sort_keys=True)
@@ -157,15 +181,16 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise CheckpointError(f"Checkpoint {path} has NaN or Inf in {name!r}; use another or train again.")
     description = json.loads(text)
-    model = ForwardModel.from_description(description["model"])
+    model = KINDS[description["kind"]].from_description(description["model"])
     weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
-    model.to(next(value.dtype for name, value in weights.items() if name.startswith("core.")))
+    model.to(next(value.dtype for name, value in weights.items() if "core." in name))
     model.load_state_dict(weights)
     return Checkpoint(
-        model=model,
+        trained=model,
         scene_descriptions=description["scenes"],
         config=description["config"],
         versions=description["versions"],
+        metrics=description["metrics"],
         training=_unflatten(description["training"], tensors),
     )
 

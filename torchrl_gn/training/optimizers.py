@@ -80,7 +80,7 @@ class ScheduledOptimizer:
 def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | None = None) -> ScheduledOptimizer:
     """Optimiser of a preset for a module's parameters.
 
-    - ``"muon"``: Muon on matrices (2e-2) and Adam on the rest (1e-3), cosine to 0.
+    - ``"muon"``: Muon on matrices (1e-2) and Adam on the rest (1e-3), cosine to 0.
     - ``"adam"``: Adam (1e-3), cosine to 0.
     - ``"paper"``: Adam at 1e-4, times 0.975 every 50,000 steps (SM "Training details", fast
       training; Paper: the rate is printed as ``1^{-4}``).
@@ -97,7 +97,7 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
         raise ValueError(f"Optimiser preset {preset!r} is not known; use one of {list(get_args(Preset))}.")
     if lr is not None and not 0 < lr < math.inf:
         raise ValueError(f"lr={lr} must be positive and finite.")
-    parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    parameters = [parameter for parameter in module.parameters() if parameter.requires_grad and parameter.numel()]
     if preset == "paper":
         return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-4)], _paper_decay)
     if preset == "adam":
@@ -106,7 +106,7 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
     rest = [parameter for parameter in parameters if parameter.ndim != 2]
     optimizers: list[torch.optim.Optimizer] = []
     if matrices:
-        optimizers.append(torch.optim.Muon(matrices, lr=lr or 2e-2, weight_decay=0.0))
+        optimizers.append(torch.optim.Muon(matrices, lr=lr or 1e-2, weight_decay=0.0))
     if rest:
         optimizers.append(torch.optim.Adam(rest, lr=1e-3))
     return ScheduledOptimizer(optimizers, _cosine)

@@ -8,13 +8,17 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.evaluation import plot_bars
+from torchrl_gn.training.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,40 @@ def run_all(runs: Iterable[Run], jobs: int, *, desc: str = "training") -> list[R
             processes.stop()
             raise
     return failed
+
+
+def report_sweep(
+    folder: RunFolder,
+    lines: Sequence[str],
+    bars: Mapping[str, Mapping[str, Mapping[str, tuple[float, float]]]],
+    metrics: Mapping[str, Any],
+    failed: Sequence[Run],
+    *,
+    seed: int,
+) -> None:
+    """Write what a sweep found, print it, and say what failed.
+
+    Args:
+        folder: where ``table.md``, ``errors.png`` and ``metrics.json`` go.
+        lines: the tables, in Markdown.
+        bars: as :func:`~torchrl_gn.evaluation.plot_bars` takes them; none are drawn if there are none.
+        metrics: flat names and plain numbers.
+        failed: runs that failed.
+        seed: the sweep's first seed.
+
+    Raises:
+        ValueError: after all else, if runs failed.
+    """
+    with atomic_path(folder.file("table.md")) as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
+    if bars:
+        plot_bars(bars, folder.file("errors.png"))
+    folder.write_metrics({**metrics, "failed": len(failed)}, seed=seed)
+    tqdm.write("\n".join(lines))
+    for path in folder.written:
+        tqdm.write(str(path))
+    if failed:
+        raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
 
 
 class _Processes:

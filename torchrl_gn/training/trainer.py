@@ -10,7 +10,7 @@ import torch
 from torchrl.data import ReplayBuffer
 
 from torchrl_gn.modules import fast_matmul
-from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
+from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss, SeveralScenesLoss
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 
@@ -58,7 +58,7 @@ class Trainer:
 
     def __init__(
         self,
-        loss: ForwardModelLoss | SeveralScenesLoss,
+        loss: ForwardModelLoss | SeveralScenesLoss | IdentificationLoss,
         buffer: ReplayBuffer,
         optimizer: ScheduledOptimizer,
         budget: Budget,
@@ -74,7 +74,7 @@ class Trainer:
         self.loss, self.buffer, self.optimizer, self.budget = loss, buffer, optimizer, budget
         self.unroll, self.unroll_fraction = unroll, unroll_fraction
         self.validate, self.validations, self.patience = validate, validations, patience
-        self.model = loss.forward_model
+        self.model = loss.trained
         self.step, self.seconds = 0, 0.0
         self.best, self.since_best, self.validated = math.inf, 0, 0
         self.best_weights: dict[str, torch.Tensor] = {}

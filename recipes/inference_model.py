@@ -1,0 +1,269 @@
+"""Train an inference model that finds out what a system is like from how it moves, and the forward model that uses it.
+
+    python recipes/inference_model.py [system=pendulum] [minutes=4] [baselines=true] [run_dir=PATH]
+
+Trains both on random variants of the system whose parameters they never see (paper, "Inference models"; SM "End-to-end
+training algorithm for System ID"). On new variants every system is identified once, from `phase` steps of one
+trajectory, and another of its trajectories is predicted: with what was inferred of it, and with what was inferred of
+another system. `baselines=true` also trains models without identification and with the true parameters for the same
+time (paper, Figure "System identification performance"). Ctrl-C saves everything; the same `run_dir` goes on.
+
+Leaves config.yaml, metrics.json, the checkpoint, and figures in its run folder: errors as bars (errors.png), error
+against the number of observed steps (steps.png), and predictions of three systems identified with and without control
+(control.png; paper, Figure "System identification analysis in Pendulum"). metrics.json also has how well each
+parameter can be read from the inferred graph by a linear map. All options: recipes/config/inference_model.yaml. What
+came out: docs/results.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from torchrl_gn.data import (
+    Simulator,
+    TrajectoryDataset,
+    collect_trajectories,
+    create_dataset,
+    spline_controls,
+    trajectory_buffer,
+)
+from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.evaluation import (
+    ErrorTable,
+    evaluate_errors,
+    identification_errors,
+    linear_probe,
+    plot_bars,
+    plot_loglog,
+    plot_motions,
+    plot_training_curve,
+    summary,
+)
+from torchrl_gn.modules import FeatureSet, ForwardModel, IdentifyingModel
+from torchrl_gn.objectives import IdentificationLoss
+from torchrl_gn.scenes import Scene, load_scene, make_variants, parameter_ranges, sample_parameters
+from torchrl_gn.training import (
+    Budget,
+    RunFolder,
+    Tracker,
+    Trainer,
+    clean_exit,
+    load_checkpoint,
+    make_optimizer,
+    save_checkpoint,
+)
+from torchrl_gn.training.progress import collecting, train_with_progress
+from torchrl_gn.training.sweep import Run, run_all
+
+RECIPE = Path(__file__).with_name("forward_model.py")
+# A run may go on with these changed, and nothing else.
+MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds", "baselines", "test")
+
+
+def options(cfg: DictConfig) -> dict[str, Any]:
+    """Options as plain values."""
+    return cast(dict[str, Any], OmegaConf.to_container(cfg))
+
+
+def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset: TrajectoryDataset) -> Trainer:
+    """Wire data, loss and optimiser together."""
+    noise = torch.Generator().manual_seed(cfg.seed)
+    loss = IdentificationLoss(model, scene, phase=cfg.phase, parts=cfg.parts, noise=cfg.noise, generator=noise)
+
+    def buffer(batch_size: int, length: int, seed: int):
+        elsewhere = (cfg.parts, length)
+        return trajectory_buffer(dataset.train, batch_size=batch_size, window=cfg.phase, elsewhere=elsewhere, seed=seed)
+
+    def validate() -> float:
+        """Identified from the first steps, predicted from after them."""
+        held = dataset.validation
+        later = TensorDict(
+            {"state": held["state"][:, cfg.phase :], "action": held["action"][:, cfg.phase :]}, [len(held)]
+        )
+        bound, inference = loss.bound, loss.inference
+        errors = identification_errors(bound, inference, held, later, steps=cfg.phase, horizons=(20,), one_step=False)
+        return errors["rollout_error_20"].total
+
+    return Trainer(
+        loss,
+        buffer(cfg.batch_size, 1, cfg.seed),
+        make_optimizer(nn.ModuleList([model.forward_model.core, model.inference]), cfg.optimizer, lr=cfg.lr),
+        Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
+        unroll=buffer(cfg.unroll_batch_size, cfg.unroll_steps, cfg.seed + 1) if cfg.unroll_fraction > 0 else None,
+        unroll_fraction=cfg.unroll_fraction,
+        validate=validate,
+    )
+
+
+class TestSystems:
+    """New variants with two trajectories each, one to identify the system from and one to predict."""
+
+    def __init__(self, cfg: DictConfig, scene: Scene) -> None:
+        system = scene.origin["system"]
+        rng = np.random.default_rng(np.random.SeedSequence(cfg.data.seed, spawn_key=(5,)))
+        self.parameters = sample_parameters(system, cfg.test.systems, rng)
+        self.names = list(parameter_ranges(system))
+        self.scenes = make_variants(system, self.parameters, timestep=scene.timestep)
+        count = cfg.test.systems
+        both = collect_trajectories(self.scenes, 2 * count, cfg.data.length, cfg.data.seed, split=4)
+        self.observed, self.predicted = (cast(TensorDictBase, half) for half in (both[:count], both[count:]))
+
+
+def identified_errors(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestSystems):
+    """Error tables by way, and the error against the number of observed steps."""
+    bound, inference = model.bind(scene)
+    pairs = bound, inference, systems.observed, systems.predicted
+    tables = {
+        "identified": identification_errors(*pairs, steps=cfg.phase),
+        "identified from another system": identification_errors(*pairs, steps=cfg.phase, wrong=True),
+    }
+    curve = {}
+    for steps in tqdm([steps for steps in cfg.test.steps if steps <= cfg.data.length], desc="evaluating", leave=False):
+        table = identification_errors(*pairs, steps=steps, one_step=False)
+        curve[steps] = table["rollout_error_100"].total
+    return tables, curve
+
+
+def probe(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestSystems) -> dict[str, float]:
+    """How well each parameter can be read from the inferred graph."""
+    _, inference = model.bind(scene)
+    state, action = (cast(Tensor, systems.observed.get(key)) for key in ("state", "action"))
+    with torch.no_grad():
+        static = inference.infer(state[:, : cfg.phase], action[:, : cfg.phase], state[:, 1 : cfg.phase + 1]).static
+    features = torch.cat([cast(Tensor, static.get(part)).flatten(1) for part in ("nodes", "edges", "globals_")], dim=1)
+    share = linear_probe(features, torch.from_numpy(systems.parameters), train=int(0.75 * len(features)))
+    return dict(zip(systems.names, share.tolist(), strict=True))
+
+
+def control_figure(cfg: DictConfig, model: IdentifyingModel, scene: Scene, path: Path) -> Path:
+    """Predictions of three systems identified with control, and without."""
+    bound, inference = model.bind(scene)
+    system, ranges = scene.origin["system"], parameter_ranges(scene.origin["system"])
+    low, high = (np.array([getattr(one, side) for one in ranges.values()]) for side in ("low", "high"))
+    scenes = make_variants(system, np.array([low, (low + high) / 2, high]), timestep=scene.timestep)
+    simulator, rng, each = Simulator(scenes), np.random.default_rng(cfg.seed), np.arange(3)
+    # All from one state, under one control: only the systems differ.
+    start = np.repeat(draw_start_states(simulator, np.zeros(1, dtype=np.int64), rng)[0], 3, axis=0)
+    controls = np.repeat(spline_controls(scene, 1, cfg.data.length, rng), 3, axis=0)
+    panels = {}
+    for title, factor in (("with control", 1.0), ("without control", 0.0)):
+        actions = controls.copy()
+        actions[:, : cfg.phase] *= factor
+        states = cast(Tensor, simulator.rollout(start, actions, each).get("state"))
+        actions = torch.from_numpy(actions)
+        with torch.no_grad():
+            seen = states[:, : cfg.phase], actions[:, : cfg.phase], states[:, 1 : cfg.phase + 1]
+            static = inference.infer(*seen).static
+            predicted = bound.rollout(states[:, cfg.phase], actions[:, cfg.phase :], static)
+        panels[f"identified {title}"] = (states, predicted)
+    return plot_motions(panels, scene, path, labels=("smallest", "middle", "largest"))
+
+
+def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, scene: Scene) -> dict[str, ErrorTable]:
+    """Errors of models without identification and with the true parameters, trained for the same time."""
+    runs = {}
+    for name, static in (("no identification", "none"), ("true parameters", "scene")):
+        sizes = {key: value for key, value in options(cfg)["model"].items() if key != "inferred"}
+        model = [f"model.{key}={value}".replace(" ", "") for key, value in sizes.items()]
+        shared = [f"system={cfg.system}", "parametrized=true", f"data.folder={data}", f"seed={cfg.seed}"]
+        budget = {key: "null" if cfg[key] is None else cfg[key] for key in ("minutes", "steps", "clock", "threads")}
+        shared += [f"{key}={value}" for key, value in budget.items()]
+        shared += [f"data.{key}={cfg.data[key]}" for key in ("train", "validation", "test", "length", "seed")]
+        shared += [f"noise={cfg.noise}", *model, f"model.static={static}"]
+        runs[name] = Run(RECIPE, folder / name.replace(" ", "_"), tuple(shared), name)
+    failed = run_all(runs.values(), cfg.jobs, desc="training baselines")
+    if failed:
+        raise ValueError(f"{len(failed)} baselines failed; see their log.txt. Start again to go on.")
+    models = {name: load_checkpoint(run.folder).model.bind(scene, static_key="static") for name, run in runs.items()}
+    return {name: evaluate_errors(bound, systems.predicted) for name, bound in models.items()}
+
+
+@hydra.main(version_base=None, config_path="config", config_name="inference_model")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    torch.manual_seed(cfg.seed)
+    torch.set_num_threads(cfg.threads)
+    scene = load_scene(cfg.system)
+    Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)
+    run = RunFolder(cfg.run_dir, "inference_model")
+    begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
+    if begun:
+        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
+        model = cast(IdentifyingModel, begun.trained)
+    else:
+        forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", **options(cfg.model))
+        model = IdentifyingModel(forward_model, **options(cfg.inference))
+    run.write_config(OmegaConf.to_yaml(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"inference_model-{scene.name}", config=options(cfg))
+
+    data = Path(cfg.data.folder) if cfg.data.folder else run.data
+    sizes = cfg.data.train, cfg.data.validation, cfg.data.test
+    with collecting(f"data of {scene.name}") as show:
+        dataset = create_dataset(
+            data / f"{scene.name}_variants",
+            scene,
+            *sizes,
+            steps=cfg.data.length,
+            seed=cfg.data.seed,
+            variants=cfg.data.train,
+            progress=show,
+        )
+    trainer = make_trainer(cfg, model, scene, dataset)
+    if begun:
+        trainer.load_state_dict(begun.training)
+    else:
+        trainer.loss.fit_normalizers(trajectory_buffer(dataset.train, batch_size=20_000, seed=cfg.seed).sample())
+    curves = begun.training["curves"] if begun else {"seconds": [], "loss": []}
+
+    def save() -> None:
+        state = {**trainer.state_dict(), "curves": curves}
+        save_checkpoint(run.checkpoint, model, scene=scene, config=options(cfg), training=state)
+
+    train_with_progress(trainer, curves, save, tracker, checkpoint_seconds=cfg.checkpoint_seconds)
+
+    systems = TestSystems(cfg, scene)
+    tables, curve = identified_errors(cfg, model, scene, systems)
+    if cfg.baselines:
+        tables |= baselines(cfg, run.path / "baselines", data, systems, scene)
+    readable = probe(cfg, model, scene, systems)
+    bars = {
+        name.replace("_error", "").replace("_", " "): {
+            way: {scene.name: (of[name].total, 0.0)} for way, of in tables.items()
+        }
+        for name in tables["identified"].errors
+    }
+    panel = {"observed steps": {"identified": (list(curve), list(curve.values()))}}
+    files = [
+        plot_bars(bars, run.path / "errors.png"),
+        plot_loglog(panel, run.path / "steps.png", ylabel="100-step error"),
+        control_figure(cfg, model, scene, run.path / "control.png"),
+    ]
+    if curves["seconds"]:
+        files.append(
+            plot_training_curve({"loss": (curves["seconds"], curves["loss"])}, run.path / "training.png", ylabel="loss")
+        )
+    metrics = {f"{way}/{key}": value for way, of in tables.items() for key, value in of.to_metrics().items()}
+    metrics |= {f"observed steps/{steps}/rollout_error_100": value for steps, value in curve.items()}
+    metrics |= {f"read from the inferred graph/{name}": value for name, value in readable.items()}
+    metrics |= {"validation_error": trainer.best, "steps": trainer.step, "training_seconds": trainer.seconds}
+    tracker.log(run.write_metrics(metrics, seed=cfg.seed), trainer.step)
+    tracker.log_files(files)
+    tracker.close()
+    print(summary(tables))
+    print("\nShare of each parameter's variance that a linear map reads from the inferred graph:")
+    print("  ".join(f"{name} {value:.2f}" for name, value in readable.items()))
+    for path in [*files, run.path / "metrics.json", run.checkpoint]:
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

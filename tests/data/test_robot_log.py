@@ -1,0 +1,183 @@
+"""Robot logs: what is read, where it is cut, and what a simulated robot's motors and encoders do."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_gn.data import DatasetError, RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log
+from torchrl_gn.scenes import JointChain, load_scene, scene_from_description
+
+PAM = Path(__file__).parents[3] / "shared" / "data" / "pam_arm" / "pam_arm_clean_f32.npz"
+NAMES = {"angle": "q", "velocity": "dq", "command": "action"}
+
+
+def smooth_log(lengths=(30, 50), joints: int = 2, timestep: float = 0.01) -> RobotLog:
+    """Joints that swing at their own frequencies, with velocities that fit; commands that tell their row."""
+    rows = sum(lengths)
+    time = np.concatenate([np.arange(length) for length in lengths]) * timestep
+    frequency = 3 + np.arange(joints)
+    angle, velocity = np.sin(time[:, None] * frequency), frequency * np.cos(time[:, None] * frequency)
+    command = np.arange(rows)[:, None] * np.ones(joints)
+    return RobotLog(angle, velocity, command, np.array(lengths), timestep, {"load": angle**2})
+
+
+def arrays_of(log: RobotLog) -> dict:
+    return {"angle": log.angle, "velocity": log.velocity, "command": log.command, "length": log.length, **log.extra}
+
+
+def test_npz_and_csv_give_the_same_log(tmp_path):
+    log = smooth_log()
+    np.savez(tmp_path / "log.npz", **arrays_of(log), timestep=0.01, name=np.array(["a", "b"]))
+    header = [
+        "episode",
+        "time",
+        *(f"{what}{joint}" for what in ("angle", "velocity", "command", "load") for joint in (0, 1)),
+    ]
+    episode = np.repeat([7, 8], log.length)
+    time = np.concatenate([np.arange(length) for length in log.length]) * 0.01
+    table = np.column_stack((episode, time, log.angle, log.velocity, log.command, log.extra["load"]))
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=",".join(header), comments="", fmt="%.17g")
+    for name in ("log.npz", "log.csv"):
+        read = load_robot_log(tmp_path / name)
+        assert read.length.tolist() == [30, 50] and read.timestep == pytest.approx(0.01)
+        np.testing.assert_array_equal(read.angle, log.angle)
+        np.testing.assert_array_equal(read.extra["load"], log.extra["load"])
+        assert list(read.extra) == ["load"]
+
+
+def test_channels_of_several_numbers_a_joint_are_dealt_out(tmp_path):
+    log = smooth_log()
+    pressure = np.arange(80)[:, None] + np.array([0.0, 0.1, 0.2, 0.3])  # two of joint 0, two of joint 1
+    np.savez(tmp_path / "log.npz", **arrays_of(log), pressure=pressure)
+    read = load_robot_log(tmp_path / "log.npz", timestep=0.01)
+    np.testing.assert_allclose(read.extra["pressure0"][5], [5.0, 5.2])
+    np.testing.assert_allclose(read.extra["pressure1"][5], [5.1, 5.3])
+    without = load_robot_log(tmp_path / "log.npz", timestep=0.01, names={"pressure": ""})
+    assert list(without.extra) == ["load"]
+
+
+def test_trajectories_hold_the_rows_and_cross_no_episode():
+    log = smooth_log()
+    trajectories, report = log_trajectories(log, 12)
+    assert trajectories["state"].shape == (6, 13, 3, 4) and trajectories["episode"].tolist() == [0, 0, 1, 1, 1, 1]
+    first = trajectories["state"][2]  # of the second episode
+    torch.testing.assert_close(first[:, 1, 1], torch.from_numpy(np.sin(log.angle[30:43, 0])))
+    torch.testing.assert_close(
+        first[:, 2, 2:], torch.from_numpy(np.stack((log.velocity, log.extra["load"]), 2)[30:43, 1])
+    )
+    assert (first[:, 0] == torch.tensor([1.0, 0, 0, 0])).all()
+    assert trajectories["action"][2, :, 0].tolist() == list(range(30, 42))
+    assert (report.rows, report.trajectories, report.kept, report.short) == (80, 6, 72, 8)
+    late, _ = log_trajectories(log, 12, lag=3)
+    assert late["action"][0, 0, 0] == 0  # the command of row 0 goes with the state of row 3
+    torch.testing.assert_close(late["state"][0, 0, 1, 1], torch.tensor(np.sin(log.angle[3, 0])))
+    coarse, _ = log_trajectories(log, 12, every=2)
+    torch.testing.assert_close(coarse["state"][0, 1, 1, 1], torch.tensor(np.sin(log.angle[2, 0])))
+    assert coarse["action"][0, :2, 0].tolist() == [0.5, 2.5]
+    every, _ = log_trajectories(log, 12, overlap=True)
+    assert len(every) == 18 + 38
+    only, _ = log_trajectories(log, 12, episodes=[1])
+    assert set(only["episode"].tolist()) == {1}
+
+
+def test_it_is_cut_at_jumps_and_gaps_and_says_so():
+    log = smooth_log((60, 60))
+    log.angle[20:60] += 2.0  # in the first episode, after row 19
+    log.velocity[80] = np.nan
+    trajectories, report = log_trajectories(log, 10)
+    assert report.jumps == ((0, 19),) and report.not_finite == 1
+    assert trajectories["state"].isfinite().all()
+    commands = trajectories["action"][:, :, 0]
+    assert not ((commands[:, 0] <= 19) & (commands[:, -1] >= 19)).any()  # no transition from row 19 to 20
+    assert not (commands == 80).any() and not (commands == 79).any()
+    assert "cut at 1 jumps, the first at row 19 of episode 0" in str(report)
+    assert "dropped 1 rows that are not finite" in str(report)
+
+
+def test_an_angle_that_turns_over_does_not_jump():
+    log = smooth_log((100,))
+    rate = 4.0
+    angle = (np.arange(100)[:, None] * 0.01 * rate * np.ones(2) + np.pi) % (2 * np.pi) - np.pi
+    turning = RobotLog(angle, np.full((100, 2), rate), log.command, log.length, 0.01)
+    assert np.abs(np.diff(angle, axis=0)).max() > 6
+    assert log_trajectories(turning, 10)[1].jumps == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"velocity": None}, r"lacks \['velocity'\]; it has .* names="),
+        ({"length": np.array([30, 49])}, "adds up to 79 rows, but there are 80"),
+        ({"velocity": np.zeros((79, 2))}, "do not fit"),
+        ({"load": np.zeros((80, 3))}, "'load' has 3 columns, which is no multiple of the 2 joints"),
+        ({"timestep": np.array(-1.0)}, "does not say its time step"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path, change, message):
+    arrays = {"timestep": 0.01, **arrays_of(smooth_log()), **change}
+    np.savez(tmp_path / "log.npz", **{name: value for name, value in arrays.items() if value is not None})
+    with pytest.raises(DatasetError, match=message):
+        load_robot_log(tmp_path / "log.npz")
+
+
+def test_other_bad_input_is_named(tmp_path):
+    with pytest.raises(DatasetError, match="No robot log at"):
+        load_robot_log(tmp_path / "none.npz")
+    (tmp_path / "log.txt").write_text("x")
+    with pytest.raises(DatasetError, match=r"is a \.npz or \.csv"):
+        load_robot_log(tmp_path / "log.txt")
+    (tmp_path / "log.npz").write_text("no zip")
+    with pytest.raises(DatasetError, match="cannot be read as a robot log"):
+        load_robot_log(tmp_path / "log.npz")
+    with pytest.raises(ValueError, match="No piece of the log has 70 transitions"):
+        log_trajectories(smooth_log(), 70)
+    with pytest.raises(ValueError, match="lag=-1"):
+        log_trajectories(smooth_log(), 5, lag=-1)
+    with pytest.raises(ValueError, match="2 commands cannot be dealt out evenly to 3 joints|cannot be dealt out"):
+        log = smooth_log(joints=3)
+        log_chain(RobotLog(log.angle, log.velocity, log.command[:, :2], log.length, 0.01), "arm")
+    with pytest.raises(DatasetError, match="has no 'q'"):
+        np.savez(tmp_path / "ok.npz", **arrays_of(smooth_log()), timestep=0.01)
+        load_robot_log(tmp_path / "ok.npz", names={"angle": "q"})
+
+
+def test_a_chain_is_a_graph_that_comes_back_from_its_description():
+    chain = log_chain(smooth_log(joints=3), "arm", carried_by=[-1, 0, 0])
+    assert isinstance(chain, JointChain)
+    assert chain.senders.tolist() == [0, 1, 1, 2, 1, 3] and chain.receivers.tolist() == [1, 0, 2, 1, 3, 1]
+    assert chain.edge_action[:, 0].tolist() == [0, 0, 1, 1, 2, 2]
+    again = scene_from_description(chain.description())
+    assert again.fingerprint() == chain.fingerprint() and again.senders.tolist() == chain.senders.tolist()
+    assert "joint2, carried by joint0" in str(chain)
+    with pytest.raises(ValueError, match="carried_by="):
+        log_chain(smooth_log(), "arm", carried_by=[0, 1])
+
+
+def test_a_simulated_robot_has_the_faults_of_a_real_one():
+    scene = load_scene("jaco")
+    faults = {"delay": 0, "time_constant": 0.0, "play": 0.0, "quantum": 0.0, "noise": 0.0}
+    clean, coarse = (simulate_log(scene, 3, 30, 0, **(faults | own)) for own in ({}, {"quantum": 0.01}))
+    assert clean.angle.shape == (3 * 29, 9) and clean.length.tolist() == [29] * 3
+    np.testing.assert_allclose(coarse.angle / 0.01, np.round(coarse.angle / 0.01), atol=1e-9)
+    assert 0 < np.abs(clean.angle - coarse.angle).max() <= 0.005 + 1e-9
+    change = np.diff(clean.angle[:29], axis=0) / scene.timestep
+    np.testing.assert_allclose(clean.velocity[1:29], change, atol=1e-9)
+    delayed = simulate_log(scene, 3, 30, 0, **(faults | {"delay": 5}))
+    assert np.array_equal(delayed.command, clean.command)
+    still = delayed.angle.reshape(3, 29, 9)[:, :4]
+    assert np.ptp(still, axis=1).max() < 0.05 < np.ptp(clean.angle.reshape(3, 29, 9)[:, :4], axis=1).max()
+    with pytest.raises(ValueError, match="hinges alone"):
+        simulate_log(load_scene("cartpole"), 1, 10, 0)
+
+
+@pytest.mark.skipif(not os.path.exists(PAM), reason="the robot's logs are not here")
+def test_a_real_log_is_cut_where_its_description_says():
+    log = load_robot_log(PAM, timestep=0.01047, names=NAMES)
+    assert log.num_joints == 4 and list(log.extra) == ["pressure0", "pressure1"]
+    _, report = log_trajectories(log, 80, lag=1)
+    assert report.jumps == ((1586, 84),) and report.rows == 323_726

@@ -1,0 +1,168 @@
+"""The inference model: a recurrent GN block, online use, and nothing of the true parameters."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import step_mdp
+
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.envs import ModelEnv
+from torchrl_gn.modules import (
+    FeatureSet,
+    ForwardModel,
+    GNBlock,
+    GraphSize,
+    IdentifyingModel,
+    InferenceModel,
+    graph_concat,
+    specialize,
+)
+from torchrl_gn.rewards import make_reward
+from torchrl_gn.scenes import load_scene, sample_variants
+
+EDGES = torch.tensor([[0, 1, 0, 2], [1, 0, 1, 2]])
+SMALL = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+
+
+@pytest.fixture
+def make_identifying(fit):
+    """Both models, small and with random weights, and the scene they know."""
+
+    def make(name: str = "pendulum", **options):
+        torch.manual_seed(0)
+        scene = load_scene(name)
+        forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=(4, 3, 2), **SMALL)
+        model = IdentifyingModel(
+            forward_model.double(), edge_hidden=(8,), node_hidden=(8,), global_hidden=(8,)
+        ).double()
+        bound, _ = model.bind(scene)
+        data = collect_trajectories(scene, 20, 5)
+        state, action = data["state"], data["action"]
+        bound.update_dynamic_normalizers(state[:, 0], action[:, 0], state[:, 1])
+        return model, scene
+
+    return make
+
+
+def sequence_of(data: TensorDict, steps: int) -> dict:
+    """The first transitions of trajectories, laid out as TorchRL's are."""
+    state, action = data["state"], data["action"]
+    return {"state": state[:, :steps], "action": action[:, :steps], "next": {"state": state[:, 1 : steps + 1]}}
+
+
+def test_a_step_is_a_gn_block_over_both_graphs(random_graph):
+    torch.manual_seed(0)
+    size, inferred, memory = GraphSize(3, 2, 1), GraphSize(4, 5, 6), GraphSize(7, 8, 9)
+    model = InferenceModel(size, inferred=(4, 5, 6), memory=(7, 8, 9)).double()
+    assert isinstance(model.block, GNBlock)
+    dynamic, hidden = random_graph(size, EDGES, 3, 2), random_graph(memory, EDGES, 3, 2, seed=1)
+    found, after = model(dynamic, hidden)
+    out = model.block(graph_concat(dynamic, hidden))
+    for part in ("nodes", "edges", "globals_"):
+        first = getattr(inferred, part)
+        assert torch.equal(getattr(found, part), getattr(out, part)[..., :first])
+        assert torch.equal(getattr(after, part), getattr(out, part)[..., first:].tanh())
+    assert all((value == 0).all() for value in (model.start(dynamic).nodes, model.start(dynamic).globals_))
+
+
+def test_observations_one_by_one_are_the_sequence(make_identifying):
+    model, scene = make_identifying("swimmer3")
+    _, inference = model.bind(scene)
+    data = collect_trajectories(scene, 4, 9, seed=1)
+    sequence = data["state"][:, :9], data["action"], data["state"][:, 1:]
+    whole = inference.infer(*sequence)
+    memory = None
+    for step in range(9):
+        known = inference.infer(*(part[:, step : step + 1] for part in sequence), memory)
+        memory = known.memory
+    for key in ("nodes", "edges", "globals_"):
+        torch.testing.assert_close(known.static[key], whole.static[key])
+    every = list(inference.observe(*sequence))
+    assert len(every) == 9 and torch.equal(every[-1].static["nodes"], whole.static["nodes"])
+    assert not torch.equal(every[0].static["nodes"], whole.static["nodes"])
+    with pytest.raises(ValueError, match="at least one transition"):
+        inference.infer(*(part[:, :0] for part in sequence))
+
+
+def test_as_tensordict_modules_they_chain(make_identifying):
+    model, scene = make_identifying()
+    bound, inference = model.bind(scene)
+    data = collect_trajectories(scene, 3, 6, seed=1)
+    td = TensorDict(
+        {
+            "identification": sequence_of(data, 5),
+            "state": data["state"][:, 5],
+            "action": data["action"][:, 5],
+        },
+        batch_size=[3],
+    )
+    with pytest.raises(KeyError, match="no static|static values at 'static'"):
+        bound(td.clone())
+    bound(inference(td))
+    static = inference.infer(data["state"][:, :5], data["action"][:, :5], data["state"][:, 1:6]).static
+    assert torch.equal(td["next", "state"], bound.step(data["state"][:, 5], data["action"][:, 5], static))
+    with pytest.raises(KeyError, match="identification"):
+        inference(TensorDict({"state": td["state"]}, [3]))
+
+
+def test_an_inferred_graph_is_kept_and_used_again(make_identifying, tmp_path):
+    model, scene = make_identifying()
+    bound, inference = model.bind(scene)
+    data = collect_trajectories(scene, 3, 6, seed=1)
+    static = inference.infer(data["state"][:, :5], data["action"][:, :5], data["state"][:, 1:6]).static.detach()
+    static.memmap(str(tmp_path))
+    again = TensorDict.load_memmap(tmp_path)
+    start, actions = data["state"][:, 2], data["action"][:, 2:]
+    expected = bound.rollout(start, actions, static)
+    assert torch.equal(bound.rollout(start, actions, again), expected)
+    torch.testing.assert_close(specialize(bound).rollout(start, actions, again), expected, rtol=1e-9, atol=1e-12)
+    env = ModelEnv(bound, make_reward("balance", scene))
+    assert (env.reset()["static", "nodes"] == 0).all()  # nothing is known
+    reset = env.reset(TensorDict({"state": start, "static": again}, [3]), set_state=True)
+    for action in actions.unbind(1):
+        reset = step_mdp(env.step(reset.set("action", action.to(env.action_spec.dtype))))
+    torch.testing.assert_close(reset["state"], expected[:, -1], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("system", ["pendulum", "cartpole", "swimmer3", "cheetah", "jaco"])
+@pytest.mark.parametrize("static", ["none", "inferred"])
+def test_true_parameters_cannot_leak(system, static):
+    """A sample's own parameters change nothing and get no gradient; only its states and actions count."""
+    torch.manual_seed(0)
+    scene = load_scene(system)
+    model = ForwardModel(FeatureSet.of(scene), static=static, inferred=(4, 3, 2), **SMALL).double()
+    variants = collect_trajectories(sample_variants(system, 3, rng=0), 3, 6, seed=0)
+    bound = model.bind(scene, static_key="static")
+    bound.update_dynamic_normalizers(variants["state"][:, 0], variants["action"][:, 0], variants["state"][:, 1])
+    state, action = variants["state"][:, 2], variants["action"][:, 2]
+    sample = TensorDict({"state": state, "action": action, "static": variants["static"]}, [3])
+    if static == "none":
+        mixed = sample.clone().set("static", variants["static"].apply(lambda value: value.flip(0)))
+        assert torch.equal(bound(sample)["next", "state"], bound(mixed)["next", "state"])
+        return
+    with pytest.raises(ValueError, match="Static entry 'nodes' must be|true parameters"):
+        bound(sample.clone())
+    identifying = IdentifyingModel(model, edge_hidden=(8,), node_hidden=(8,), global_hidden=(8,)).double()
+    bound, inference = identifying.bind(scene)
+    td = sample.set("identification", sequence_of(variants, 6))
+    found = bound(inference(td.clone()))["next", "state"]
+    td.set("static", variants["static"].apply(lambda value: value.flip(0)))
+    assert torch.equal(bound(inference(td))["next", "state"], found)
+
+
+def test_the_forward_model_must_read_what_is_inferred():
+    scene = load_scene("pendulum")
+    with pytest.raises(ValueError, match="reads static='scene'; build it with 'inferred'"):
+        IdentifyingModel(ForwardModel(FeatureSet.of(scene), **SMALL))
+
+
+def test_a_description_builds_the_same_models(make_identifying):
+    model, scene = make_identifying()
+    again = IdentifyingModel.from_description(model.description()).double()
+    again.load_state_dict(model.state_dict())
+    data = collect_trajectories(scene, 3, 6, seed=1)
+    sequence = data["state"][:, :6], data["action"], data["state"][:, 1:]
+    found = [each.bind(scene)[1].infer(*sequence).static for each in (model, again)]
+    assert torch.equal(found[0]["nodes"], found[1]["nodes"])

@@ -1,0 +1,120 @@
+"""The loss of system identification: other parts of a trajectory, predicted with what was inferred from one."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.evaluation import identification_errors, linear_probe
+from torchrl_gn.modules import FeatureSet, ForwardModel, IdentifyingModel
+from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss
+from torchrl_gn.scenes import load_scene, sample_variants
+
+SMALL = {"edge_hidden": (16,), "node_hidden": (16,), "global_hidden": (16,)}
+
+
+@pytest.fixture(scope="module")
+def trajectories():
+    """Two trajectories each of eight pendulums."""
+    return collect_trajectories(sample_variants("pendulum", 8, rng=0), 16, 30, seed=0)
+
+
+@pytest.fixture
+def make_loss(trajectories):
+    def make(**options) -> IdentificationLoss:
+        torch.manual_seed(0)
+        scene = load_scene("pendulum")
+        forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", latent=16, **SMALL)
+        loss = IdentificationLoss(IdentifyingModel(forward_model, **SMALL), scene, **options)
+        loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=500, seed=0).sample())
+        return loss
+
+    return make
+
+
+@pytest.mark.parametrize("length", [1, 3])
+def test_it_is_the_forward_models_loss_with_the_inferred_graph(make_loss, trajectories, length):
+    loss = make_loss(phase=6, parts=2)
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(2, length), seed=0).sample()
+    assert batch.shape == (5, 6 + 2 * length)
+    time, trajectory = batch["index"][..., 1], batch["index"][..., 0]
+    assert (trajectory == trajectory[:, :1]).all() and (time[:, :6].diff(dim=1) == 1).all()
+    static = loss.inference.infer(batch["state"][:, :6], batch["action"][:, :6], batch["next", "state"][:, :6]).static
+    alone = []
+    for sample, own in zip(batch, static, strict=True):
+        for part in range(2):
+            steps = sample[6 + part * length : 6 + (part + 1) * length].select("state", "action", "next")
+            steps = steps.set("static", own.expand(length)).unsqueeze(0)
+            alone.append(loss.prediction(steps)["loss_forward_model"])
+    torch.testing.assert_close(loss(batch)["loss_forward_model"], torch.stack(alone).mean())
+
+
+def test_one_loss_trains_both_models_and_identification_pays(make_loss, trajectories):
+    loss = make_loss(phase=10, parts=4)
+    buffer = trajectory_buffer(trajectories, batch_size=16, window=10, elsewhere=(4, 1), seed=0)
+    loss(buffer.sample())["loss_forward_model"].backward()
+    for part in (loss.trained.inference, loss.trained.forward_model.core):
+        assert all(weight.grad.abs().sum() > 0 for weight in part.parameters() if weight.ndim == 2)
+    optimizer = torch.optim.Adam(loss.trained.parameters(), 3e-3)
+    for _ in range(300):
+        optimizer.zero_grad()
+        loss(buffer.sample())["loss_forward_model"].backward()
+        optimizer.step()
+    pairs = loss.bound, loss.inference, trajectories[:8], trajectories[8:]
+    right, wrong = (identification_errors(*pairs, wrong=wrong, horizons=(10,)) for wrong in (False, True))
+    assert right["rollout_error_10"].total < 0.8 * wrong["rollout_error_10"].total
+
+
+def test_true_parameters_in_the_samples_are_not_read(make_loss, trajectories):
+    loss = make_loss(phase=6)
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(1, 1), seed=0).sample()
+    mixed = batch.clone().set("static", batch["static"].apply(lambda value: value.flip(0)))
+    assert torch.equal(loss(batch)["loss_forward_model"], loss(mixed)["loss_forward_model"])
+    assert "static" not in loss.in_keys
+
+
+def test_what_does_not_fit_is_named(make_loss, trajectories):
+    loss = make_loss(phase=6, parts=2)
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(2, 1), seed=0).sample()
+    for wrong in (batch[:, :6], batch[:, :7], batch[0]):
+        with pytest.raises(ValueError, match=r"must be \[B, 6 \+ 2 \* H\].*elsewhere=\(2, H\)"):
+            loss(wrong)
+    with pytest.raises(KeyError, match=r"needs .{0,2}'action"):
+        loss(batch.exclude("action"))
+    batch["state"][0, 0, 1, 0] = torch.nan
+    with pytest.raises(ValueError, match="'state' of the batch"):
+        loss(batch)
+    with pytest.raises(ValueError, match="phase=0"):
+        make_loss(phase=0)
+    with pytest.raises(ValueError, match="count and a length"):
+        trajectory_buffer(trajectories, batch_size=5, elsewhere=(0, 1))
+    with pytest.raises(ValueError, match="8 observed and 16 test"):
+        identification_errors(loss.bound, loss.inference, trajectories[:8], trajectories)
+
+
+def test_a_model_that_reads_true_parameters_is_no_part_of_it():
+    scene = load_scene("pendulum")
+    model = ForwardModel(FeatureSet.of(scene), latent=16, **SMALL)
+    loss = ForwardModelLoss(model.bind(scene))
+    assert not isinstance(loss.trained, IdentifyingModel)
+
+
+def test_other_windows_start_elsewhere(trajectories):
+    buffer = trajectory_buffer(trajectories, batch_size=400, window=4, elsewhere=(3, 5), seed=0)
+    time = buffer.sample()["index"][..., 1]
+    first, others = time[:, 0], time[:, 4::5]
+    assert (others != first[:, None]).all()
+    assert others.unique().tolist() == list(range(26)) and first.unique().tolist() == list(range(27))
+    assert (time[:, 4:].unflatten(1, (3, 5)).diff(dim=-1) == 1).all()
+
+
+def test_a_linear_probe_finds_what_is_linear():
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(400, 6, generator=generator)
+    features[:, 5] = 3.0  # says nothing
+    targets = torch.stack((features[:, 0] - 2 * features[:, 1], torch.randn(400, generator=generator)), 1)
+    found = linear_probe(features, targets, train=300)
+    assert found[0] > 0.99 and found[1] < 0.1
+    with pytest.raises(ValueError, match="train=399 of 400"):
+        linear_probe(features, targets, train=399)

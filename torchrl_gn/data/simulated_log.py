@@ -1,0 +1,89 @@
+"""Logs of a simulated robot with the faults of a real one."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import mujoco
+import numpy as np
+import torch
+
+from torchrl_gn.data.controls import spline_controls
+from torchrl_gn.data.robot_log import RobotLog
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.start_states import sample_start_states
+from torchrl_gn.scenes.scene import Scene
+
+
+def simulate_log(
+    scene: Scene,
+    episodes: int,
+    steps: int,
+    seed: int,
+    *,
+    delay: int = 2,
+    time_constant: float = 0.1,
+    play: float = 0.1,
+    quantum: float = 1e-3,
+    noise: float = 5e-4,
+) -> RobotLog:
+    """What the encoders of a robot would log whose motors lag behind their commands.
+
+    Commands are splines, as in :func:`spline_controls`. What a motor does is its command ``delay`` steps before,
+    passed through a play (hysteresis: it follows only once the command is half of ``play`` ahead of it) and a
+    first-order lag. Angles are measured with noise and quantised; velocities are backward differences of what was
+    measured.
+
+    Args:
+        scene: a robot whose joints are all hinges.
+        episodes: number of episodes.
+        steps: control steps of each.
+        seed: seed of commands, starts and noise.
+        delay: control steps until a command begins to act.
+        time_constant: of the lag, seconds; 0: none.
+        play: width of the play, as a share of the range of the command.
+        quantum: resolution of the encoders, radians.
+        noise: standard deviation of the noise of the encoders, radians.
+
+    Returns:
+        The log: one row a control step, joints in the order of MuJoCo.
+
+    Raises:
+        ValueError: if the scene has other joints than hinges, or no motors.
+    """
+    model = scene.model
+    if (model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE).any() or not scene.num_actions:
+        raise ValueError(f"Scene {scene.name!r} must have hinges alone, and motors, to be logged by joint encoders.")
+    rng = np.random.default_rng(seed)
+    command = spline_controls(scene, episodes, steps, rng)
+    acting = _motors(command, scene, delay, time_constant, play)
+    found = Simulator(scene).rollout(sample_start_states(scene, episodes, rng), acting)
+    physics: np.ndarray = cast(torch.Tensor, found.get("physics")).numpy()
+    angle = physics[:, :, 1 : 1 + model.nq]  # after the time
+    measured = angle + noise * rng.normal(size=angle.shape)
+    measured = np.round(measured / quantum) * quantum if quantum > 0 else measured
+    velocity = np.diff(measured, axis=1) / scene.timestep
+    # The first row has no velocity yet; the last no command that was carried out.
+    rows = episodes * (steps - 1)
+    return RobotLog(
+        angle=measured[:, 1:-1].reshape(rows, -1),
+        velocity=velocity[:, :-1].reshape(rows, -1),
+        command=command[:, 1:].reshape(rows, -1),
+        length=np.full(episodes, steps - 1),
+        timestep=scene.timestep,
+    )
+
+
+def _motors(command: np.ndarray, scene: Scene, delay: int, time_constant: float, play: float) -> np.ndarray:
+    """What motors do ``[n, T, A]`` under commands ``[n, T, A]``."""
+    width = play * (scene.action_high - scene.action_low) / 2
+    share = 1.0 if time_constant <= 0 else 1 - np.exp(-scene.timestep / time_constant)
+    rest = np.clip(np.zeros(scene.num_actions), scene.action_low, scene.action_high)
+    held = np.broadcast_to(rest, command[:, 0].shape).copy()
+    moved, acting = held.copy(), np.empty_like(command)
+    for step in range(command.shape[1]):
+        wanted = command[:, step - delay] if step >= delay else held
+        held = np.clip(held, wanted - width, wanted + width)
+        moved = moved + share * (held - moved)
+        acting[:, step] = moved
+    return acting

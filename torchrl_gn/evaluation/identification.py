@@ -1,0 +1,88 @@
+"""How well systems are identified: errors with inferred graphs, and what can be read from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.evaluation.error_table import ErrorTable
+from torchrl_gn.evaluation.errors import evaluate_errors
+from torchrl_gn.modules import BoundForwardModel, BoundInferenceModel
+
+
+@torch.no_grad()
+def identification_errors(
+    model: BoundForwardModel,
+    inference: BoundInferenceModel,
+    observed: TensorDictBase,
+    trajectories: TensorDictBase,
+    *,
+    steps: int | None = None,
+    wrong: bool = False,
+    horizons: Sequence[int] = (20, 100),
+    one_step: bool = True,
+) -> ErrorTable:
+    """Errors of predictions with what was inferred from other trajectories of the same systems.
+
+    Args:
+        model: forward model that reads what the inference model writes.
+        inference: inference model.
+        observed: ``[M]`` with ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``: one trajectory of
+            every system.
+        trajectories: ``[M]`` test trajectories of the same systems in the same order.
+        steps: how many transitions to identify from; default: all.
+        wrong: give every system what was inferred of another (paper, figure "System identification performance").
+        horizons: steps of the rollout errors.
+        one_step: whether to measure the one-step error.
+
+    Raises:
+        ValueError: if there are not as many observed as test trajectories, or (``wrong``) only one.
+    """
+    if len(observed) != len(trajectories):
+        raise ValueError(f"There are {len(observed)} observed and {len(trajectories)} test trajectories; give pairs.")
+    if wrong and len(observed) < 2:
+        raise ValueError("Another system takes at least two trajectories.")
+    action = cast(Tensor, observed.get("action"))[:, :steps]
+    state = cast(Tensor, observed.get("state"))[:, : action.shape[1] + 1]
+    static = inference.infer(state[:, :-1], action, state[:, 1:]).static
+    if wrong:
+        static = static.apply(lambda value: value.roll(1, 0))
+    entries = {key: trajectories.get(key) for key in ("state", "action")}
+    test = TensorDict({**entries, "static": static}, batch_size=[len(static)])
+    return evaluate_errors(model, test, horizons=horizons, one_step=one_step)
+
+
+def linear_probe(features: Tensor, targets: Tensor, *, train: int, penalty: float = 1e-2) -> Tensor:
+    """How much of each target a linear map of the features tells, on samples that it was not fitted to.
+
+    Ridge regression on standardised features and targets.
+
+    Args:
+        features: ``[M, F]``.
+        targets: ``[M, P]``.
+        train: number of samples to fit to; the rest are tested on.
+        penalty: on squared weights, as a share of the number of samples.
+
+    Returns:
+        ``[P]`` coefficients of determination: 1 where the targets can be read off, 0 where no better than their
+        mean, below where worse.
+
+    Raises:
+        ValueError: if fewer than two samples are left to fit to or to test on.
+    """
+    if train < 2 or len(features) - train < 2:
+        raise ValueError(f"train={train} of {len(features)} samples leaves too few to fit to or to test on.")
+    features, targets = features.double(), targets.double()
+    fitted, tested = features[:train], features[train:]
+    mean, std = fitted.mean(0), fitted.std(0)
+    used = std > 1e-9 * mean.abs().clamp(min=1)
+    fitted, tested = ((part[:, used] - mean[used]) / std[used] for part in (fitted, tested))
+    center = targets[:train].mean(0)
+    gram = fitted.T @ fitted + penalty * train * torch.eye(fitted.shape[1], dtype=torch.float64)
+    weights = torch.linalg.solve(gram, fitted.T @ (targets[:train] - center))
+    left = targets[train:] - center - tested @ weights
+    return 1 - left.square().sum(0) / (targets[train:] - targets[train:].mean(0)).square().sum(0)

@@ -1,0 +1,218 @@
+"""Inference model: what a system is like, found from how it moves (implicit system identification)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_gn.modules.bound_forward_model import BoundForwardModel
+from torchrl_gn.modules.forward_model import ForwardModel
+from torchrl_gn.modules.gn_block import GNBlock
+from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat, graph_split
+from torchrl_gn.scenes import Scene
+
+
+class Inferred(NamedTuple):
+    """What observations of a system tell.
+
+    Attributes:
+        static: TensorDict ``[*B]`` of the inferred static graph: ``nodes`` ``[*B, N, 10]``, ``edges`` ``[*B, E, 10]``
+            and ``globals_`` ``[*B, 10]``.
+        memory: hidden graph, to go on with more observations.
+    """
+
+    static: TensorDict
+    memory: Graph
+
+
+class InferenceModel(nn.Module):
+    """Recurrent graph network over dynamic graphs (paper, "Inference models", SM "Forward prediction with System ID").
+
+    Holds weights only and knows no scene. Each observation is a transition: the dynamic graph of a state and an action,
+    with what came of it on its nodes; the paper's model sees states and actions and has to remember the last one
+    to see any change. Its hidden graph passes through a tanh, so that it stays bounded for any number of observations;
+    the paper says nothing of how.
+
+    Args:
+        observed: features of a normalised observation.
+        inferred: features of the inferred static graph.
+        memory: features of the hidden graph.
+        edge_hidden: hidden sizes of the edge MLP.
+        node_hidden: hidden sizes of the node MLP.
+        global_hidden: hidden sizes of the global MLP.
+        activation: between the layers.
+    """
+
+    def __init__(
+        self,
+        observed: GraphSize,
+        *,
+        inferred: Sequence[int] = (10, 10, 10),
+        memory: Sequence[int] = (20, 20, 20),
+        edge_hidden: Sequence[int] = (64, 64),
+        node_hidden: Sequence[int] = (64, 64),
+        global_hidden: Sequence[int] = (64, 64),
+        activation: str = "silu",
+    ) -> None:
+        super().__init__()
+        self.inferred_size, self.memory_size = GraphSize(*inferred), GraphSize(*memory)
+        self.options = {
+            "inferred": list(inferred),
+            "memory": list(memory),
+            "edge_hidden": list(edge_hidden),
+            "node_hidden": list(node_hidden),
+            "global_hidden": list(global_hidden),
+            "activation": activation,
+        }
+        self.block = GNBlock(
+            observed + self.memory_size,
+            self.inferred_size + self.memory_size,
+            edge_hidden=edge_hidden,
+            node_hidden=node_hidden,
+            global_hidden=global_hidden,
+            activation=activation,
+        )
+
+    def start(self, observed: Graph) -> Graph:
+        """Hidden graph before any observation, for a batch like that of an observation ``[*B, ...]``."""
+        return observed.zeros(self.memory_size)
+
+    def forward(self, observed: Graph, memory: Graph) -> tuple[Graph, Graph]:
+        """One observation: inferred static graph, and hidden graph for the next."""
+        size = self.inferred_size
+        out = self.block(graph_concat(observed, memory))
+        inferred, memory = graph_split(out, (size.nodes, size.edges, size.globals_))
+        bounded = Graph(memory.nodes.tanh(), memory.edges.tanh(), memory.globals_.tanh(), memory.edge_index)
+        return inferred, bounded
+
+
+class BoundInferenceModel(TensorDictModuleBase):
+    """Infer the static graph of one scene's systems from observed transitions.
+
+    Reads a sequence at ``identification``, laid out as TorchRL's trajectories are: ``state`` ``[*B, T, N, 13]``,
+    ``action`` ``[*B, T, A]`` and ``("next", "state")``. Writes a TensorDict ``[*B]`` of the inferred graph at
+    ``static``, where a forward model with ``static="inferred"`` reads it. It is one entry a system: identify once, save
+    it, and use it for any number of rollouts from any state. True static parameters are not read, only what moves.
+
+    Args:
+        model: the weights.
+        bound: the forward model of the scene, whose features and normalisers it shares.
+        observed_key: where the observed sequence is.
+        static_key: where to write the inferred graph.
+    """
+
+    def __init__(
+        self,
+        model: InferenceModel,
+        bound: BoundForwardModel,
+        *,
+        observed_key: NestedKey = "identification",
+        static_key: NestedKey = "static",
+    ) -> None:
+        super().__init__()
+        key = (observed_key,) if isinstance(observed_key, str) else tuple(observed_key)
+        self.model, self.bound = model, bound
+        self.in_keys: list[NestedKey] = [(*key, "state"), (*key, "action"), (*key, "next", "state")]
+        self.out_keys: list[NestedKey] = [static_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write what the observed sequence tells into ``tensordict`` and return it.
+
+        Raises:
+            KeyError: if there is no observed sequence.
+        """
+        state, action, next_state = (tensordict.get(key, None) for key in self.in_keys)
+        if state is None or action is None or next_state is None:
+            raise KeyError(f"The inference model reads {self.in_keys}; there is {list(tensordict.keys(True))}.")
+        return tensordict.set(self.out_keys[0], self.infer(state, action, next_state).static)
+
+    def infer(self, state: Tensor, action: Tensor, next_state: Tensor, memory: Graph | None = None) -> Inferred:
+        """What a sequence of transitions tells.
+
+        Args:
+            state: ``[*B, T, N, 13]``.
+            action: ``[*B, T, A]``, each applied in the state of its step.
+            next_state: ``[*B, T, N, 13]``, what came of it.
+            memory: hidden graph after earlier observations of the same systems; default: none were made.
+
+        Returns:
+            The inferred graph after the last observation.
+
+        Raises:
+            ValueError: if there is no observation, or a shape does not fit the scene.
+        """
+        *_, last = self.observe(state, action, next_state, memory)
+        return last
+
+    def observe(
+        self, state: Tensor, action: Tensor, next_state: Tensor, memory: Graph | None = None
+    ) -> Iterator[Inferred]:
+        """As :meth:`infer`, yielding what is known after each observation."""
+        if state.shape[-3] == 0 or next_state.shape != state.shape:
+            raise ValueError(
+                "The inference model needs at least one transition, states and next states of equal shape; got"
+                f" {list(state.shape)} and {list(next_state.shape)}."
+            )
+        # Features of all steps at once: only the graph network is recurrent.
+        bound = self.bound
+        dynamic = bound.dynamic_graph(state, action)
+        change = bound.model.residual_normalizer(bound.residual(state, next_state), bound.network_dtype)
+        nodes = torch.cat((dynamic.nodes, change * bound.live), dim=-1)
+        for step in range(state.shape[-3]):
+            now = Graph(
+                nodes[..., step, :, :],
+                dynamic.edges[..., step, :, :],
+                dynamic.globals_[..., step, :],
+                dynamic.edge_index,
+            )
+            known = self.model.start(now) if memory is None else memory
+            inferred, memory = self.model(now, known)
+            parts = {"nodes": inferred.nodes, "edges": inferred.edges, "globals_": inferred.globals_}
+            assert memory is not None
+            yield Inferred(TensorDict(parts, batch_size=inferred.globals_.shape[:-1]), memory)
+
+
+class IdentifyingModel(nn.Module):
+    """A forward model and the inference model that tells it what its systems are like, trained together.
+
+    Args:
+        forward_model: with ``static="inferred"``.
+        **options: of :class:`InferenceModel`.
+
+    Raises:
+        ValueError: if the forward model does not read an inferred graph.
+    """
+
+    def __init__(self, forward_model: ForwardModel, **options) -> None:
+        super().__init__()
+        if forward_model.static != "inferred":
+            raise ValueError(f"The forward model reads static={forward_model.static!r}; build it with 'inferred'.")
+        self.forward_model, size = forward_model, forward_model.static_size
+        options["inferred"] = (size.nodes, size.edges, size.globals_)
+        observed = forward_model.dynamic_size + GraphSize(forward_model.layout.delta_size, 0, 0)
+        self.inference = InferenceModel(observed, **options)
+
+    def bind(self, scene: Scene, **options) -> tuple[BoundForwardModel, BoundInferenceModel]:
+        """Both models joined to a scene, the forward model reading at ``"static"`` what the other writes there.
+
+        Args:
+            scene: the scene, whose own static parameters neither reads.
+            **options: of :meth:`ForwardModel.bind`.
+        """
+        bound = self.forward_model.bind(scene, static_key="static", **options)
+        return bound, BoundInferenceModel(self.inference, bound)
+
+    def description(self) -> dict:
+        """Everything needed to build this model again, as plain JSON-able values."""
+        return {"forward_model": self.forward_model.description(), "inference": self.inference.options}
+
+    @classmethod
+    def from_description(cls, description: dict) -> IdentifyingModel:
+        """Build the model that :meth:`description` described, with fresh weights."""
+        return cls(ForwardModel.from_description(description["forward_model"]), **description["inference"])

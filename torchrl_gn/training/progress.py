@@ -1,0 +1,71 @@
+"""What a person at a terminal sees of long work, shared by the recipes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from tqdm import tqdm
+
+from torchrl_gn.training.tracking import Tracker
+from torchrl_gn.training.trainer import Trainer
+
+
+@contextmanager
+def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Progress bar of collecting data, as ``create_dataset(..., progress=...)`` wants it.
+
+    Args:
+        what: what is collected.
+    """
+    with tqdm(desc=f"collecting {what}", unit=" trajectories", leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def train_with_progress(
+    trainer: Trainer,
+    curves: dict[str, list],
+    save: Callable[[], None],
+    tracker: Tracker,
+    *,
+    checkpoint_seconds: float,
+) -> None:
+    """Train to the end with a progress bar, saving now and then, on Ctrl-C and at the end, with the best weights.
+
+    Args:
+        trainer: what trains.
+        curves: ``"seconds"`` and ``"loss"``, extended every 100 steps by the mean loss since then.
+        save: writes a checkpoint.
+        tracker: where losses and validation errors are logged.
+        checkpoint_seconds: training seconds between checkpoints.
+    """
+    saved, losses = trainer.seconds, []
+    bar = tqdm(total=100, initial=int(100 * trainer.fraction), unit="%", desc="training", leave=False)
+    try:
+        for progress in trainer.run():
+            losses.append(progress.loss)
+            if progress.step % 100 == 0:
+                mean = sum(losses) / len(losses)
+                losses.clear()
+                curves["seconds"].append(progress.seconds)
+                curves["loss"].append(mean)
+                tracker.log({"train/loss": mean, "train/seconds": progress.seconds}, progress.step)
+                bar.set_postfix(step=progress.step, loss=f"{mean:.2e}", best20=f"{trainer.best:.2e}")
+                bar.update(int(100 * progress.fraction) - bar.n)
+            if progress.validation is not None:
+                tracker.log({"validation/rollout_error_20": progress.validation}, progress.step)
+            if progress.seconds - saved > checkpoint_seconds:
+                save()
+                saved = progress.seconds
+    except KeyboardInterrupt:
+        save()
+        raise
+    finally:
+        bar.close()
+    trainer.restore_best()
+    save()
