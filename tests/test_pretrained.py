@@ -1,0 +1,40 @@
+"""Every shipped model loads with one call and has the errors that it states."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.evaluation import evaluate_errors
+from torchrl_gn.pretrained import WEIGHTS, load_pretrained, pretrained_names
+from torchrl_gn.scenes import load_scene
+
+
+@pytest.mark.parametrize("name", pretrained_names())
+def test_a_shipped_model_has_the_errors_that_it_states(name):
+    loaded = load_pretrained(name)
+    stated = dict(loaded.metrics)
+    how = stated.pop("evaluation")
+    scene = loaded.scenes()[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # it is at home in its own scene
+        bound = loaded.model.bind(scene)
+    test = collect_trajectories(scene, how["sequences"], how["length"], how["seed"], split=3)
+    errors = evaluate_errors(bound, test)
+    for key, value in stated[scene.name].items():
+        assert errors[key].total == pytest.approx(value, rel=0.05), key
+        assert value < 1
+    for other in stated.keys() - {scene.name}:
+        loaded.model.bind(load_scene(other))
+
+
+def test_there_are_some_and_they_are_small():
+    assert {"cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", "jaco"} <= set(pretrained_names())
+    assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 8e6
+
+
+def test_a_wrong_name_names_the_right_ones():
+    with pytest.raises(ValueError, match=r"no trained model 'swimer6'; use one of .* Did you mean 'swimmer6'\?"):
+        load_pretrained("swimer6")

@@ -1,0 +1,48 @@
+"""Trained models that come with the package."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+from torchrl_gn.training.checkpoint import Checkpoint, load_checkpoint
+
+WEIGHTS = Path(__file__).with_name("weights")
+"""Where they lie."""
+
+
+def pretrained_names() -> list[str]:
+    """Names of all models that come with the package."""
+    return sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
+
+
+def load_pretrained(name: str) -> Checkpoint:
+    """Load a trained model that comes with the package.
+
+    Weights are stored in half precision, which costs nothing that can be seen in their errors, and computed with in
+    single precision.
+
+    Args:
+        name: one of :func:`pretrained_names`, the system that it was trained on.
+
+    Returns:
+        The checkpoint: model, scenes it was trained on, and its errors in ``metrics``.
+
+    Raises:
+        ValueError: if there is none of that name.
+
+    Example:
+        >>> from torchrl_gn.pretrained import load_pretrained
+        >>> checkpoint = load_pretrained("swimmer6")
+        >>> bound = checkpoint.model.bind(checkpoint.scene())
+        >>> checkpoint.metrics["swimmer6"]["rollout_error_100"] < 0.01
+        True
+    """
+    names = pretrained_names()
+    if name not in names:
+        near = difflib.get_close_matches(name, names, 1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"There is no trained model {name!r}; use one of {names}.{hint}")
+    checkpoint = load_checkpoint(WEIGHTS / f"{name}.safetensors")
+    checkpoint.model.float()
+    return checkpoint
