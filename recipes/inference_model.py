@@ -138,7 +138,7 @@ def probe(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestS
     _, inference = model.bind(scene)
     state, action = (cast(Tensor, systems.observed.get(key)) for key in ("state", "action"))
     with torch.no_grad():
-        static = inference.infer(state[:, : cfg.phase], action[:, : cfg.phase], state[:, 1 : cfg.phase + 1]).static
+        static = inference.identify(state[:, : cfg.phase + 1], action[:, : cfg.phase])
     features = torch.cat([cast(Tensor, static.get(part)).flatten(1) for part in ("nodes", "edges", "globals_")], dim=1)
     share = linear_probe(features, torch.from_numpy(systems.parameters), train=int(0.75 * len(features)))
     return dict(zip(systems.names, share.tolist(), strict=True))
@@ -161,8 +161,7 @@ def control_figure(cfg: DictConfig, model: IdentifyingModel, scene: Scene, path:
         states = cast(Tensor, simulator.rollout(start, actions, each).get("state"))
         actions = torch.from_numpy(actions)
         with torch.no_grad():
-            seen = states[:, : cfg.phase], actions[:, : cfg.phase], states[:, 1 : cfg.phase + 1]
-            static = inference.infer(*seen).static
+            static = inference.identify(states[:, : cfg.phase + 1], actions[:, : cfg.phase])
             predicted = bound.rollout(states[:, cfg.phase], actions[:, cfg.phase :], static)
         panels[f"identified {title}"] = (states, predicted)
     return plot_motions(panels, scene, path, labels=("smallest", "middle", "largest"))

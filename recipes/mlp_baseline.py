@@ -73,13 +73,10 @@ def main(cfg: DictConfig) -> None:
     long = {}
     for system, of in screened.items():
         kept = [names[of.index(run)] for run in best(of, "validation_error", cfg.keep)]
-        long[system] = dict(zip(kept, runs(system, kept, cfg.minutes, [first]), strict=True))
-    failed += run_all([run for of in long.values() for run in of.values()], cfg.jobs, desc="training the best")
-    winners = {
-        system: next(name for name, run in of.items() if [run] == best(list(of.values()), "validation_error"))
-        for system, of in long.items()
-        if best(list(of.values()), "validation_error")
-    }
+        long[system] = dict(zip(runs(system, kept, cfg.minutes, [first]), kept, strict=True))
+    failed += run_all([run for of in long.values() for run in of], cfg.jobs, desc="training the best")
+    # None of a system whose runs all failed.
+    winners = {system: of[run] for system, of in long.items() for run in best(list(of), "validation_error")}
     seeds = list(cfg.seeds)
     final = {
         (system, kind): runs(system, [name], cfg.minutes, seeds)

@@ -9,6 +9,7 @@ trajectories of every system that the model was trained on, and of those named b
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import hydra
@@ -29,8 +30,7 @@ def main(cfg: DictConfig) -> None:
     loaded = load_checkpoint(cfg.checkpoint)
     own, file = loaded.scenes(), Path(cfg.file)
     half = loaded.model.half()
-    save_checkpoint(file, half, scene=own, config=loaded.config)
-    model, tables = load_checkpoint(file).model.float(), {}
+    model, tables = copy.deepcopy(half).float(), {}
     for scene in tqdm([*own, *map(load_scene, cfg.also)], desc="evaluating", leave=False):
         test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, split=3)
         tables[scene.name] = evaluate_errors(model.bind(scene), test)

@@ -48,7 +48,7 @@ def identification_errors(
         raise ValueError("Another system takes at least two trajectories.")
     action = cast(Tensor, observed.get("action"))[:, :steps]
     state = cast(Tensor, observed.get("state"))[:, : action.shape[1] + 1]
-    static = inference.infer(state[:, :-1], action, state[:, 1:]).static
+    static = inference.identify(state, action)
     if wrong:
         static = static.apply(lambda value: value.roll(1, 0))
     entries = {key: trajectories.get(key) for key in ("state", "action")}

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import BoundForwardModel, BoundRecurrentModel
+from torchrl_gn.modules import BoundForwardModel
 
 
 def predict(model: TensorDictModuleBase, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> Tensor:
@@ -146,7 +146,7 @@ def guarded_rollout(
     states[:, 0] = current
     for first in range(0, steps, every):
         now = actions[:, first : first + every]
-        if isinstance(model, BoundRecurrentModel):
+        if isinstance(model, BoundForwardModel):
             predicted, memory = model.rollout_and_memory(current, now, static, memory)
         else:
             predicted = _unchecked(model, current, now, static)

@@ -308,6 +308,22 @@ class BoundForwardModel(TensorDictModuleBase):
         self._check_shapes(state, action)
         return self._delta(state, action, folded or self.fold())
 
+    def delta_and_memory(
+        self, state: Tensor, action: Tensor, folded: Folded | None = None, memory: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDictBase | None]:
+        """As :meth:`delta`, with what a recurrent model remembers; this one remembers nothing."""
+        return self.delta(state, action, folded), None
+
+    def rollout_and_memory(
+        self,
+        state: Tensor,
+        actions: Tensor,
+        static: TensorDictBase | None = None,
+        memory: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDictBase | None]:
+        """As :meth:`rollout`, with what a recurrent model remembers at its end; this one remembers nothing."""
+        return self.rollout(state, actions, static), None
+
     def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         return self._settled(state, self._residual(state, action, folded), folded.values)
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded
@@ -30,16 +29,8 @@ class BoundRecurrentModel(BoundForwardModel):
     :meth:`ForwardModel.bind` of a model with ``core="recurrent"``.
     """
 
-    def __init__(
-        self,
-        model: ForwardModel,
-        scene: Scene,
-        *,
-        strict: bool = False,
-        plain: bool = False,
-        static_key: NestedKey | None = None,
-    ) -> None:
-        super().__init__(model, scene, strict=strict, plain=plain, static_key=static_key)
+    def __init__(self, model: ForwardModel, scene: Scene, **options) -> None:
+        super().__init__(model, scene, **options)
         self.in_keys.append("memory")
         self.out_keys.append(("next", "memory"))
 
@@ -62,13 +53,7 @@ class BoundRecurrentModel(BoundForwardModel):
 
     def own_memory(self) -> TensorDict:
         """Memory of nothing, without batch."""
-        size = self.core.memory_size
-        zeros = {
-            "nodes": torch.zeros(self.scene.num_nodes, size.nodes, dtype=self.network_dtype),
-            "edges": torch.zeros(self.scene.num_edges, size.edges, dtype=self.network_dtype),
-            "globals_": torch.zeros(size.globals_, dtype=self.network_dtype),
-        }
-        return TensorDict(zeros).to(self.live.device)
+        return self.core.start(self.static_graph()).tensordict()
 
     def delta_and_memory(
         self, state: Tensor, action: Tensor, folded: Folded | None = None, memory: TensorDictBase | None = None
@@ -91,8 +76,7 @@ class BoundRecurrentModel(BoundForwardModel):
         else:
             normalized = self.model.core(graph_concat(dynamic, static)).nodes
             residual = self.model.residual_normalizer.inverse(normalized)
-        parts = {"nodes": after.nodes, "edges": after.edges, "globals_": after.globals_}
-        return self._settled(state, residual, folded.values), TensorDict(parts, batch_size=state.shape[:-2])
+        return self._settled(state, residual, folded.values), after.tensordict()
 
     def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         return self.delta_and_memory(state, action, folded)[0]

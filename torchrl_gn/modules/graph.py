@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 
@@ -36,6 +37,11 @@ class Graph:
     edges: Tensor
     globals_: Tensor
     edge_index: Tensor
+
+    def tensordict(self) -> TensorDict:
+        """Its features as entries of a TensorDict ``[*B]``."""
+        features = {"nodes": self.nodes, "edges": self.edges, "globals_": self.globals_}
+        return TensorDict(features, batch_size=self.globals_.shape[:-1])
 
     def zeros(self, size: GraphSize) -> Graph:
         """Graph of the same topology and batch whose features are all 0."""

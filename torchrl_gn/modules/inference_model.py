@@ -150,6 +150,15 @@ class BoundInferenceModel(TensorDictModuleBase):
         *_, last = self.observe(state, action, next_state, memory)
         return last
 
+    def identify(self, states: Tensor, actions: Tensor) -> TensorDict:
+        """The inferred graph of whole trajectories.
+
+        Args:
+            states: ``[*B, T + 1, N, 13]``.
+            actions: ``[*B, T, A]``; each leads from a state to the next.
+        """
+        return self.infer(states[..., :-1, :, :], actions, states[..., 1:, :, :]).static
+
     def observe(
         self, state: Tensor, action: Tensor, next_state: Tensor, memory: Graph | None = None
     ) -> Iterator[Inferred]:
@@ -173,9 +182,8 @@ class BoundInferenceModel(TensorDictModuleBase):
             )
             known = self.model.start(now) if memory is None else memory
             inferred, memory = self.model(now, known)
-            parts = {"nodes": inferred.nodes, "edges": inferred.edges, "globals_": inferred.globals_}
             assert memory is not None
-            yield Inferred(TensorDict(parts, batch_size=inferred.globals_.shape[:-1]), memory)
+            yield Inferred(inferred.tensordict(), memory)
 
 
 class IdentifyingModel(nn.Module):

@@ -15,7 +15,6 @@ from torchrl.objectives import LossModule
 from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import (
     BoundForwardModel,
-    BoundRecurrentModel,
     ForwardModel,
     Normalizer,
     SpecializedForwardModel,
@@ -175,15 +174,11 @@ class ForwardModelLoss(LossModule):
         errors, folded = state.new_zeros(len(layout.components)), self.model.fold(static)
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
-            if isinstance(self.model, BoundRecurrentModel):
-                delta, memory = self.model.delta_and_memory(current, action[:, step], folded, memory)
-            else:
-                delta = self.model.delta(current, action[:, step], folded)
+            delta, memory = self.model.delta_and_memory(current, action[:, step], folded, memory)
             errors = errors + self._component_errors(delta, target)
-            if step + 1 < self.forced:
-                current = self._perturb(state[:, min(step + 1, steps - 1)])
-            elif step + 1 < steps:
-                current = layout.apply(current, delta)
+            if step + 1 < steps:
+                forced = step + 1 < self.forced
+                current = self._perturb(state[:, step + 1]) if forced else layout.apply(current, delta)
         errors = errors / steps
         live = self._live_components()
         loss = errors.sum() / live.sum().clamp(min=1)
