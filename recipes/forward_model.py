@@ -44,7 +44,6 @@ from torchrl_gn.training import (
     clean_exit,
     load_checkpoint,
     make_optimizer,
-    save_checkpoint,
 )
 from torchrl_gn.training.progress import collecting, train_with_progress
 
@@ -228,17 +227,9 @@ def main(cfg: DictConfig) -> None:
 
     tasks = make_tasks(cfg, scenes, Path(cfg.data.folder) if cfg.data.folder else run.data)
     trainer = make_trainer(cfg, model, tasks)
-    if begun:
-        trainer.load_state_dict(begun.training)
-    else:
+    if not begun:
         fit_normalizers(cfg, trainer, tasks)
-    curves = begun.training["curves"] if begun else {"seconds": [], "loss": []}
-
-    def save() -> None:
-        state = {**trainer.state_dict(), "curves": curves}
-        save_checkpoint(run.checkpoint, model, scene=scenes, config=options(cfg), training=state)
-
-    train_with_progress(trainer, curves, save, tracker, checkpoint_seconds=cfg.checkpoint_seconds)
+    curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scenes, config=options(cfg))
 
     tables, files = evaluate(cfg, model, tasks, unseen, run.path)
     if curves["seconds"]:

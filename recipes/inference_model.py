@@ -59,7 +59,6 @@ from torchrl_gn.training import (
     clean_exit,
     load_checkpoint,
     make_optimizer,
-    save_checkpoint,
 )
 from torchrl_gn.training.progress import collecting, train_with_progress
 from torchrl_gn.training.sweep import Run, run_all
@@ -217,17 +216,9 @@ def main(cfg: DictConfig) -> None:
             progress=show,
         )
     trainer = make_trainer(cfg, model, scene, dataset)
-    if begun:
-        trainer.load_state_dict(begun.training)
-    else:
+    if not begun:
         trainer.loss.fit_normalizers(trajectory_buffer(dataset.train, batch_size=20_000, seed=cfg.seed).sample())
-    curves = begun.training["curves"] if begun else {"seconds": [], "loss": []}
-
-    def save() -> None:
-        state = {**trainer.state_dict(), "curves": curves}
-        save_checkpoint(run.checkpoint, model, scene=scene, config=options(cfg), training=state)
-
-    train_with_progress(trainer, curves, save, tracker, checkpoint_seconds=cfg.checkpoint_seconds)
+    curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scene, config=options(cfg))
 
     systems = TestSystems(cfg, scene)
     tables, curve = identified_errors(cfg, model, scene, systems)

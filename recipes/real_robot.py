@@ -37,7 +37,6 @@ from torchrl_gn.training import (
     clean_exit,
     load_checkpoint,
     make_optimizer,
-    save_checkpoint,
 )
 from torchrl_gn.training.progress import train_with_progress
 
@@ -119,7 +118,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, chain: JointChain, data: 
 
 
 def train(cfg: DictConfig, name: str, run: RunFolder, chain: JointChain, data: dict, tracker: Tracker):
-    """Train one of the models, or go on with it; the model and its number of steps."""
+    """Train one of the models, or go on with it; the model, its trainer and its checkpoint."""
     path = run.path / name / "checkpoint.safetensors"
     begun = load_checkpoint(path) if path.exists() else None
     if begun:
@@ -137,17 +136,9 @@ def train(cfg: DictConfig, name: str, run: RunFolder, chain: JointChain, data: d
             **options(cfg.model),
         )
     trainer = make_trainer(cfg, model, chain, data)
-    if begun:
-        trainer.load_state_dict(begun.training)
-    else:
+    if not begun:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
-    curves = begun.training["curves"] if begun else {"seconds": [], "loss": []}
-
-    def save() -> None:
-        state = {**trainer.state_dict(), "curves": curves}
-        save_checkpoint(path, model, scene=[cast(Any, chain)], config=options(cfg), training=state)
-
-    train_with_progress(trainer, curves, save, tracker, checkpoint_seconds=cfg.checkpoint_seconds)
+    train_with_progress(trainer, path, begun, tracker, scene=cast(Any, chain), config=options(cfg))
     return model, trainer, path
 
 

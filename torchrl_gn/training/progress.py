@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
+from torchrl_gn.scenes import Scene
+from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
 
@@ -29,21 +33,35 @@ def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
 
 def train_with_progress(
     trainer: Trainer,
-    curves: dict[str, list],
-    save: Callable[[], None],
+    path: Path,
+    begun: Checkpoint | None,
     tracker: Tracker,
     *,
-    checkpoint_seconds: float,
-) -> None:
+    scene: Scene | Sequence[Scene],
+    config: Mapping[str, Any],
+) -> dict[str, list]:
     """Train to the end with a progress bar, saving now and then, on Ctrl-C and at the end, with the best weights.
 
     Args:
         trainer: what trains.
-        curves: ``"seconds"`` and ``"loss"``, extended every 100 steps by the mean loss since then.
-        save: writes a checkpoint.
+        path: the checkpoint to write.
+        begun: the checkpoint to go on from, if the run was begun before.
         tracker: where losses and validation errors are logged.
-        checkpoint_seconds: training seconds between checkpoints.
+        scene: the scene, or scenes, trained on.
+        config: configuration of the run; its ``checkpoint_seconds`` are the training seconds between checkpoints.
+
+    Returns:
+        ``"seconds"`` and mean ``"loss"`` of every 100 steps.
     """
+    curves: dict[str, list] = {"seconds": [], "loss": []}
+    if begun is not None:
+        trainer.load_state_dict(begun.training)
+        curves = begun.training["curves"]
+
+    def save() -> None:
+        state = {**trainer.state_dict(), "curves": curves}
+        save_checkpoint(path, trainer.model, scene=scene, config=config, training=state)
+
     saved, losses = trainer.seconds, []
     bar = tqdm(total=100, initial=int(100 * trainer.fraction), unit="%", desc="training", leave=False)
     try:
@@ -59,7 +77,7 @@ def train_with_progress(
                 bar.update(int(100 * progress.fraction) - bar.n)
             if progress.validation is not None:
                 tracker.log({"validation/rollout_error_20": progress.validation}, progress.step)
-            if progress.seconds - saved > checkpoint_seconds:
+            if progress.seconds - saved > config["checkpoint_seconds"]:
                 save()
                 saved = progress.seconds
     except KeyboardInterrupt:
@@ -69,3 +87,4 @@ def train_with_progress(
         bar.close()
     trainer.restore_best()
     save()
+    return curves
