@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.modules import quaternion
-from torchrl_gn.rewards.bodies import find_body
+from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.rewards.reward import Reward
 from torchrl_gn.scenes.scene import Scene
 
@@ -29,11 +29,12 @@ class Balance(Reward):
         bodies: names of the bodies, summed over.
         target: ``[4]`` or ``[len(bodies), 4]`` balanced orientation, w-first, world
             frame; any non-zero norm. Default: the identity, which is upright for bodies
-            that the model file draws standing, as the suite's poles.
+            that the model file draws standing, as the suite's poles, acrobot and walker.
+            Upside down in the plane of those is ``[0, 0, 1, 0]``, half a turn about y.
 
     Raises:
-        ValueError: the scene has no such body, or ``target`` has another shape or a
-            quaternion of norm zero.
+        ValueError: the scene has no such body, ``bodies`` is no list of different ones, or ``target``
+            has another shape or a quaternion that is not finite or of norm zero.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -45,35 +46,25 @@ class Balance(Reward):
         True
     """
 
-    node: Tensor
-    offset: Tensor
     target: Tensor
 
     def __init__(self, scene: Scene, bodies: Sequence[str], *, target: np.ndarray | Tensor | None = None):
         super().__init__()
-        if isinstance(bodies, str) or not bodies:
-            raise ValueError(f"bodies must be a list of body names, got {bodies!r}")
-        found = [find_body(scene, name) for name in bodies]
-        self.bodies = tuple(bodies)
-        self.scene_name = scene.name
+        self.bodies = Bodies(scene, bodies)
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
         wanted = identity if target is None else torch.as_tensor(target, dtype=torch.float64)
-        if wanted.shape not in {(4,), (len(found), 4)}:
-            raise ValueError(f"target must be [4] or [{len(found)}, 4], got {list(wanted.shape)}")
+        if wanted.shape not in {(4,), (len(bodies), 4)}:
+            raise ValueError(f"target must be [4] or [{len(bodies)}, 4], got {list(wanted.shape)}")
         norm = wanted.norm(dim=-1, keepdim=True)
         if not bool((norm > 0).all() and wanted.isfinite().all()):
             raise ValueError(f"target must hold finite quaternions of non-zero norm, got {wanted.tolist()}")
-        # Float64 buffers are cast to the states' dtype in `forward`: exact for either.
-        self.register_buffer("node", torch.tensor([body.node for body in found]))
-        self.register_buffer("offset", torch.stack([torch.as_tensor(b.quat, dtype=torch.float64) for b in found]))
-        self.register_buffer("target", (wanted / norm).expand(len(found), 4).clone())
+        # A float64 buffer is cast to the states' dtype in `forward`: exact for either.
+        self.register_buffer("target", (wanted / norm).expand(len(bodies), 4).clone())
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         """Reward ``[*B, 1]``, radians; see :class:`Reward`. Only ``next_state`` is read."""
-        orientation = next_state.index_select(-2, self.node)[..., 3:7]
-        orientation = quaternion.product(orientation, self.offset.to(next_state.dtype))
-        angle = quaternion.angle(orientation, self.target.to(next_state.dtype))
+        angle = quaternion.angle(self.bodies.orientation(next_state), self.target.to(next_state.dtype))
         return -angle.sum(-1, keepdim=True)
 
     def extra_repr(self) -> str:
-        return f"scene={self.scene_name!r}, bodies={self.bodies}"
+        return f"scene={self.bodies.scene_name!r}, bodies={self.bodies.names}"

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.modules import BODY_STATE, quaternion
+from torchrl_gn.modules.float64_buffers import Float64Buffers
 from torchrl_gn.scenes.scene import Attachment, Scene
+
+_POSITION, _ORIENTATION = BODY_STATE.slices["position"], BODY_STATE.slices["orientation"]
+_LINEAR, _ANGULAR = BODY_STATE.slices["linear_velocity"], BODY_STATE.slices["angular_velocity"]
 
 
 def find_body(scene: Scene, name: str) -> Attachment:
@@ -18,11 +27,92 @@ def find_body(scene: Scene, name: str) -> Attachment:
         The node and the offset, the identity for a node's own name.
 
     Raises:
+        TypeError: it is no :class:`~torchrl_gn.scenes.Scene` but a robot known by its joints alone: there are
+            no body states to read.
         ValueError: the scene has no body of this name.
     """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"rewards read the states of a Scene's bodies, which {type(scene).__name__} has not got")
     if name in scene.node_names:
         return Attachment(scene.node_names.index(name), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     if name in scene.attachments:
         return scene.attachments[name]
     known = ", ".join([*scene.node_names, *scene.attachments])
     raise ValueError(f"scene {scene.name!r} has no body {name!r}; it has: {known}")
+
+
+class Bodies(Float64Buffers):
+    r"""Reads where named bodies are, and how they move, out of states ``[*B, N, 13]``.
+
+    A body welded into a node at a fixed offset :math:`(p, q)` moves with the node's frame
+    :math:`(x, R, v, \omega)`: it is at :math:`x + R p`, turned by :math:`R q`, and moves at
+    :math:`v + \omega \times R p` and :math:`\omega`. All in the world frame, of the body's own
+    frame (MuJoCo's ``xpos`` and ``xquat``), not of its centre of mass. Differentiable in the
+    states; a cast of the module leaves the offsets in float64, states give the dtype.
+
+    Args:
+        scene: the scene.
+        names: ``K`` names of bodies, as :func:`find_body` takes them.
+
+    Raises:
+        ValueError: ``names`` is no list of names or has one twice, or the scene has no such body; when
+            reading, states of another scene's size.
+
+    Example:
+        >>> from torchrl_gn.scenes import load_scene
+        >>> scene = load_scene("jaco")
+        >>> Bodies(scene, ["jaco_hand/hand"]).position(torch.zeros(5, scene.num_nodes, 13)).shape
+        torch.Size([5, 1, 3])
+    """
+
+    node: Tensor
+    offset: Tensor
+    turn: Tensor
+
+    def __init__(self, scene: Scene, names: Sequence[str]):
+        super().__init__()
+        if isinstance(names, str) or not names:
+            raise ValueError(f"bodies must be a list of body names, got {names!r}")
+        if len(set(names)) < len(names):
+            raise ValueError(f"bodies must be different ones, got {list(names)}")
+        found = [find_body(scene, name) for name in names]
+        self.names, self.scene_name, self.num_nodes = tuple(names), scene.name, scene.num_nodes
+        offset, turn = np.stack([body.pos for body in found]), np.stack([body.quat for body in found])
+        self.constants({"node": [body.node for body in found], "offset": offset, "turn": turn})
+        # Nearly always there is nothing to add: no operations, no lost digits.
+        self._is_shifted, self._is_turned = bool(np.any(offset != 0)), bool(np.any(turn[:, 1:] != 0))
+
+    def position(self, state: Tensor) -> Tensor:
+        """``[*B, K, 3]`` positions in metres of states ``[*B, N, 13]``."""
+        nodes = self._nodes(state)
+        position = nodes[..., _POSITION]
+        return position + self._arm(nodes) if self._is_shifted else position
+
+    def orientation(self, state: Tensor) -> Tensor:
+        """``[*B, K, 4]`` unit quaternions, w-first and of either sign, of states ``[*B, N, 13]``."""
+        orientation = self._nodes(state)[..., _ORIENTATION]
+        return quaternion.product(orientation, self.turn.to(state.dtype)) if self._is_turned else orientation
+
+    def linear_velocity(self, state: Tensor) -> Tensor:
+        """``[*B, K, 3]`` velocities of the frames' origins in m/s of states ``[*B, N, 13]``."""
+        nodes = self._nodes(state)
+        velocity = nodes[..., _LINEAR]
+        return velocity + torch.linalg.cross(nodes[..., _ANGULAR], self._arm(nodes)) if self._is_shifted else velocity
+
+    def angular_velocity(self, state: Tensor) -> Tensor:
+        """``[*B, K, 3]`` angular velocities in rad/s of states ``[*B, N, 13]``."""
+        return self._nodes(state)[..., _ANGULAR]
+
+    def _nodes(self, state: Tensor) -> Tensor:
+        """States ``[*B, K, 13]`` of the nodes that carry the bodies."""
+        if state.shape[-2:] != (self.num_nodes, BODY_STATE.size):
+            wanted = f"[*B, {self.num_nodes}, {BODY_STATE.size}]"
+            raise ValueError(f"states of scene {self.scene_name!r} must be {wanted}, got {list(state.shape)}")
+        return state.index_select(-2, self.node)
+
+    def _arm(self, nodes: Tensor) -> Tensor:
+        """``[*B, K, 3]`` from the nodes' origins to the bodies', world frame."""
+        return quaternion.rotate(nodes[..., _ORIENTATION], self.offset.to(nodes.dtype))
+
+    def extra_repr(self) -> str:
+        return f"scene={self.scene_name!r}, names={self.names}"

@@ -2,38 +2,58 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from types import MappingProxyType
 
 from torchrl_gn.rewards.balance import Balance
+from torchrl_gn.rewards.imitate_pose import ImitatePose
+from torchrl_gn.rewards.motion import AngularSpeed, Position, Velocity, VerticalDistance
+from torchrl_gn.rewards.reach import Reach
 from torchrl_gn.rewards.reward import Reward
 from torchrl_gn.scenes.scene import Scene
 
-
-def _pendulum_balance(scene: Scene) -> Reward:
-    return Balance(scene, ["pole"])
-
+_WALKER_UPRIGHT = ("torso", "right_thigh", "left_thigh", "right_leg", "left_leg")
+_WALKER_FEET = ("right_foot", "left_foot")
 
 # (system, task) -> how to build the reward; one line a row of the paper's table.
 _REWARDS: MappingProxyType[tuple[str, str], Callable[[Scene], Reward]] = MappingProxyType(
     {
-        ("pendulum", "balance"): _pendulum_balance,
+        ("pendulum", "balance"): lambda scene: Balance(scene, ["pole"]),
+        ("cartpole", "balance"): lambda scene: Balance(scene, ["pole_1"]),
+        ("acrobot", "swing_up"): lambda scene: Balance(scene, ["upper_arm", "lower_arm"]),
+        ("swimmerN", "reach"): lambda scene: Reach(scene, "head"),
+        ("cheetah", "forward"): lambda scene: Velocity(scene, "torso", "x"),
+        ("cheetah", "height"): lambda scene: Position(scene, "torso", "z"),
+        ("cheetah", "vertical_speed"): lambda scene: Velocity(scene, "torso", "z", power=2),
+        ("cheetah", "spin"): lambda scene: AngularSpeed(scene, "torso"),
+        ("walker2d", "forward"): lambda scene: Velocity(scene, "torso", "x"),
+        ("walker2d", "height"): lambda scene: Position(scene, "torso", "z"),
+        ("walker2d", "inverse_verticality"): lambda scene: Balance(scene, _WALKER_UPRIGHT),
+        ("walker2d", "feet_to_head"): lambda scene: VerticalDistance(scene, _WALKER_FEET, "torso"),
+        ("jaco", "palm_pose"): lambda scene: ImitatePose(scene, ["jaco_hand/hand"]),
+        # Paper: "13 variables x 9 bodies": those that move, welded ones together.
+        ("jaco", "full_pose"): lambda scene: ImitatePose(scene, scene.node_names[1:]),
     }
 )
 
 
 def available_rewards() -> tuple[tuple[str, str], ...]:
-    """Every ``(system, task)`` that :func:`make_reward` knows."""
+    """Every ``(system, task)`` that :func:`make_reward` knows; ``"swimmerN"`` stands for every number of links."""
     return tuple(_REWARDS)
 
 
 def make_reward(task: str, scene: Scene) -> Reward:
     """Reward of a task of the paper, bound to a scene (paper, SM "Planning configuration").
 
+    Paper: Walker2d's ``"inverse_verticality"`` has its name from there, and is what its text there says, "same as
+    Pendulum-Balance summed for torso, thighs and legs": it is largest where the walker stands. For one on its head
+    use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
+
     Args:
         task: the task's name, for example ``"balance"``.
-        scene: a scene of one of the paper's systems. For a scene of your own build the
-            reward itself: ``Balance(scene, ["my_pole"])``.
+        scene: a scene of one of the paper's systems, its random variants too. For a scene of your own
+            build the reward itself: ``Balance(scene, ["my_pole"])``.
 
     Returns:
         The reward, bound to the scene's bodies.
@@ -46,9 +66,13 @@ def make_reward(task: str, scene: Scene) -> Reward:
         >>> from torchrl_gn.scenes import load_scene
         >>> make_reward("balance", load_scene("pendulum"))
         Balance(scene='pendulum', bodies=('pole',))
+        >>> make_reward("reach", load_scene("swimmer3"))
+        Reach(scene='swimmer3', body='head', shaping=0.01)
     """
-    builder = _REWARDS.get((scene.origin.get("system", scene.name), task))
+    system = scene.origin.get("system", scene.name)
+    family = "swimmerN" if re.fullmatch(r"swimmer\d+", system) else system
+    builder = _REWARDS.get((family, task))
     if builder is None:
-        known = ", ".join(f"{name} ({system})" for system, name in available_rewards())
+        known = ", ".join(f"{name} ({of})" for of, name in available_rewards())
         raise ValueError(f"no reward {task!r} for scene {scene.name!r}; there are: {known}")
     return builder(scene)
