@@ -14,7 +14,8 @@ from torchrl_gn.scenes.contact_points import SLOTS, contact_slots
 
 def features(scene, state):
     offset, radius, mask = (torch.as_tensor(value) for value in contact_slots(scene))
-    return Contacts(scene)(state, offset, radius).unflatten(-1, (SLOTS, 6)), mask
+    matrices = quaternion.to_matrix(state[..., 3:7]).unflatten(-1, (3, 3))
+    return Contacts(scene)(state, matrices, offset, radius).unflatten(-1, (SLOTS, 6)), mask
 
 
 @pytest.mark.parametrize("name", ["cheetah", "walker2d"])

@@ -149,17 +149,17 @@ def test_where_the_world_can_be_touched_it_shows_the_heading(make_model, random_
     bound = make_model(scene).bind(scene)
     assert scene.heading is not None and not scene.heading.exact
     state = random_states(scene, 5)
-    seen = bound.frame.local(state, bound.values)
+    seen = bound.frame.see(state, bound.values).state
     rest = torch.as_tensor(scene.heading.rest).expand(5, 4)
-    turn = bound.frame.heading_turn(state, bound.values)
+    turn = bound.frame.heading_turn(state, bound.values).rotation
     assert turn is not None
     torch.testing.assert_close(seen[:, 0, 3:7], quaternion.product(quaternion.conjugate(turn), state[:, 0, 3:7]))
     unmoved = make_model(load_scene(ARM)).bind(load_scene(ARM))
-    free = unmoved.frame.local(state, unmoved.values)
+    free = unmoved.frame.see(state, unmoved.values).state
     assert torch.equal(free[:, 0], state[:, 0])
     assert torch.equal(free[:, 1:], seen[:, 1:])
     state[:, 1, 3:7] = rest
-    torch.testing.assert_close(bound.frame.local(state, bound.values), state, rtol=0, atol=1e-12)
+    torch.testing.assert_close(bound.frame.see(state, bound.values).state, state, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -409,19 +409,21 @@ def test_joint_axes_turn_with_the_scene(scenes, make_model, random_states, rando
     scene = scenes["jaco"] if "jaco" in scenes else load_scene("jaco")
     bound = make_model(scene, joint_axes=True).bind(scene)
     state, action = random_states(scene, 5), random_actions(scene, 5)
-    features = bound.frame.features(state, action, bound.values)[1]
+    features = bound.frame.features(bound.frame.see(state, bound.values), action, bound.values)[1]
     assert features.shape == (5, scene.num_edges, 7)
     axes, pushes = features[..., 1:4], features[..., 4:]
     torch.testing.assert_close(axes.norm(dim=-1), torch.ones(5, scene.num_edges, dtype=axes.dtype))
     torch.testing.assert_close(pushes, features[..., :1] * axes)
     # With the place and heading as they are, every body turned by one rotation turns every axis.
     bound = make_model(scene, align=False).bind(scene)
-    axes = bound.frame.features(state, action, bound.values)[1][..., 1:4]
+    axes = bound.frame.features(bound.frame.see(state, bound.values), action, bound.values)[1][..., 1:4]
     turn = quaternion.exp(torch.tensor([0.3, -0.5, 0.8], dtype=state.dtype))
     turned = state.clone()
     turned[..., 3:7] = quaternion.product(turn, state[..., 3:7])
     matrix = quaternion.to_matrix(turn).reshape(3, 3)
-    torch.testing.assert_close(bound.frame.features(turned, action, bound.values)[1][..., 1:4], axes @ matrix.T)
+    torch.testing.assert_close(
+        bound.frame.features(bound.frame.see(turned, bound.values), action, bound.values)[1][..., 1:4], axes @ matrix.T
+    )
 
 
 def test_actions_beyond_the_limits_do_what_those_at_the_limits_do(scenes, make_model, random_states, random_actions):

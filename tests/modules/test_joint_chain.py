@@ -58,7 +58,7 @@ def test_several_commands_a_joint(robot):
     options = {"layout": joint_layout(), "joint_axes": False, "contacts": False, **SMALL}
     bound = ForwardModel(FeatureSet.of(doubled), controls=2, **options).bind(doubled)
     action = torch.arange(18.0).expand(len(data), 18)
-    _, controls = bound.frame.features(data["state"][:, 0], action, bound.values)
+    _, controls = bound.frame.features(bound.frame.see(data["state"][:, 0], bound.values), action, bound.values)
     assert controls[0].tolist() == [[2 * (e // 2), 2 * (e // 2) + 1] for e in range(18)]
     with pytest.raises(ValueError, match="controls=2"):
         ForwardModel(FeatureSet.of(doubled), controls=2)

@@ -36,7 +36,7 @@ LINKED = [*SYSTEMS, CREATURE]
 
 
 def link(bound, state, delta):
-    return bound.linking(state, delta, bound.model.delta_normalizer.std, bound.values)
+    return bound.linking(state, bound.frame.matrices(state), delta, bound.model.delta_normalizer.std, bound.values)
 
 
 def gaps(scene, state):
@@ -120,9 +120,10 @@ def test_linking_by_joints_takes_noise_away(make_model, name):
     generator = torch.Generator().manual_seed(0)
     noisy = delta + 0.1 * std * torch.randn(delta.shape, generator=generator, dtype=torch.float64) * bound.live
     seen = std > 1e-9
+    seen_from = states[:, :-1], bound.frame.matrices(states[:, :-1])
     left = [
-        ((by(states[:, :-1], noisy, std, bound.values) - delta)[..., seen] / std[seen]).square().mean()
-        for by in (JointLinking(scene), Linking(scene), lambda _, change, *__: change)
+        ((by(*seen_from, noisy, std, bound.values) - delta)[..., seen] / std[seen]).square().mean()
+        for by in (JointLinking(scene), Linking(scene), lambda _, __, change, *___: change)
     ]
     assert left[0] < 0.9 * left[1] < 0.8 * left[2]
 
@@ -137,7 +138,8 @@ def test_in_the_plane_both_ways_are_the_same(make_model, name):
     generator = torch.Generator().manual_seed(0)
     raw = 1e-4 * torch.randn(4, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * bound.live
     std = torch.ones(12, dtype=torch.float64)
-    ours, theirs = (by(state, raw, std, bound.values) for by in (JointLinking(scene), Linking(scene)))
+    matrices = bound.frame.matrices(state)
+    ours, theirs = (by(state, matrices, raw, std, bound.values) for by in (JointLinking(scene), Linking(scene)))
     assert (ours - theirs).norm() < 1e-3 * raw.norm()
 
 
@@ -149,7 +151,8 @@ def test_gradients_of_linking_by_joints(make_model):
     raw = 1e-2 * torch.randn(1, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * bound.live
     std = torch.ones(12, dtype=torch.float64)
     assert torch.autograd.gradcheck(
-        lambda delta: bound.linking(state, delta * bound.live, std, bound.values), (raw.requires_grad_(),)
+        lambda delta: bound.linking(state, bound.frame.matrices(state), delta * bound.live, std, bound.values),
+        (raw.requires_grad_(),),
     )
 
 
@@ -177,11 +180,15 @@ def test_levers_are_the_derivative_of_places(make_model, name):
     turn = torch.randn(2, scene.num_nodes, 3, generator=generator, dtype=torch.float64) * live[:, 9:]
     still = torch.zeros_like(turn)
 
-    arms = bound.linking.arms(state, bound.values)
+    arms = bound.linking.arms(bound.frame.matrices(state), bound.values)
+
+    root = torch.as_tensor(scene.linkage.root)
+    together = (root[:, None] == root).double()
+    mean, root_moves = together / together.sum(1, keepdim=True), live[root, :3]
 
     def apart(turn):
-        places = bound.linking.pins(state, arms, turn, still)[1][..., :3]
-        return places - torch.where(bound.linking.root_moves, bound.linking.mean @ places, still)
+        places = bound.linking.pins(state, arms, turn, still)[1][:, 0].view_as(turn)
+        return places - torch.where(root_moves, mean @ places, still)
 
     moved = torch.zeros_like(turn).flatten(1)
     turned = turn.flatten(1)[:, bound.linking.turning].unsqueeze(-1)

@@ -250,7 +250,7 @@ def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, no
     if model.integrate:
         target = BODY_STATE.residual(state, target, loss.model.timestep)
     if model.align:
-        turn = loss.model.frame.heading_turn(state, loss.model.values)
+        turn = loss.model.frame.heading_turn(state, loss.model.values).rotation
         target = BODY_STATE.turn_delta(target, quaternion.conjugate(turn))
     live = loss.model.live
     targets = model.residual_normalizer(target)

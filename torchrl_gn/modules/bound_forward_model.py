@@ -16,7 +16,7 @@ from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.joint_linking import make_linking
-from torchrl_gn.modules.local_frame import LocalFrame
+from torchrl_gn.modules.local_frame import LocalFrame, Seen
 from torchrl_gn.scenes.scene_values import SceneValues, topology
 
 if TYPE_CHECKING:
@@ -325,24 +325,27 @@ class BoundForwardModel(TensorDictModuleBase):
         return self.rollout(state, actions, static), None
 
     def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
-        return self._settled(state, self._residual(state, action, folded), folded.values)
+        seen = self.frame.see(state, folded.values)
+        return self._settled(state, self._residual(seen, action, folded), seen, folded.values)
 
-    def _settled(self, state: Tensor, residual: Tensor, values: SceneValues) -> Tensor:
+    def _settled(self, state: Tensor, residual: Tensor, seen: Seen, values: SceneValues) -> Tensor:
         """Change of the state ``[*B, N, 12]`` from what the network predicts, in the world frame."""
         residual = residual.to(state.dtype)
-        turn = self.frame.heading_turn(state, values)
-        if turn is not None:
-            residual = self.layout.turn_delta(residual, turn)
+        if seen.turn is not None:
+            residual = self.layout.turn_delta(residual, *seen.turn)
         if self.model.integrate:
             residual = self.layout.integrate(state, residual, self.timestep)
         delta = residual * self.live
         if self.linking is not None:
-            delta = self.linking(state, delta, self.model.delta_normalizer.std, values)
+            # Where nothing was turned the network's matrices are the world's.
+            matrices = seen.matrices if seen.turn is None else self.frame.matrices(state)
+            assert matrices is not None
+            delta = self.linking(state, matrices, delta, self.model.delta_normalizer.std, values)
         return delta
 
-    def _residual(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
+    def _residual(self, seen: Seen, action: Tensor, folded: Folded) -> Tensor:
         """What the network predicts ``[*B, N, 12]``, in the local frame."""
-        dynamic = self.dynamic_graph(state, action, folded.values)
+        dynamic = self._dynamic_graph(seen, action, folded.values)
         if folded.core is not None:
             return self.model(dynamic, folded.core)
         normalized = self.model.core(graph_concat(dynamic, self.static_graph(folded.values))).nodes
@@ -351,8 +354,12 @@ class BoundForwardModel(TensorDictModuleBase):
     def dynamic_graph(self, state: Tensor, action: Tensor, values: SceneValues | None = None) -> Graph:
         """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
         self._check_shapes(state, action)
+        values = values or self.values
+        return self._dynamic_graph(self.frame.see(state, values), action, values)
+
+    def _dynamic_graph(self, seen: Seen, action: Tensor, values: SceneValues) -> Graph:
         dtype, model = self.network_dtype, self.model
-        encoded, controls = self.frame.features(state, action, values or self.values)
+        encoded, controls = self.frame.features(seen, action, values)
         globals_ = encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype)
         nodes, edges = model.node_normalizer(encoded, dtype), model.edge_normalizer(controls, dtype)
         return Graph(nodes, edges, globals_, self.edge_index)
@@ -417,7 +424,7 @@ class BoundForwardModel(TensorDictModuleBase):
             if given is not None:
                 require_finite(given, what)
         values = self._read(static)
-        encoded, controls = self.frame.features(state, action, values)
+        encoded, controls = self.frame.features(self.frame.see(state, values), action, values)
         self.model.node_normalizer.update(encoded)
         self.model.edge_normalizer.update(controls)
         self.model.delta_normalizer.update(self.layout.delta(state, next_state), self.live)
@@ -428,7 +435,9 @@ class BoundForwardModel(TensorDictModuleBase):
         delta = self.layout.delta(state, next_state)
         residual = self.layout.residual(state, delta, self.timestep) if self.model.integrate else delta
         turn = self.frame.heading_turn(state, values or self.values)
-        return residual if turn is None else self.layout.turn_delta(residual, quaternion.conjugate(turn))
+        if turn is None:
+            return residual
+        return self.layout.turn_delta(residual, quaternion.conjugate(turn.rotation), turn.matrix.mT)
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"

@@ -67,7 +67,8 @@ class BoundRecurrentModel(BoundForwardModel):
             memory: of the states before; by default there were none.
         """
         folded = folded or self.fold()
-        dynamic, static = self.dynamic_graph(state, action, folded.values), self.static_graph(folded.values)
+        seen = self.frame.see(state, folded.values)
+        dynamic, static = self._dynamic_graph(seen, action, folded.values), self.static_graph(folded.values)
         before = self.core.start(dynamic) if memory is None else _graph(memory, self.edge_index)
         after = self.core.remember(dynamic, static, before)
         dynamic = graph_concat(dynamic, after)
@@ -76,7 +77,7 @@ class BoundRecurrentModel(BoundForwardModel):
         else:
             normalized = self.model.core(graph_concat(dynamic, static)).nodes
             residual = self.model.residual_normalizer.inverse(normalized)
-        return self._settled(state, residual, folded.values), after.tensordict()
+        return self._settled(state, residual, seen, folded.values), after.tensordict()
 
     def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         return self.delta_and_memory(state, action, folded)[0]

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.float64_buffers import Float64Buffers
 from torchrl_gn.modules.state_layout import BODY_STATE
 from torchrl_gn.scenes.contact_points import SLOTS, contact_slots
@@ -40,6 +39,7 @@ class Contacts(Float64Buffers):
         super().__init__()
         self.timestep = float(scene.timestep)
         points = scene.contact_points
+        self.any = points is not None
         _, _, mask = contact_slots(scene)
         values = {
             "mask": mask,
@@ -48,11 +48,12 @@ class Contacts(Float64Buffers):
         }
         self.constants(values)
 
-    def forward(self, state: Tensor, offset: Tensor, radius: Tensor) -> Tensor:
+    def forward(self, state: Tensor, matrices: Tensor, offset: Tensor, radius: Tensor) -> Tensor:
         """Features of every node.
 
         Args:
             state: ``[*B, N, 13]``, the world first: the plane is fixed to it.
+            matrices: ``[*B, N, 3, 3]`` of the orientations in it.
             offset: ``[N, 4, 3]`` or ``[*B, N, 4, 3]`` points in the nodes' frames, metres.
             radius: ``[N, 4]`` or ``[*B, N, 4]``.
 
@@ -60,13 +61,13 @@ class Contacts(Float64Buffers):
             ``[*B, N, 24]``: for every point its distance from the plane, the same finely where it is
             small, where it will be a control step on, and its velocity; 0 where there is no point.
         """
+        if not self.any:
+            return state.new_zeros((*state.shape[:-1], self.size))
         at = BODY_STATE.slices
         position, velocity = state[..., at["position"]], state[..., at["linear_velocity"]]
-        world = state[..., :1, at["orientation"]]
-        normal = quaternion.rotate(world, self.normal.to(state.dtype)).unsqueeze(-2)  # [*B, 1, 1, 3]
-        origin = quaternion.rotate(world, self.origin.to(state.dtype)) + position[..., :1, :]
-        frame = quaternion.to_matrix(state[..., at["orientation"]]).unflatten(-1, (3, 3))
-        arm = offset.to(state.dtype) @ frame.mT  # [*B, N, 4, 3]
+        plane = torch.stack((self.normal, self.origin)).to(state.dtype) @ matrices[..., :1, :, :].mT  # [*B, 1, 2, 3]
+        normal, origin = plane[..., :1, :], plane[..., 1, :] + position[..., :1, :]
+        arm = offset.to(state.dtype) @ matrices.mT  # [*B, N, 4, 3]
         spin = state[..., at["angular_velocity"]].unsqueeze(-2).expand_as(arm)
         moving = velocity.unsqueeze(-2) + torch.linalg.cross(spin, arm)
         away = ((position - origin).unsqueeze(-2) + arm) * normal

@@ -73,14 +73,14 @@ class JointLinking(Linking):
         self._order = [(int(n), int(linkage.parent[n])) for n in range(count) if linkage.parent[n] != n]
         self._two_stages = bool((stage == 1).any())
 
-    def forward(self, state: Tensor, delta: Tensor, std: Tensor, values: SceneValues) -> Tensor:
+    def forward(self, state: Tensor, matrices: Tensor, delta: Tensor, std: Tensor, values: SceneValues) -> Tensor:
         """The nearest change of joint angles and rates; arguments and result as of ``Linking``."""
         at, to = BODY_STATE.slices, BODY_STATE.delta_slices
         weight = position_weight(std).to(state.dtype)
         place = state[..., at["position"]] + delta[..., to["position"]]
         velocity = state[..., at["linear_velocity"]] + delta[..., to["linear_velocity"]]
         speed = state[..., at["angular_velocity"]] + delta[..., to["angular_velocity"]]
-        axes, arms = self._axes(state, values), self.arms(state, values)
+        axes, arms = self._axes(matrices, values), self.arms(matrices, values)
 
         # Angles: what each pair of bodies says about its joint, then one Gauss-Newton step of all.
         predicted = quaternion.exp(delta[..., to["orientation"]])
@@ -90,25 +90,27 @@ class JointLinking(Linking):
         turned = self._compose(axes, angles)
         here = self._turn(turned, axes, arms)
         missing = quaternion.log(quaternion.product(predicted, quaternion.conjugate(turned)))
-        gaps = self._gap(place, self._along(here[1]))
+        gaps = self._gap(place.flatten(-2), self._along(here[1]))
         angles = angles + self._solve(*here, missing, gaps, weight)
         turned = self._compose(axes, angles)
         axes, arms = self._turn(turned, axes, arms)
-        shift = place - self._gap(place, self._along(arms)) - state[..., at["position"]]
+        gaps = self._gap(place.flatten(-2), self._along(arms))
+        shift = place - gaps.view_as(place) - state[..., at["position"]]
 
         # Rates: linear, where the joints are now.
-        rates = self._solve(axes, arms, speed, self._gap(velocity, torch.zeros_like(velocity)), weight)
+        moved = velocity.flatten(-2)
+        rates = self._solve(axes, arms, speed, self._gap(moved, torch.zeros_like(moved)), weight)
         speed = (self._turning(axes) @ rates.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 3))
         both = torch.stack((speed[..., self.parent, :], speed), dim=-3)
         along = self._along(torch.linalg.cross(both, arms))
-        push = velocity - self._gap(velocity, along) - state[..., at["linear_velocity"]]
+        push = velocity - self._gap(moved, along).view_as(velocity) - state[..., at["linear_velocity"]]
         spin = speed - state[..., at["angular_velocity"]]
         return torch.cat((shift, quaternion.log(turned), push, spin), dim=-1) * self.live
 
-    def _axes(self, state: Tensor, values: SceneValues) -> Tensor:
+    def _axes(self, matrices: Tensor, values: SceneValues) -> Tensor:
         """Axes of all degrees of freedom ``[*B, K, 3]`` in the world frame."""
-        axis = torch.where(self.hinged, values.joint_axis[..., self.dof_edge, :], self.own_axis).to(state.dtype)
-        carried = quaternion.rotate(state[..., self.dof_carrier, BODY_STATE.slices["orientation"]], axis)
+        axis = torch.where(self.hinged, values.joint_axis[..., self.dof_edge, :], self.own_axis).to(matrices.dtype)
+        carried = (matrices[..., self.dof_carrier, :, :] @ axis.unsqueeze(-1)).squeeze(-1)
         return torch.where(self.hinged, carried, axis)
 
     def _turn(self, turned: Tensor, axes: Tensor, arms: Tensor) -> tuple[Tensor, Tensor]:
@@ -134,14 +136,14 @@ class JointLinking(Linking):
         return (self.reach.to(axes.dtype).unsqueeze(-2) * axes.mT.unsqueeze(-3)).flatten(-3, -2)
 
     def _solve(self, axes: Tensor, arms: Tensor, turns: Tensor, gaps: Tensor, weight: Tensor) -> Tensor:
-        """Rates ``[*B, K]`` whose turning ``[*B, N, 3]`` and moving ``[*B, N, 3]`` of the bodies is nearest."""
+        """Rates ``[*B, K]`` whose turning ``[*B, N, 3]`` and moving ``[*B, 3 N]`` of the bodies is nearest."""
         turning = self._turning(axes)
         moving = self.moves(arms) @ turning[..., self.turning, :]
         pull = torch.cat((turning.mT, weight * moving.mT), dim=-1)
         normal = turning.mT @ turning + weight * (moving.mT @ moving)
         # Two parallel hinges at one place would share their turn: a little of nothing settles it.
         normal = normal + 1e-12 * torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
-        wanted = torch.cat((turns.flatten(-2), gaps.flatten(-2)[..., self.placed]), dim=-1).unsqueeze(-1)
+        wanted = torch.cat((turns.flatten(-2), gaps[..., self.placed]), dim=-1).unsqueeze(-1)
         return torch.linalg.solve_ex(normal, pull @ wanted)[0].squeeze(-1)
 
 

@@ -35,10 +35,8 @@ class Linking(Float64Buffers):
     """
 
     parent: Tensor
-    chain: Tensor
-    mean: Tensor
-    root: Tensor
-    root_moves: Tensor
+    sums: Tensor
+    apart: Tensor
     turning: Tensor
     lever_arms: Tensor
     placed: Tensor
@@ -50,28 +48,32 @@ class Linking(Float64Buffers):
         super().__init__()
         linkage = scene.linkage
         together = linkage.root[:, None] == linkage.root
+        mean, root = together / together.sum(1, keepdims=True), np.eye(scene.num_nodes)[linkage.root]
+        root_moves = scene.live[linkage.root, :3]
+        # Where a linkage as a whole is: the mean opinion of its bodies, or its root's where that cannot move.
+        whole = np.where(root_moves[:, None, :], mean[:, :, None], root[:, :, None])  # [N, N, 3]
         values = {
             "parent": linkage.parent,
-            "chain": linkage.chain,
-            "mean": together / together.sum(1, keepdims=True),
-            "root": np.eye(scene.num_nodes)[linkage.root],
-            "root_moves": scene.live[linkage.root, :3],
+            # Both act on all coordinates of all bodies in a row, [3 N].
+            "sums": np.kron(linkage.chain, np.eye(3)),
+            "apart": np.eye(3 * scene.num_nodes) - _each_coordinate(whole),
             "turning": scene.live[:, 9:].ravel().nonzero()[0],
             "spread": np.eye(3 * scene.num_nodes)[:, scene.live[:, 9:].ravel()],
             "live": scene.live,
         }
         self.constants(values)
         # Of all arms and places those that turning can move: in the plane less than half of the products.
-        levers = self._levers()
+        levers = self._levers(*(torch.as_tensor(part).double() for part in (linkage.chain, mean, root_moves)))
         used = levers.any(2)
         self.constants({"lever_arms": used.any(1).nonzero().flatten(), "placed": used.any(0).nonzero().flatten()})
         self.constants({"levers": levers[self.lever_arms][:, self.placed].flatten(1)})
 
-    def forward(self, state: Tensor, delta: Tensor, std: Tensor, values: SceneValues) -> Tensor:
+    def forward(self, state: Tensor, matrices: Tensor, delta: Tensor, std: Tensor, values: SceneValues) -> Tensor:
         """The nearest change that keeps pins together.
 
         Args:
             state: ``[*B, N, 13]``.
+            matrices: ``[*B, N, 3, 3]`` of the orientations in it.
             delta: ``[*B, N, 12]`` predicted change.
             std: ``[12]`` how much each channel of a change varies.
             values: numbers of the scene; read are where the pins are.
@@ -81,13 +83,14 @@ class Linking(Float64Buffers):
         """
         at, to = BODY_STATE.slices, BODY_STATE.delta_slices
         turn, spin = delta[..., to["orientation"]], delta[..., to["angular_velocity"]]
-        here = torch.cat((state[..., at["position"]], state[..., at["linear_velocity"]]), dim=-1)
-        moved = here + torch.cat((delta[..., to["position"]], delta[..., to["linear_velocity"]]), dim=-1)
-        before = self.arms(state, values)
+        # Positions and velocities [*B, 2, 3 N].
+        here = torch.stack((state[..., at["position"]], state[..., at["linear_velocity"]]), dim=-3).flatten(-2)
+        change = torch.stack((delta[..., to["position"]], delta[..., to["linear_velocity"]]), dim=-3).flatten(-2)
+        moved, before = here + change, self.arms(matrices, values)
 
         arms, along = self.pins(state, before, turn, spin)
         moves = self.moves(arms)
-        misses = self._gap(moved, along).unflatten(-1, (2, 3)).movedim(-2, -1).flatten(-3, -2)[..., self.placed, :]
+        misses = self._gap(moved, along)[..., self.placed].mT
         ratio = position_weight(std).to(state.dtype)
         pull = ratio * moves.mT
         normal = pull @ moves + torch.eye(moves.shape[-1], dtype=state.dtype, device=state.device)
@@ -97,16 +100,14 @@ class Linking(Float64Buffers):
         turn, spin = turn + better[..., 0], spin + better[..., 1]
 
         _, along = self.pins(state, before, turn, spin)
-        shift, push = (moved - here - self._gap(moved, along)).split(3, dim=-1)
+        shift, push = (change - self._gap(moved, along)).unflatten(-1, (-1, 3)).unbind(-3)
         return torch.cat((shift, turn, push, spin), dim=-1) * self.live
 
-    def arms(self, state: Tensor, values: SceneValues) -> Tensor:
+    def arms(self, matrices: Tensor, values: SceneValues) -> Tensor:
         """From each pin's upper and lower body to it, ``[*B, 2, N, 3]``, in the world frame."""
-        parent_arm, arm = values.parent_arm, values.arm
-        frame = quaternion.to_matrix(state[..., BODY_STATE.slices["orientation"]]).unflatten(-1, (3, 3))
-        upper = frame[..., self.parent, :, :] @ parent_arm.to(state.dtype).unsqueeze(-1)
-        lower = frame @ arm.to(state.dtype).unsqueeze(-1)
-        return torch.stack((upper, lower), dim=-4).squeeze(-1)
+        arms = torch.stack((values.parent_arm, values.arm), dim=-3).to(matrices.dtype)
+        both = torch.stack((matrices[..., self.parent, :, :], matrices), dim=-4)
+        return (both @ arms.unsqueeze(-1)).squeeze(-1)
 
     def moves(self, arms: Tensor) -> Tensor:
         """``[*B, R, L]``: how turning moves bodies relative to their linkage as a whole, linear in the arms.
@@ -130,26 +131,24 @@ class Linking(Float64Buffers):
             spin: ``[*B, N, 3]`` changes of angular velocity.
 
         Returns:
-            Arms after it, and places and speeds ``[*B, N, 6]`` relative to each linkage's root.
+            Arms after it, and places and speeds ``[*B, 2, 3 N]`` relative to each linkage's root.
         """
         speed = state[..., BODY_STATE.slices["angular_velocity"]] + spin
         both = torch.cat((turn, speed), dim=-1)
         turn, speed = torch.stack((both[..., self.parent, :], both), dim=-3).split(3, dim=-1)
         arms = quaternion.rotate_by(turn, arms)
-        return arms, self._along(torch.cat((arms, torch.linalg.cross(speed, arms)), dim=-1))
+        return arms, self._along(torch.stack((arms, torch.linalg.cross(speed, arms)), dim=-4))
 
     def _along(self, pins: Tensor) -> Tensor:
-        """Sums ``[*B, N, F]`` from each linkage's root of what pins ``[*B, 2, N, F]`` add, upper less lower body."""
+        """Sums ``[*B, 3 N]`` from each linkage's root of what pins ``[*B, 2, N, 3]`` add, upper less lower body."""
         upper, lower = pins.unbind(-3)
-        return _mix(self.chain, upper - lower)
+        return F.linear((upper - lower).flatten(-2), self.sums.to(pins.dtype))
 
     def _gap(self, moved: Tensor, along: Tensor) -> Tensor:
-        """How far predicted places or speeds ``[*B, N, F]`` are from where their linkages have them."""
-        start = moved - along  # every body's opinion of its root's
-        moves = self.root_moves.repeat(1, moved.shape[-1] // 3)
-        return start - torch.where(moves, _mix(self.mean, start), _mix(self.root, start))
+        """How far predicted places or speeds ``[*B, 3 N]`` are from where their linkages have them."""
+        return F.linear(moved - along, self.apart.to(moved.dtype))  # the difference: opinions of the root's
 
-    def _levers(self) -> Tensor:
+    def _levers(self, chain: Tensor, mean: Tensor, root_moves: Tensor) -> Tensor:
         """``[6 N, 3 N, L]``: velocities of bodies about their linkage's own for each live angular velocity, by arm."""
         count = len(self.parent)
         upper, lower = torch.eye(6 * count, dtype=torch.float64).view(-1, 2, count, 3).unbind(1)
@@ -157,9 +156,9 @@ class Linking(Float64Buffers):
         parents, own = F.one_hot(self.parent, count).double(), torch.eye(count, dtype=torch.float64)
         # Node i moves with every pin j on its way to the root: by parent's spin x upper less own spin x lower.
         pins = own[..., None, None] * lower - parents[..., None, None] * upper
-        bodies = torch.einsum("ij,...jkab->...iakb", self.chain, pins)
-        means = torch.einsum("ij,...jakb->...iakb", self.mean, bodies)
-        bodies = bodies - self.root_moves.double()[:, :, None, None] * means
+        bodies = torch.einsum("ij,...jkab->...iakb", chain, pins)
+        means = torch.einsum("ij,...jakb->...iakb", mean, bodies)
+        bodies = bodies - root_moves[:, :, None, None] * means
         return bodies.flatten(-2).flatten(-3, -2)[..., self.turning]
 
 
@@ -168,9 +167,10 @@ def position_weight(std: Tensor) -> Tensor:
     return std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)
 
 
-def _mix(matrix: Tensor, values: Tensor) -> Tensor:
-    """``[N, N]`` times ``[*B, N, F]``, as one product and not one for every sample."""
-    return F.linear(values.mT.contiguous(), matrix.to(values.dtype)).mT
+def _each_coordinate(matrices: np.ndarray) -> np.ndarray:
+    """``[3 N, 3 N]`` that acts on each of three coordinates with its own of matrices ``[N, N, 3]``."""
+    count = len(matrices)
+    return np.einsum("ijc,cd->icjd", matrices, np.eye(3)).reshape(3 * count, 3 * count)
 
 
 def _cross(v: Tensor) -> Tensor:

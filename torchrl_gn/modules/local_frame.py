@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,32 @@ if TYPE_CHECKING:
     from torchrl_gn.modules.forward_model import ForwardModel
     from torchrl_gn.scenes import Scene
     from torchrl_gn.scenes.scene_values import SceneValues
+
+
+class Turn(NamedTuple):
+    """A rotation of a whole scene.
+
+    Attributes:
+        rotation: ``[*B, 4]``.
+        matrix: ``[*B, 3, 3]``.
+    """
+
+    rotation: Tensor
+    matrix: Tensor
+
+
+class Seen(NamedTuple):
+    """A state as the network sees it.
+
+    Attributes:
+        state: ``[*B, N, 13]`` recentred, at heading 0.
+        matrices: ``[*B, N, 3, 3]`` of the orientations in it; None of a robot that is known by its joints alone.
+        turn: from heading 0 to the root's heading; None where there is none.
+    """
+
+    state: Tensor
+    matrices: Tensor | None
+    turn: Turn | None
 
 
 class LocalFrame(Float64Buffers):
@@ -72,7 +98,7 @@ class LocalFrame(Float64Buffers):
         moved = state[..., position] - center * self.shifted.to(state.dtype)
         return torch.cat((state[..., : position.start], moved, state[..., position.stop :]), dim=-1)
 
-    def local(self, state: Tensor, values: SceneValues) -> Tensor:
+    def see(self, state: Tensor, values: SceneValues) -> Seen:
         """State ``[*B, N, 13]`` as the network sees it: recentred, and turned to heading 0.
 
         Where the dynamics do not depend on how the scene is turned
@@ -81,14 +107,20 @@ class LocalFrame(Float64Buffers):
         where parts can touch it, it is turned with the rest and so shows the heading.
         """
         state, turn = self.recentered(state), self.heading_turn(state, values)
-        if self.heading is None or turn is None:
-            return state
-        pivot = torch.nn.functional.pad(values.pivot.to(state.dtype), (0, self.layout.size - 3)).unsqueeze(-2)
-        turned = self.layout.turn(state - pivot, quaternion.conjugate(turn)) + pivot
-        return torch.cat((state[..., :1, :], turned[..., 1:, :]), dim=-2) if self.heading.exact else turned
+        if self.heading is not None and turn is not None:
+            pivot = torch.nn.functional.pad(values.pivot.to(state.dtype), (0, self.layout.size - 3)).unsqueeze(-2)
+            back = quaternion.conjugate(turn.rotation)
+            turned = self.layout.turn(state - pivot, back, turn.matrix.mT) + pivot
+            state = torch.cat((state[..., :1, :], turned[..., 1:, :]), dim=-2) if self.heading.exact else turned
+        return Seen(state, self.matrices(state), turn)
 
-    def heading_turn(self, state: Tensor, values: SceneValues) -> Tensor | None:
-        """Rotation ``[*B, 4]`` from heading 0 to the root's heading; None where there is none."""
+    def matrices(self, state: Tensor) -> Tensor | None:
+        """Rotation matrices ``[*B, N, 3, 3]`` of the bodies of a state; None if it has none."""
+        where = self.layout.slices.get("orientation")
+        return None if where is None else quaternion.to_matrix(state[..., where]).unflatten(-1, (3, 3))
+
+    def heading_turn(self, state: Tensor, values: SceneValues) -> Turn | None:
+        """Rotation from heading 0 to the root's heading; None where there is none."""
         if self.heading is None:
             return None
         orientation = state[..., self.heading.node, self.layout.slices["orientation"]]
@@ -96,32 +128,29 @@ class LocalFrame(Float64Buffers):
         turn = quaternion.product(orientation, quaternion.conjugate(rest))
         kept = torch.zeros(4, dtype=state.dtype, device=state.device)
         kept[0] = kept[1 + self.heading.axis] = 1
-        return quaternion.normalize(turn * kept)
+        rotation = quaternion.normalize(turn * kept)
+        return Turn(rotation, quaternion.to_matrix(rotation).unflatten(-1, (3, 3)))
 
-    def features(self, state: Tensor, action: Tensor, values: SceneValues) -> tuple[Tensor, Tensor]:
+    def features(self, seen: Seen, action: Tensor, values: SceneValues) -> tuple[Tensor, Tensor]:
         """Dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised.
 
         Args:
-            state: ``[*B, N, 13]`` in the world frame.
+            seen: what :meth:`see` gives of the state.
             action: ``[*B, A]``; cut off at the motors' limits.
             values: numbers of the scene.
         """
-        state = self.local(state, values)
+        state, matrices, _ = seen
         # As motors do: what is beyond their limits has no effect, and the network never sees it.
         # (0 * action: an infinite action gives no number, as it should, and not the motor's limit.)
         action = action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype)) + 0 * action
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
         controls = padded[..., self.edge_action]  # [*B, E, C]
         if self.joint_axes:
-            axes = self._joint_axes(state, values)
+            assert matrices is not None
+            axes = (matrices[..., self.joint_node, :, :] @ values.joint_axis.to(state.dtype).unsqueeze(-1)).squeeze(-1)
             controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]
-        features = self.layout.encode(state, self.encoding)
+        features = self.layout.encode(state, self.encoding, matrices)
         if self.contacts is not None:
-            touching = self.contacts(state, values.contact_offset, values.contact_radius)
+            touching = self.contacts(state, matrices, values.contact_offset, values.contact_radius)
             features = torch.cat((features, touching), dim=-1)
         return features, controls
-
-    def _joint_axes(self, state: Tensor, values: SceneValues) -> Tensor:
-        """Axes of the joints ``[*B, E, 3]`` in the frame of the state."""
-        orientation = state[..., self.joint_node, self.layout.slices["orientation"]]
-        return quaternion.rotate(orientation, values.joint_axis.to(state.dtype))

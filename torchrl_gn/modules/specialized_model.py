@@ -16,6 +16,7 @@ from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded, Un
 from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
 from torchrl_gn.modules.folded_core import FoldedCore, copy_into, snapshot
 from torchrl_gn.modules.graph import Graph, graph_concat
+from torchrl_gn.modules.local_frame import Seen
 from torchrl_gn.modules.mlp_core import FoldedMLP
 from torchrl_gn.modules.recurrent_core import RecurrentCore
 from torchrl_gn.scenes.scene_values import SceneValues
@@ -137,17 +138,18 @@ class SpecializedForwardModel(BoundForwardModel):
         )
         return Folded(snapshot(small, self.dtype), SceneValues(*(value.detach().clone() for value in values)))
 
-    def _residual(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
+    def _residual(self, seen: Seen, action: Tensor, folded: Folded) -> Tensor:
         core = folded.core
         assert isinstance(core, (FoldedCore, FoldedMLP))
-        encoded, controls = self.frame.features(state, action, folded.values)
+        encoded, controls = self.frame.features(seen, action, folded.values)
         nodes = _centered(encoded, self.model.node_normalizer.mean, self.node_columns)
         edges = _centered(controls, self.model.edge_normalizer.mean, self.edge_columns)
         dtype = core.out[0].dtype
-        globals_ = nodes.new_zeros((*state.shape[:-2], 0), dtype=dtype)
-        predicted = core.predict(Graph(nodes.to(dtype), edges.to(dtype), globals_, self.edge_index)).to(state.dtype)
+        globals_ = nodes.new_zeros((*nodes.shape[:-2], 0), dtype=dtype)
+        dynamic = Graph(nodes.to(dtype), edges.to(dtype), globals_, self.edge_index)
+        predicted = core.predict(dynamic).to(seen.state.dtype)
         # Channels that never varied are predicted as what they were.
-        constant = self.model.residual_normalizer.mean.to(state.dtype).expand(*predicted.shape[:-1], -1)
+        constant = self.model.residual_normalizer.mean.to(predicted.dtype).expand(*predicted.shape[:-1], -1)
         return torch.cat([(predicted if varies else constant)[..., where] for varies, where in self._runs], dim=-1)
 
     def skipped(self) -> dict[str, tuple[float, float]]:

@@ -193,12 +193,13 @@ class StateLayout:
                 parts.append(timestep * (rate + 0.5 * change))
         return torch.cat(parts, dim=-1)
 
-    def turn(self, state: Tensor, rotation: Tensor) -> Tensor:
+    def turn(self, state: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
         """State as seen when all of space is turned about the origin.
 
         Args:
             state: ``[*B, N, size]``.
             rotation: ``[*B, 4]`` unit quaternions, one for all ``N`` items.
+            matrix: ``[*B, 3, 3]`` of that rotation, if it is known already.
 
         Returns:
             ``[*B, N, size]``.
@@ -207,7 +208,7 @@ class StateLayout:
             ValueError: if a component is no vector or rotation in space.
         """
         self._check_spatial()
-        matrix = quaternion.to_matrix(rotation).unflatten(-1, (3, 3)).mT
+        matrix = (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
         parts = []
         for component in self.components:
             part = state[..., self.slices[component.name]]
@@ -217,10 +218,10 @@ class StateLayout:
                 parts.append(part @ matrix)
         return torch.cat(parts, dim=-1)
 
-    def turn_delta(self, delta: Tensor, rotation: Tensor) -> Tensor:
+    def turn_delta(self, delta: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
         """State change ``[*B, N, delta_size]`` as seen when all of space is turned, see :meth:`turn`."""
         self._check_spatial()
-        matrix = quaternion.to_matrix(rotation).unflatten(-1, (3, 3)).mT
+        matrix = (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
         vectors = delta.reshape(*delta.shape[:-2], delta.shape[-2] * len(self.components), 3)
         return (vectors @ matrix).reshape(delta.shape)
 
@@ -231,7 +232,7 @@ class StateLayout:
                     f"Component {component.name!r} is no vector or rotation in space and cannot be turned."
                 )
 
-    def encode(self, state: Tensor, encoding: Encoding = "matrix") -> Tensor:
+    def encode(self, state: Tensor, encoding: Encoding = "matrix", matrices: Tensor | None = None) -> Tensor:
         """Features of a state that the network sees.
 
         Args:
@@ -239,6 +240,7 @@ class StateLayout:
             encoding: a rotation as its ``"quaternion"`` (paper) or as the 9 entries of its
                 rotation ``"matrix"``: the same for ``q`` and ``-q``, and linear in how
                 body-fixed vectors turn.
+            matrices: ``[..., 3, 3]`` of the only rotation that the state has, if they are known already.
 
         Returns:
             ``[..., encoded_size(encoding)]``.
@@ -246,7 +248,7 @@ class StateLayout:
         if encoding == "quaternion":
             return state
         parts = [
-            quaternion.to_matrix(state[..., self.slices[c.name]])
+            (quaternion.to_matrix(state[..., self.slices[c.name]]) if matrices is None else matrices.flatten(-2))
             if c.kind == "rotation"
             else state[..., self.slices[c.name]]
             for c in self.components
