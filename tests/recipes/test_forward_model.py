@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,29 +15,8 @@ ROOT = Path(__file__).parents[2]
 SMALL = ("system=pendulum", "data.train=20", "data.validation=5", "data.test=5")
 
 
-def start(*options: str, recipe: str = "forward_model") -> subprocess.Popen:
-    """Start a recipe in the background."""
-    pytest.importorskip("hydra")
-    command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *options]
-    environment = os.environ | {"WANDB_MODE": "offline"}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    # Shells let what they start in the background ignore Ctrl-C, and so would the recipe.
-    return subprocess.Popen(command, env=environment, preexec_fn=_listen_to_ctrl_c, **pipes)
-
-
-def _listen_to_ctrl_c() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
-    """Exit code, output and errors of a recipe."""
-    process = start(*options, recipe=recipe)
-    output, errors = process.communicate(timeout=120)
-    return process.returncode, output, errors
-
-
 @pytest.fixture(scope="module")
-def interrupted(tmp_path_factory) -> Path:
+def interrupted(tmp_path_factory, start) -> Path:
     """Folder of a run that Ctrl-C stopped in the middle of its training."""
     folder = tmp_path_factory.mktemp("run")
     process = start(*SMALL, "minutes=5", "checkpoint_seconds=0", f"run_dir={folder}")
@@ -55,7 +31,7 @@ def interrupted(tmp_path_factory) -> Path:
     return folder
 
 
-def test_an_interrupted_run_goes_on_to_its_end(interrupted):
+def test_an_interrupted_run_goes_on_to_its_end(interrupted, run):
     done = load_checkpoint(interrupted).training["progress"]["step"]
     assert done > 0
     code, output, errors = run(*SMALL, "minutes=null", f"steps={done + 5}", f"run_dir={interrupted}", "logger=wandb")
@@ -70,7 +46,7 @@ def test_an_interrupted_run_goes_on_to_its_end(interrupted):
     assert list(interrupted.glob("log/wandb/offline-run-*/files/media/images/prediction*.png"))
 
 
-def test_bad_options_end_in_one_line_and_touch_nothing(interrupted):
+def test_bad_options_end_in_one_line_and_touch_nothing(interrupted, run):
     before = {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()}
     for options, message in (
         (("noise=0.5", "minutes=9"), "other options: noise=0.5"),
@@ -83,7 +59,7 @@ def test_bad_options_end_in_one_line_and_touch_nothing(interrupted):
     assert {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()} == before
 
 
-def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_path):
+def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_path, run):
     options = (*SMALL, "parametrized=true", "minutes=null", "steps=5", f"run_dir={tmp_path}")
     code, output, errors = run(*options)
     assert code == 0, errors
@@ -94,7 +70,7 @@ def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_pa
     assert request["variants"] == 20 and list(request["parameters"]) == ["length", "mass"]
 
 
-def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path):
+def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path, run):
     small = (*SMALL[1:], "system=[swimmer3,pendulum]", "zero_shot=[swimmer4]", "minutes=null")
     code, output, errors = run(*small, "steps=5", "parametrized=true", f"run_dir={tmp_path}")
     assert code == 0, errors
@@ -111,7 +87,7 @@ def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path):
     assert load_checkpoint(tmp_path).training["progress"]["step"] == 8
 
 
-def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path):
+def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path, run):
     options = (f"checkpoint={interrupted}", "sequences=5", f"run_dir={tmp_path}")
     code, output, errors = run(*options, "system=cartpole", recipe="evaluate")
     assert code == 0, errors
@@ -122,7 +98,7 @@ def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path):
     assert "never saw" in errors
 
 
-def test_comparing_goes_on_past_a_failed_run_and_keeps_finished_ones(tmp_path):
+def test_comparing_goes_on_past_a_failed_run_and_keeps_finished_ones(tmp_path, run):
     small = ["data.train=20", "data.validation=5", "data.test=5"]
     options = ["systems=[pendulum]", "minutes=0.01", f"run_dir={tmp_path}", f"overrides={small}"]
     bad = "+variants.bad=['model.latent=zero']"

@@ -9,6 +9,7 @@ from torchrl_gn.evaluation.errors import squared_errors as squared_errors
 from torchrl_gn.evaluation.figures import plot_bars as plot_bars
 from torchrl_gn.evaluation.figures import plot_errors as plot_errors
 from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog
+from torchrl_gn.evaluation.figures import plot_rewards as plot_rewards
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve
 from torchrl_gn.evaluation.identification import identification_errors as identification_errors
 from torchrl_gn.evaluation.identification import linear_probe as linear_probe

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from torchrl_gn.evaluation import palette
 from torchrl_gn.evaluation.canvas import clean, new_figure, save
@@ -40,6 +41,35 @@ def plot_loglog(
         axes.set_ylabel(ylabel)
         axes.grid(alpha=0.25, which="both")
         axes.legend(frameon=False)
+    return save(figure, path)
+
+
+def plot_rewards(
+    rewards: Mapping[str, Tensor], path: str | os.PathLike, *, timestep: float, ylabel: str = "reward"
+) -> Path:
+    """Reward over time, a line for every planner or policy: the mean of its episodes, and pale from worst to best.
+
+    Args:
+        rewards: ``[B, T]`` by label.
+        path: file to write; its suffix is the format.
+        timestep: seconds of a control step.
+        ylabel: name of the vertical axis.
+
+    Returns:
+        The written path.
+    """
+    figure = new_figure((6.4, 3.8))
+    axes = figure.subplots()
+    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    for number, (label, values) in enumerate(rewards.items()):
+        values = values.detach().double().numpy()
+        time, color = timestep * np.arange(1, values.shape[1] + 1), colors[number % len(colors)]
+        axes.fill_between(time, values.min(0), values.max(0), color=color, alpha=0.15, linewidth=0)
+        axes.plot(time, values.mean(0), color=color, label=label, linewidth=1.6)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(ylabel)
+    axes.legend(frameon=False, fontsize=9)
+    clean(axes)
     return save(figure, path)
 
 

@@ -1,0 +1,321 @@
+"""Control a system by planning, through the learned model or on the true physics.
+
+    python recipes/mpc.py [system=pendulum] [reward=balance] [planner=gn] [key=value ...]
+    python recipes/mpc.py system=cartpole "planner=[gn,ilqg,cem,random]"
+
+Plays episodes in MuJoCo, all from the same start states for every planner: gn plans by gradients through the learned
+model (paper, SM "MPC planner with learned models"), cem and mppi are TorchRL's own planners on that model, ilqg (paper,
+SM "Baseline Mujoco-based planner"), cem_true and mppi_true plan on MuJoCo itself, random plays random controls. A
+checkpoint of an inference model first identifies the system from random controls. Finished episodes are kept: the same
+`run_dir` goes on, with more steps or planners too.
+
+Leaves config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
+a video of the first episode, beside what the plan said before (<planner>.gif). All options: recipes/config/mpc.yaml.
+What came out: docs/results.md.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+import numpy as np
+import torch
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.modules import CEMPlanner, MPPIPlanner
+from tqdm import tqdm
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.data import sample_start_states, spline_controls
+from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.evaluation import plot_rewards, rollout_video
+from torchrl_gn.modules import IdentifyingModel, specialize
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner
+from torchrl_gn.pretrained import load_pretrained, pretrained_names
+from torchrl_gn.rewards import FixTask, Reward, make_reward
+from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, load_checkpoint
+
+ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
+SAVE_SECONDS = 60
+MAY_CHANGE = ("planner", "steps", "compile", "threads", "video", "logger", "run_dir")  # when a run goes on
+
+
+class RandomControl(TensorDictModuleBase):
+    """Smooth random controls, or none: what planners are to beat."""
+
+    def __init__(self, scene: Scene, episodes: int, steps: int, seed: int, factor: float) -> None:
+        super().__init__()
+        self.in_keys: list[NestedKey] = ["state"]
+        self.out_keys: list[NestedKey] = ["action"]
+        self.step = 0
+        self.controls = factor * torch.from_numpy(spline_controls(scene, episodes, steps, seed))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self.controls[:, self.step].float()
+        self.step += 1
+        return tensordict.set("action", action)
+
+
+class ReturnToGo(TensorDictModuleBase):
+    """Scores sequences ``[*B, K, H]`` for MPPI: returns from each step on, in their spread over the candidates."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.in_keys: list[NestedKey] = [("next", "reward")]
+        self.out_keys: list[NestedKey] = ["advantage"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        reward = cast(Tensor, tensordict.get(("next", "reward")))
+        returns = reward.flip(-2).cumsum(-2).flip(-2)
+        best, spread = returns.amax(-3, keepdim=True), returns.std(-3, keepdim=True)
+        return tensordict.set("advantage", (returns - best) / spread.clamp(min=1e-12))
+
+
+class Episodes:
+    """Episodes under one planner, saved now and then, to go on with.
+
+    Args:
+        path: file that they are kept in.
+        start: TensorDict to begin from.
+        seconds: of planning in every step.
+    """
+
+    def __init__(self, path: Path, start: TensorDictBase) -> None:
+        self.path, self.now = path, start
+        self.records: dict[str, list[Tensor]] = {"state": [start["state"]], "action": [], "reward": [], "seconds": []}
+        self.records["foreseen"] = []
+        if path.exists():
+            saved = load_file(path)
+            flat = {key.removeprefix("now."): value for key, value in saved.items() if key.startswith("now.")}
+            batch = start.batch_size
+            self.now = cast(TensorDictBase, TensorDict(flat, batch_size=batch).unflatten_keys("."))
+            for name, record in self.records.items():
+                values = saved[name]
+                record[:] = list(values.unbind(0) if name in ("seconds", "foreseen") else values.unbind(1))
+
+    def __len__(self) -> int:
+        return len(self.records["action"])
+
+    def __getitem__(self, name: str) -> Tensor:
+        """``[B, T, ...]`` of states, actions and rewards; ``[T, ...]`` of the rest."""
+        record = self.records[name]
+        if not record:
+            return torch.zeros(0)
+        return torch.stack(record, dim=0 if name in ("seconds", "foreseen") else 1)
+
+    def save(self) -> None:
+        """Write everything, atomically."""
+        now = {f"now.{key}": value for key, value in self.now.flatten_keys(".").items()}
+        if not len(self):
+            return
+        values = {name: self[name] for name in self.records}
+        with atomic_path(self.path) as temporary:
+            save_file({key: value.contiguous() for key, value in (now | values).items()}, temporary)
+
+
+def options(cfg: DictConfig) -> dict[str, Any]:
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+
+
+def fill_in(cfg: DictConfig) -> None:
+    """The paper's task of the system, where options are left open."""
+    task = cfg.tasks.get(re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system)
+    for key, value in (("reward", task and task.rewards[0]), ("horizon", task and task.horizon)):
+        if cfg[key] is None and value is None:
+            raise ValueError(f"{cfg.system!r} is no system of the paper: say which {key} it gets, as {key}=...")
+        cfg[key] = value if cfg[key] is None else cfg[key]
+    cfg.steps = (task.steps if task else 200) if cfg.steps is None else cfg.steps
+    if not isinstance(cfg.planner, ListConfig):
+        cfg.planner = [cfg.planner]
+    unknown = [name for name in cfg.planner if name not in ON_MODEL + ON_PHYSICS]
+    if unknown:
+        raise ValueError(f"There is no planner {unknown[0]!r}; use some of {[*ON_MODEL, *ON_PHYSICS]}.")
+
+
+def load_model(cfg: DictConfig, scene: Scene):
+    """The trained model, bound to the scene, and the inference model if it has one."""
+    fitting = (cfg.system, re.sub(r"^swimmer\d+$", "swimmerN", cfg.system))
+    names = [name for name in fitting if name in pretrained_names()]
+    if cfg.checkpoint is None and not names:
+        raise ValueError(f"No trained model of {cfg.system!r} comes with the package; give checkpoint=PATH.")
+    checkpoint = load_pretrained(names[0]) if cfg.checkpoint is None else load_checkpoint(cfg.checkpoint)
+    if isinstance(checkpoint.trained, IdentifyingModel):
+        bound, inference = checkpoint.trained.bind(scene)
+        return specialize(bound, compile=cfg.compile), inference
+    return specialize(checkpoint.model.bind(scene), compile=cfg.compile), None
+
+
+def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:
+    """Where every episode should get to: a place for a swimmer's head, a random pose for an arm."""
+    rng = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(1,)))
+    count = len(state)
+    if reward.target_shape is None:
+        return None
+    if reward.target_shape == (3,):
+        angle = torch.from_numpy(rng.uniform(-np.pi, np.pi, count))
+        way = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=-1)
+        return state[:, 1, :3] + cfg.target_distance * way
+    return SceneEnv(scene).simulator.observe(sample_start_states(scene, count, rng))
+
+
+def make_planner(
+    name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, steps: int
+) -> TensorDictModuleBase:
+    """The planner of a name; steps are those still to play."""
+    if name in ("random", "nothing"):
+        return RandomControl(env.scene, cfg.episodes, steps, cfg.seed + 2, float(name == "random"))
+    if name == "ilqg":
+        return ILQGPlanner(env, cfg.horizon, seed=cfg.seed, **cfg.ilqg)
+    if name == "gn":
+        assert imagined is not None
+        more = {key: value for key, value in cfg.gn.items() if key != "lr"}
+        optimizer = partial(torch.optim.Adam, lr=cfg.gn.lr)
+        return GradientPlanner(imagined, cfg.horizon, optimizer=optimizer, seed=cfg.seed, **more)
+    where = env if name.endswith("_true") else imagined
+    assert where is not None
+    chosen = cfg[name.removesuffix("_true")]
+    sizes = {"optim_steps": chosen.iterations, "num_candidates": chosen.candidates, "top_k": chosen.top_k}
+    if name.startswith("cem"):
+        return CEMPlanner(where, planning_horizon=cfg.horizon, **sizes)
+    return MPPIPlanner(where, ReturnToGo(), chosen.temperature, planning_horizon=cfg.horizon, **sizes)
+
+
+def begin(cfg: DictConfig, scene: Scene, env: SceneEnv, inference) -> TensorDictBase:
+    """Start states, after random controls to identify the system from if it has to be."""
+    now = env.reset(TensorDict(batch_size=[cfg.episodes]))
+    if inference is None:
+        return now
+    controls = torch.from_numpy(spline_controls(scene, cfg.episodes, cfg.phase, cfg.seed + 1))
+    simulated = env.simulator.rollout(now["physics"], controls)
+    entries = {"state": simulated["state"][:, -1], "physics": simulated["physics"][:, -1]}
+    with torch.no_grad():
+        entries["static"] = inference.identify(simulated["state"], controls)
+    return TensorDict(entries, batch_size=now.shape)
+
+
+def play(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv | None, played: Episodes) -> None:
+    """Play to the end, or to Ctrl-C; what was played is saved either way."""
+    last = time.monotonic()
+    try:
+        with torch.no_grad(), tqdm(total=cfg.steps, initial=len(played), desc=name, unit="step", leave=False) as bar:
+            while len(played) < cfg.steps:
+                started = time.perf_counter()
+                now = policy(played.now.copy())
+                seconds = time.perf_counter() - started
+                if name == "gn" and imagined is not None:
+                    played.records["foreseen"].append(foresee(imagined, now))
+                stepped = env.step(now)
+                keep = {key: value for key, value in stepped.items() if key not in ("next", "action")}
+                keep.update({key: stepped["next", key] for key in ("state", "physics")})
+                played.now = TensorDict(keep, batch_size=now.shape)
+                reward = stepped["next", "reward"].squeeze(-1)
+                for key, value in (("state", played.now["state"]), ("action", now["action"]), ("reward", reward)):
+                    played.records[key].append(value)
+                played.records["seconds"].append(torch.tensor(seconds))
+                bar.set_postfix(reward=f"{float(reward.mean()):.3g}", refresh=False)
+                bar.update()
+                if time.monotonic() - last > SAVE_SECONDS:
+                    played.save()
+                    last = time.monotonic()
+    finally:
+        played.save()
+
+
+def foresee(imagined: ModelEnv, now: TensorDictBase) -> Tensor:
+    """The last state of the first episode's plan."""
+    plan = cast(Tensor, now["plan", "actions"])[:1, 0, :-1]
+    first = torch.cat((now["action"][:1, None], plan), dim=1)
+    return imagined.imagine(cast(TensorDictBase, now[:1]), first)[0][0, -1].detach()
+
+
+def distance_left(played: Episodes, target: Tensor) -> Tensor:
+    """Share ``[B]`` of a swimmer's way to its target that is left at the end."""
+    away = (played["state"][:, [0, -1], 1, :2] - target[:, None, :2]).norm(dim=-1)
+    return away[:, 1] / away[:, 0]
+
+
+@hydra.main(version_base=None, config_path="config", config_name="mpc")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    fill_in(cfg)
+    torch.manual_seed(cfg.seed)
+    torch.set_num_threads(cfg.threads)
+    scene = load_scene(cfg.system)
+    reward = make_reward(cfg.reward, scene)
+    env = SceneEnv(scene, reward, seed=cfg.seed)
+    bound, inference = load_model(cfg, scene) if set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint else (None, None)
+    imagined = None if bound is None else ModelEnv(bound, reward)
+    run = RunFolder(cfg.run_dir, "mpc")
+    if (run.path / "config.yaml").exists():
+        before = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.load(run.path / "config.yaml")))
+        run.refuse_changes(before, options(cfg), free=MAY_CHANGE)
+    run.write_config(OmegaConf.to_yaml(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"mpc-{scene.name}-{cfg.reward}", config=options(cfg))
+    start = begin(cfg, scene, env, inference)
+    target = draw_targets(cfg, reward, scene, start["state"])
+    if target is not None:
+        start["target"] = target
+
+    metrics: dict[str, Any] = {"horizon": cfg.horizon, "steps": cfg.steps, "episodes": cfg.episodes}
+    rows = [["planner", "mean reward", "spread", "last tenth", "way left", "ms a step"]]
+    curves: dict[str, Tensor] = {}
+    for name in cfg.planner:
+        played = Episodes(run.file(f"{name}.safetensors"), start.copy())
+        planner = make_planner(name, cfg, env, imagined, cfg.steps - len(played))
+        policy = planner if target is None else TensorDictSequential([FixTask(reward), planner])
+        play(cfg, name, policy, env, imagined, played)
+        rewards, seconds = played["reward"][:, : cfg.steps], played["seconds"]
+        last = rewards[:, -max(1, cfg.steps // 10) :].mean()
+        of = {
+            "mean_reward": rewards.mean().item(),
+            "mean_reward_std": rewards.mean(1).std(correction=0).item(),
+            "last_tenth_reward": last.item(),
+            "planning_ms": 1e3 * seconds.median().item(),
+            "planning_ms_first": 1e3 * seconds[0].item(),
+        }
+        if target is not None and reward.target_shape == (3,):
+            left = distance_left(played, target)
+            of |= {"distance_left": left.mean().item(), "distance_left_std": left.std(correction=0).item()}
+        metrics |= {f"{name}/{key}": value for key, value in of.items()}
+        left_text = f"{100 * of['distance_left']:.0f} %" if "distance_left" in of else ""
+        numbers = [f"{of[key]:.4g}" for key in ("mean_reward", "mean_reward_std", "last_tenth_reward")]
+        rows.append([name, *numbers, left_text, f"{of['planning_ms']:.0f}"])
+        curves[name] = rewards
+        tracker.log({f"{name}/{key}": value for key, value in of.items()}, len(played))
+        if cfg.video:
+            film(played, scene, cfg, run.file(f"{name}.gif"))
+    run.write_metrics(metrics, seed=cfg.seed)
+    plot_rewards(curves, run.file("rewards.png"), timestep=scene.timestep, ylabel=f"{cfg.reward} reward")
+    tracker.log_files(run.written)
+    tracker.close()
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(map(str.ljust, row, widths)).rstrip())
+    for path in run.written:
+        print(path)
+
+
+def film(played: Episodes, scene: Scene, cfg: DictConfig, path: Path) -> None:
+    """The first episode, beside what its plan foresaw a horizon ago."""
+    states, foreseen = played["state"][0], played["foreseen"]
+    speed = min(1.0, scene.timestep / 0.01)
+    if len(foreseen) > cfg.horizon:
+        first = states[: cfg.horizon]
+        prediction = torch.cat((first, foreseen))[: len(states)]
+        rollout_video(scene, states, prediction, path, speed=speed, labels=("played", "planned a horizon before"))
+    else:
+        rollout_video(scene, states, None, path, speed=speed, labels=("played", ""))
+
+
+if __name__ == "__main__":
+    main()

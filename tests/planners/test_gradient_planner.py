@@ -1,0 +1,342 @@
+"""Planning by gradients against the known optimum, finite differences, and what TorchRL asks of a planner."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.envs import BatchSizeTransform, Compose, StepCounter, TransformedEnv
+
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.modules import FeatureSet, ForwardModel, specialize
+from torchrl_gn.planners import GradientPlanner
+from torchrl_gn.rewards import FixTask, make_reward
+from torchrl_gn.scenes import load_scene
+
+STEP, SPEED_WEIGHT, CONTROL_COST, HORIZON = 0.1, 0.1, 0.02, 12
+POINT = """
+<mujoco model="cart">
+  <option timestep="0.1" gravity="0 0 0"/>
+  <worldbody>
+    <body name="point"><joint name="x" type="slide" axis="1 0 0"/><geom type="sphere" size=".1" mass="1"/></body>
+  </worldbody>
+  <actuator><motor joint="x" ctrlrange="-LIMIT LIMIT" ctrllimited="true"/></actuator>
+</mujoco>
+"""
+
+
+class Point(TensorDictModuleBase):
+    """A mass of 1 kg on a rail, exactly as MuJoCo integrates it."""
+
+    def __init__(self, scene):
+        super().__init__()
+        self.in_keys, self.out_keys, self.scene = ["state", "action"], [("next", "state")], scene
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        state, action = tensordict["state"], tensordict["action"].to(tensordict["state"].dtype)
+        along = torch.zeros(state.shape[-2:], dtype=state.dtype)
+        along[1, 7] = 1.0
+        moved = torch.zeros_like(along)
+        moved[1, 0] = 1.0
+        speed = state[..., 1, 7:8] + STEP * action
+        shift = (STEP * speed).unsqueeze(-1) * moved
+        return tensordict.set(("next", "state"), state + shift + (STEP * action).unsqueeze(-1) * along)
+
+
+def quadratic(state, action, next_state, task):
+    point = next_state[..., 1, :]
+    cost = point[..., :1].square() + SPEED_WEIGHT * point[..., 7:8].square()
+    return -cost - CONTROL_COST * action.square()
+
+
+def point_env(limit: float) -> ModelEnv:
+    return ModelEnv(Point(load_scene(POINT.replace("LIMIT", str(limit)), timestep=STEP)), quadratic)
+
+
+def at(*places: float) -> TensorDict:
+    state = torch.zeros(len(places), 2, 13, dtype=torch.float64)
+    state[..., 3] = 1.0
+    state[:, 1, 0] = torch.tensor(places)
+    return TensorDict({"state": state}, batch_size=[len(places)])
+
+
+def best_gains() -> list[np.ndarray]:
+    """Riccati recursion of the cost on x_1 .. x_H and u_0 .. u_{H-1}."""
+    a, b = np.array([[1.0, STEP], [0.0, 1.0]]), np.array([[STEP**2], [STEP]])
+    q = np.diag([1.0, SPEED_WEIGHT])
+    value, gains = np.zeros((2, 2)), []
+    for _ in range(HORIZON):
+        p = value + q
+        gain = np.linalg.solve(CONTROL_COST + b.T @ p @ b, b.T @ p @ a)
+        value, gains = a.T @ p @ (a - b @ gain), [gain, *gains]
+    return gains
+
+
+def best_actions(place: float) -> torch.Tensor:
+    x, actions = np.array([place, 0.0]), []
+    for gain in best_gains():
+        u = -gain @ x
+        actions.append(u)
+        x = np.array([[1.0, STEP], [0.0, 1.0]]) @ x + np.array([STEP**2, STEP]) * u
+    return torch.from_numpy(np.array(actions))
+
+
+def returns(env: ModelEnv, start: TensorDict, actions: torch.Tensor) -> torch.Tensor:
+    return env.imagine(start, actions)[1].sum((-2, -1)).double()
+
+
+def trained(scene, **options):
+    """A forward model that has seen data, and no more."""
+    torch.manual_seed(0)
+    bound = ForwardModel(FeatureSet.of(scene), **options).double().bind(scene)
+    seen = collect_trajectories(scene, 5, 20, seed=0)
+    bound.update_static_normalizers()
+    bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
+    return bound
+
+
+def test_it_reaches_the_known_optimum_of_a_linear_quadratic_problem():
+    env, start = point_env(20.0), at(1.0, -0.5)
+    planner = GradientPlanner(env, HORIZON, warm_up=400, samples=4, seed=0)
+    action = planner.planning(start)
+    optimum = torch.stack([best_actions(1.0), best_actions(-0.5)])
+    assert optimum.abs().max() < 20  # no limit in the way
+    # The plan that is left lacks the first action and repeats the last.
+    planned = torch.cat((action[:, None], start["plan", "actions"][:, 0, :-1]), dim=1)
+    best, found = returns(env, start, optimum.float()), returns(env, start, planned)
+    assert (found <= best + 1e-6 * best.abs()).all()
+    assert (best - found < 1e-3 * best.abs()).all()
+    torch.testing.assert_close(action.double(), optimum[:, 0], rtol=0.02, atol=0.02)
+
+
+def test_limits_bind():
+    env, start = point_env(2.0), at(1.0)
+    planner = GradientPlanner(env, HORIZON, warm_up=300, samples=4, seed=0)
+    assert planner.planning(start).item() == pytest.approx(-2.0)
+    assert (start["plan", "actions"].abs() <= 2).all()
+
+
+def test_it_imagines_what_stepping_gives():
+    env, start = point_env(2.0), at(0.3, 0.7, -0.2)
+    actions = torch.randn(3, 5, 1)
+    states, rewards = env.imagine(start, actions)
+    now = start.clone()
+    for t in range(5):
+        stepped = env.step(now.set("action", actions[:, t]))["next"]
+        torch.testing.assert_close(states[:, t + 1], stepped["state"])
+        torch.testing.assert_close(rewards[:, t], stepped["reward"])
+        now = stepped.select("state")
+    with pytest.raises(ValueError, match=r"actions must be \[\*B, H, 1\]"):
+        env.imagine(start, actions[:2])
+
+
+@pytest.mark.parametrize("kind", ["bound", "specialized", "recurrent"])
+def test_a_trained_kind_of_model_imagines_what_stepping_gives_and_differentiates_it(kind):
+    scene = load_scene("cartpole")
+    small = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
+    core = {"core": "recurrent", "memory": [4, 4, 4]} if kind == "recurrent" else {}
+    bound = trained(scene, **small, **core)
+    env = ModelEnv(specialize(bound) if kind == "specialized" else bound, make_reward("balance", scene), seed=0)
+    start, actions = env.reset(TensorDict(batch_size=[2])), torch.rand(2, 4, 1, dtype=torch.float64) - 0.5
+    states, rewards = env.imagine(start, actions)
+    now = start.clone()
+    for t in range(4):
+        stepped = env.step(now.set("action", actions[:, t]))["next"]
+        torch.testing.assert_close(states[:, t + 1], stepped["state"])
+        torch.testing.assert_close(rewards[:, t], stepped["reward"])
+        now = stepped.exclude("reward", "done", "terminated")
+
+    def total(actions):
+        states, _ = env.imagine(start, actions)
+        return states[:, -1, :, :3].sum()
+
+    actions.requires_grad_()
+    (gradient,) = torch.autograd.grad(total(actions), actions)
+    for index in ((0, 0, 0), (1, 3, 0)):
+        step = torch.zeros_like(actions)
+        step[index] = 1e-6
+        difference = (total(actions + step) - total(actions - step)).item() / 2e-6
+        assert gradient[index].item() == pytest.approx(difference, rel=1e-5, abs=1e-9)
+
+
+def test_the_next_call_goes_on_from_the_last_plan():
+    env, planner = point_env(20.0), GradientPlanner(point_env(20.0), HORIZON, 2, warm_up=200, samples=4, seed=0)
+    played = env.rollout(4, planner, tensordict=at(1.0), auto_reset=False)
+    optimum = best_actions(1.0)[:4]
+    torch.testing.assert_close(played["action"][0].double(), optimum, rtol=0.1, atol=0.3)
+    fresh = GradientPlanner(env, HORIZON, 2, warm_up=2, samples=4, seed=0)
+    alone = at(1.0)
+    assert (fresh.planning(alone).double() - optimum[0]).abs() > (played["action"][0, 0].double() - optimum[0]).abs()
+
+
+def test_rows_are_planned_on_their_own():
+    env = point_env(20.0)
+    optimum = GradientPlanner(env, HORIZON, warm_up=150, samples=1, candidates=1, seed=0)
+    both, one = at(1.0, -2.0), at(1.0)
+    together = optimum.planning(both)
+    torch.testing.assert_close(together[:1], optimum.planning(one), rtol=0.05, atol=0.05)
+
+
+def test_candidates_find_what_one_sequence_misses():
+    """From the middle of two hills a single ascent may climb the lower one."""
+    scene = load_scene(POINT.replace("LIMIT", "1"), timestep=STEP)
+
+    def hills(state, action, next_state, task):
+        x = next_state[..., 1, :1]
+        return torch.exp(-((x - 0.4) ** 2) / 0.01) * 2 + torch.exp(-((x + 0.25) ** 2) / 0.01)
+
+    env, start = ModelEnv(Point(scene), hills), at(0.0)
+    many = GradientPlanner(env, HORIZON, warm_up=60, candidates=6, samples=6, seed=1)
+    many.planning(start)
+    states, _ = env.imagine(at(0.0), start["plan", "actions"][:, 0])
+    assert start["plan", "actions"].shape == (1, 6, HORIZON, 1)
+    assert states[0, -1, 1, 0] > 0.2
+
+
+def test_an_episode_that_begins_anew_is_planned_anew(monkeypatch):
+    scene = load_scene(POINT.replace("LIMIT", "5"), timestep=STEP)
+    planner = GradientPlanner(ModelEnv(Point(scene), quadratic), 4, 1, warm_up=3, samples=3, seed=0)
+    transforms = Compose(BatchSizeTransform(batch_size=[2]), StepCounter(2))
+    env = TransformedEnv(SceneEnv(scene, quadratic, seed=0), transforms)
+    seen = []
+    planning = planner.planning
+
+    def watched(tensordict):
+        seen.append(tensordict["plan", "planned"].flatten().tolist())
+        return planning(tensordict)
+
+    monkeypatch.setattr(planner, "planning", watched)
+    # TorchRL finds the primer by its name and appends it.
+    collector = Collector(env, planner, frames_per_batch=8, total_frames=8, auto_register_policy_transforms=True)
+    for data in collector:
+        assert data["action"].shape == (2, 4, 1)
+    assert seen[-4:] == [[False, False], [True, True], [False, False], [True, True]]
+
+
+def test_a_task_is_fixed_when_planning_starts():
+    scene = load_scene("swimmer3")
+    small = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
+    reward = make_reward("reach", scene)
+    imagined = ModelEnv(specialize(trained(scene, **small)), reward)
+    planner = GradientPlanner(imagined, 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
+    env = SceneEnv(scene, reward, seed=0)
+    start = env.reset(TensorDict(batch_size=[2]))
+    start["target"] = start["state"][:, 1, :3] + torch.tensor([[2.0, 0, 0], [0, 2, 0]])
+    with torch.no_grad():
+        played = env.rollout(3, TensorDictSequential(FixTask(reward), planner), tensordict=start, auto_reset=False)
+    assert played["action"].shape == (2, 3, scene.num_actions)
+    assert (played["next", "reward"] != 0).any()
+
+
+def test_a_recurrent_model_remembers_what_was_played():
+    scene = load_scene("pendulum")
+    small = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
+    bound = trained(scene, core="recurrent", memory=[4, 4, 4], **small)
+    reward = make_reward("balance", scene)
+    planner = GradientPlanner(ModelEnv(bound, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
+    acted = SceneEnv(scene, reward, seed=0)
+    start = acted.reset(TensorDict(batch_size=[2]))
+    with pytest.raises(KeyError, match="make_tensordict_primer"):
+        acted.rollout(2, planner, tensordict=start.clone(), auto_reset=False)
+    primed = TransformedEnv(acted, Compose(BatchSizeTransform(batch_size=[2]), planner.make_tensordict_primer()))
+    played = primed.rollout(4, planner)
+    _, memory = bound.observe(played["state"], played["action"])
+    for key, value in memory.items():
+        torch.testing.assert_close(played["next", "memory", key][:, -1], value)
+        assert (played["memory", key][:, 0] == 0).all()
+
+
+def test_what_an_inference_model_wrote_is_planned_with():
+    scene = load_scene("pendulum")
+    small = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
+    torch.manual_seed(0)
+    model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=[3, 3, 3], link=False, **small).double()
+    bound = model.bind(scene, static_key="static")
+    seen = collect_trajectories(scene, 5, 20, seed=0)
+    bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
+    reward = make_reward("balance", scene)
+    special = specialize(bound)
+    planner = GradientPlanner(ModelEnv(special, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
+    start = SceneEnv(scene, reward, seed=0).reset(TensorDict(batch_size=[2]))
+    static = bound.own_static().expand(2).apply(torch.randn_like)
+    start["static"] = static
+    planner(start)
+    total = planner._imagine(start.select("state", "static"), torch.zeros(2, 1, 3, 1))
+    for row in range(2):
+        other = static.clone()
+        other["nodes"][1 - row] += 1
+        changed = planner._imagine(start.select("state").set("static", other), torch.zeros(2, 1, 3, 1))
+        assert changed[row] == pytest.approx(total[row].item(), rel=1e-6)
+        assert changed[1 - row] != pytest.approx(total[1 - row].item(), rel=1e-6)
+    folds = special._folds
+    planner(start)
+    assert special._folds - folds <= 2  # of the candidates' values, not of every iteration's
+
+
+def test_what_is_not_finite_keeps_the_last_good_plan_and_says_so():
+    class Exploding(Point):
+        def forward(self, tensordict):
+            out = super().forward(tensordict)
+            bad = tensordict["state"][..., 1, :1] > 5
+            state = torch.where(bad.unsqueeze(-1), torch.nan, out["next", "state"])
+            return out.set(("next", "state"), state)
+
+    env = ModelEnv(Exploding(load_scene(POINT.replace("LIMIT", "2"), timestep=STEP)), quadratic)
+    planner = GradientPlanner(env, 4, 2, warm_up=5, samples=3, seed=0)
+    good = at(1.0, 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        planner.planning(good)
+    plan = good["plan", "actions"].clone()
+    good["state"][1, 1, 0] = 9.0
+    with pytest.warns(RuntimeWarning, match="1 of 2 states has predictions or rewards that are not finite"):
+        action = planner.planning(good)
+    assert action.isfinite().all()
+    torch.testing.assert_close(action[1], plan[1, 0, 0])
+
+
+def test_gradients_are_opened_under_no_grad_and_refused_in_inference_mode():
+    planner = GradientPlanner(point_env(2.0), 3, 1, warm_up=2, samples=2, seed=0)
+    with torch.no_grad():
+        assert planner(at(1.0))["action"].shape == (1, 1)
+    with torch.inference_mode(), pytest.raises(RuntimeError, match="torch.no_grad"):
+        planner(at(1.0))
+
+
+def test_a_copy_plans_the_same():
+    planner = GradientPlanner(point_env(2.0), 3, 1, warm_up=2, samples=2, seed=0)
+    torch.testing.assert_close(copy.deepcopy(planner)(at(1.0))["action"], planner(at(1.0))["action"])
+
+
+def test_bad_input_is_named():
+    env = point_env(2.0)
+    for options, message in (
+        ({"horizon": 0}, "horizon must be at least 1, got 0"),
+        ({"horizon": 3, "iterations": 0}, "iterations must be at least 1"),
+        ({"horizon": 3, "candidates": 0}, "candidates must be at least 1"),
+        ({"horizon": 3, "warm_up": -1}, "warm_up must not be negative"),
+        ({"horizon": 3, "noise": 2.0}, "noise must be in"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            GradientPlanner(env, **options)
+    with pytest.raises(TypeError, match="On the true physics use ILQGPlanner"):
+        GradientPlanner(SceneEnv(env.scene, quadratic), 3)
+    with pytest.raises(ValueError, match="no reward to plan for"):
+        GradientPlanner(ModelEnv(Point(env.scene)), 3)
+    still = load_scene('<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
+    with pytest.raises(ValueError, match="no actions to plan"):
+        GradientPlanner(ModelEnv(Point(still), quadratic), 3)
+    deaf = ModelEnv(Point(env.scene), lambda state, action, next_state, task: state.detach()[..., 1, :1])
+    with pytest.raises(ValueError, match="do not depend on the actions"):
+        GradientPlanner(deaf, 1, 1, warm_up=1, samples=2, seed=0).planning(at(1.0))
+    planner, start = GradientPlanner(env, 3, 1, warm_up=1, samples=2, seed=0), at(1.0)
+    planner.planning(start)
+    with pytest.raises(ValueError, match="comes from another planner"):
+        GradientPlanner(env, 5, 1, warm_up=1, samples=2, seed=0).planning(start)

@@ -1,0 +1,390 @@
+"""iLQG against the Riccati equation, a bounded optimiser, a swing-up, and what TorchRL asks of a planner."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import lsq_linear
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, StepCounter, TransformedEnv
+
+from torchrl_gn.data import sample_start_states
+from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.planners.ddp import QuadraticModel, backward_pass
+from torchrl_gn.planners.ilqg import ILQGPlanner
+from torchrl_gn.rewards import make_reward
+from torchrl_gn.scenes import Scene, load_scene
+
+SUBSTEPS, STEP, MASS = 4, 0.01, 2.0
+POINT = f"""
+<mujoco model="point">
+  <option timestep="{STEP}" gravity="0 0 0"/>
+  <worldbody>
+    <body name="point">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="y" type="slide" axis="0 1 0"/>
+      <geom type="sphere" size=".1" mass="{MASS}"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="x" ctrlrange="-LIMIT LIMIT" ctrllimited="true"/>
+    <motor joint="y" ctrlrange="-LIMIT LIMIT" ctrllimited="true"/>
+  </actuator>
+</mujoco>
+"""
+FREE_BODY = """
+<mujoco model="free">
+  <worldbody><body name="ball"><freejoint/><geom size=".1"/></body></worldbody>
+</mujoco>
+"""
+SPEED_WEIGHT, CONTROL_COST, HORIZON = 0.1, 0.02, 25
+
+
+def quadratic(state, action, next_state, task):
+    """Near a target [*B, 3] (the origin without one), slowly."""
+    point = next_state[..., 1, :]
+    off = point[..., :3] if task is None else point[..., :3] - task
+    return -(off.square().sum(-1) + SPEED_WEIGHT * point[..., 7:10].square().sum(-1)).unsqueeze(-1)
+
+
+def point_scene(limit: float) -> Scene:
+    return load_scene(POINT.replace("LIMIT", str(limit)), timestep=SUBSTEPS * STEP)
+
+
+def point_env(limit: float, reward=quadratic) -> SceneEnv:
+    return SceneEnv(point_scene(limit), reward, num_threads=1, seed=0)
+
+
+def point_planner(env: SceneEnv, iterations: int = 2, **options) -> ILQGPlanner:
+    options = {"control_cost": CONTROL_COST, "seed": 0, **options}
+    return ILQGPlanner(env, HORIZON, iterations, **options)
+
+
+def physics_of(env: SceneEnv, *rows: list[float]) -> torch.Tensor:
+    """Physics ``[n, S]`` of rows of positions and velocities."""
+    physics = torch.from_numpy(sample_start_states(env.scene, len(rows), 0))
+    physics[:, 1:] = torch.tensor(rows, dtype=torch.float64)
+    return physics
+
+
+def point_dynamics(limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Exact ``A`` and ``B`` of (x, y, vx, vy) in a control step; MuJoCo's Euler moves by the new velocity."""
+    a, b = np.eye(4), np.zeros((4, 2))
+    one = np.eye(4)
+    one[:2, 2:] = STEP * np.eye(2)
+    push = np.concatenate([STEP**2 * np.eye(2), STEP * np.eye(2)]) * limit / MASS
+    for _ in range(SUBSTEPS):
+        a, b = one @ a, one @ b + push
+    return a, b
+
+
+def riccati(limit: float, start: np.ndarray) -> np.ndarray:
+    """Optimal controls ``[H, 2]``, in units of the limit, without regard to it."""
+    a, b = point_dynamics(limit)
+    weight = np.diag([1.0, 1.0, SPEED_WEIGHT, SPEED_WEIGHT])
+    value, gains = np.zeros((4, 4)), []
+    for _ in range(HORIZON):
+        total = weight + value
+        gain = np.linalg.solve(CONTROL_COST * np.eye(2) + b.T @ total @ b, b.T @ total @ a)
+        value = a.T @ total @ (a - b @ gain)
+        gains.append(gain)
+    controls, state = [], start
+    for gain in reversed(gains):
+        controls.append(-gain @ state)
+        state = a @ state + b @ controls[-1]
+    return np.stack(controls)
+
+
+def bounded_optimum(limit: float, start: np.ndarray) -> np.ndarray:
+    """Optimal controls ``[H, 2]`` within -1 and 1, by bounded least squares."""
+    a, b = point_dynamics(limit)
+    root = np.sqrt([1.0, 1.0, SPEED_WEIGHT, SPEED_WEIGHT])[:, None]
+    by_controls, state, rows, offsets = np.zeros((4, 2 * HORIZON)), start, [], []
+    for t in range(HORIZON):
+        by_controls, state = a @ by_controls, a @ state
+        by_controls[:, 2 * t : 2 * t + 2] += b
+        rows.append(root * by_controls)
+        offsets.append(root[:, 0] * state)
+    rows.append(np.sqrt(CONTROL_COST) * np.eye(2 * HORIZON))
+    offsets.append(np.zeros(2 * HORIZON))
+    found = lsq_linear(np.concatenate(rows), -np.concatenate(offsets), (-1, 1), tol=1e-15, method="bvls")
+    return found.x.reshape(HORIZON, 2)
+
+
+@pytest.mark.parametrize("central", [False, True])
+def test_linear_quadratic_problem_reaches_the_riccati_optimum(central):
+    limit, start = 100.0, [0.5, -0.3, 0.2, 0.4]
+    env = point_env(limit)
+    planner = point_planner(env, warm_up=8, central=central)
+    plan = planner.plan(TensorDict({"physics": physics_of(env, start)}, [1]))[0].numpy() / limit
+    wanted = riccati(limit, np.array(start))
+    assert np.abs(wanted).max() < 0.9
+    np.testing.assert_allclose(plan, wanted, atol=1e-7)
+
+
+def test_limits_that_are_hit_equal_a_bounded_optimiser():
+    limit, start = 2.0, [0.5, -0.3, 0.2, 0.4]
+    env = point_env(limit)
+    planner = point_planner(env, warm_up=10)
+    plan = planner.plan(TensorDict({"physics": physics_of(env, start)}, [1]))[0].numpy() / limit
+    wanted = bounded_optimum(limit, np.array(start))
+    hit = np.abs(wanted) > 1 - 1e-9
+    assert 0.2 < hit.mean() < 0.8
+    np.testing.assert_allclose(plan, wanted, atol=1e-6)
+
+
+def test_swings_the_pendulum_up():
+    scene = load_scene("pendulum")
+    env = SceneEnv(scene, make_reward("balance", scene), num_threads=1, seed=0)
+    planner = ILQGPlanner(env, 50, 1, seed=0)
+    acted = TransformedEnv(env, planner.make_tensordict_primer())
+    start = acted.reset(TensorDict({"physics": physics_of(env, [1.3, 0.0])[0]}), set_state=True)
+    played = acted.rollout(160, planner, tensordict=start, auto_reset=False)
+    angle = -played["next", "reward"].flatten()
+    assert angle.max() > 2.5  # torque alone does not lift it: it must swing the other way first
+    assert angle[-25:].max() < 0.1
+
+
+def test_rows_of_a_batch_are_planned_by_themselves():
+    env = point_env(5.0)
+    planner = point_planner(env)
+    rng = torch.Generator().manual_seed(0)
+    count = 6
+    given = TensorDict(
+        {
+            "physics": physics_of(env, *torch.randn(count, 4, generator=rng).tolist()),
+            "task": torch.randn(count, 3, generator=rng, dtype=torch.float64),
+            "plan": {
+                "actions": torch.randn(count, HORIZON, 2, generator=rng, dtype=torch.float64),
+                "planned": torch.ones(count, 1, dtype=torch.bool),
+            },
+        },
+        [count],
+    )
+    before = given.clone()
+    together = planner(given.reshape(2, 3).clone())
+    assert together["action"].shape == (2, 3, 2) and together["action"].dtype == torch.float32
+    assert together["plan", "actions"].shape == (2, 3, HORIZON, 2)
+    assert together["plan", "planned"].all()
+    together = together.reshape(-1)
+    for row in range(count):
+        alone = planner(given[row].clone())
+        for key in ("action", ("plan", "actions")):
+            torch.testing.assert_close(together[row][key], alone[key], rtol=0, atol=1e-9)
+    # A task that says nothing else than where to go: the plans go there.
+    assert together["action"].std(0).min() > 0.1
+    assert (given == before).all()
+
+
+def test_plan_is_shifted_and_improved():
+    env = point_env(5.0)
+    planner = point_planner(env, warm_up=6)
+    first = planner(env.reset())
+    plan = point_planner(env, warm_up=6).plan(first.exclude("action", "plan"))
+    torch.testing.assert_close(first["plan", "actions"][-1], first["plan", "actions"][-2])
+    torch.testing.assert_close(first["action"].double(), plan[0], rtol=0, atol=1e-3)
+    torch.testing.assert_close(first["plan", "actions"][:-1], plan[1:], rtol=0, atol=1e-3)
+
+
+def test_same_seed_same_actions():
+    env = point_env(5.0)
+    start = env.reset()
+    first, same, other = (point_planner(env, 1, warm_up=0, seed=seed)(start.clone())["action"] for seed in (1, 1, 2))
+    assert torch.equal(first, same)
+    assert not torch.equal(first, other)
+
+
+def test_beats_the_random_sequences_it_starts_from_on_contacts():
+    scene = load_scene("cheetah")
+    node = scene.node_names.index("torso")
+
+    def forward(state, action, next_state, task):
+        return next_state[..., node, 7:8]
+
+    env = SceneEnv(scene, forward, num_threads=1, seed=0)
+    start = env.reset()
+    returns = []
+    for warm_up in (0, 10):
+        plan = ILQGPlanner(env, 20, 1, warm_up, seed=0).plan(start)
+        assert (plan.abs() <= 1).all()
+        simulated = env.simulator.rollout(start["physics"], plan)
+        returns.append(float(simulated["state"][1:, node, 7].sum()))
+    assert returns[1] > returns[0] + 5
+
+
+def test_primer_and_collector():
+    scene = load_scene("pendulum")
+    env = SceneEnv(scene, make_reward("balance", scene), num_threads=1, seed=0)
+    planner = ILQGPlanner(env, 8, 1, 2, seed=0)
+    acted = TransformedEnv(env, Compose(StepCounter(max_steps=5), planner.make_tensordict_primer()))
+    known, plan = [], planner.plan
+
+    def watched(tensordict):
+        known.append(bool(tensordict["plan", "planned"]))
+        return plan(tensordict)
+
+    planner.plan = watched
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        played = acted.rollout(5, planner)
+        assert known == [False] + [True] * 4
+        known.clear()
+        collector = Collector(
+            acted, planner, frames_per_batch=12, total_frames=12, auto_register_policy_transforms=False
+        )
+        data = next(iter(collector))
+        collector.shutdown()
+    assert played["plan", "actions"].shape == (5, 8, 1)
+    assert data["action"].shape == (12, 1)
+    # Before it begins, the collector tries the policy once.
+    assert known[-12:] == ([False] + [True] * 4) * 2 + [False, True]
+
+
+def test_without_a_primer_the_plan_goes_on():
+    env = point_env(5.0)
+    planner = point_planner(env, 1, warm_up=5)
+    rewards = env.rollout(HORIZON, planner)["next", "reward"]
+    assert rewards[-1] > -1e-3 and rewards[-1] >= rewards[0]
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_works_without_gradients(mode):
+    env = point_env(5.0)
+    physics, task = physics_of(env, [0.5, 0.1, 0, 0]), torch.ones(1, 3, dtype=torch.float64)
+    wanted = point_planner(env)(TensorDict({"physics": physics, "task": task}, [1]))
+    with mode():
+        given = TensorDict({"physics": physics + 0, "task": task + 0}, [1])
+        found = point_planner(env)(given)
+    assert torch.equal(found["action"], wanted["action"])
+    assert not wanted["plan", "actions"].requires_grad
+
+
+def test_task_may_be_a_tensordict():
+    def reward(state, action, next_state, task):
+        return quadratic(state, action, next_state, task["target"])
+
+    target = torch.tensor([[1.0, 0, 0], [0, -1.0, 0]], dtype=torch.float64)
+    physics = physics_of(point_env(5.0), [0.0] * 4, [0.0] * 4)
+    wanted = point_planner(point_env(5.0))(TensorDict({"physics": physics, "task": target}, [2]))
+    given = TensorDict({"physics": physics, "task": TensorDict({"target": target}, [2])}, [2])
+    assert torch.equal(point_planner(point_env(5.0, reward))(given)["action"], wanted["action"])
+
+
+def test_controls_that_do_the_same_share_the_work():
+    # One state, pushed by two controls alike, without any cost of them.
+    dynamics = np.tile(np.array([[1.0, 1.0, 1.0]]), (3, 1, 1))
+    by_all = np.ones((3, 3))
+    model = QuadraticModel(dynamics, np.ones((3, 3)), np.tile(by_all, (3, 1, 1)), -np.ones((3, 2)), np.ones((3, 2)))
+    changes, gains = backward_pass(model, np.array([0.0, 1e-20]), np.zeros(2))
+    assert np.isfinite(changes).all() and np.isfinite(gains).all()
+    np.testing.assert_allclose(changes[..., 0], changes[..., 1], atol=1e-6)
+    np.testing.assert_allclose(changes.sum(-1), -1, atol=1e-6)
+    np.testing.assert_allclose(gains.sum(-2), -1, atol=1e-6)
+
+
+def test_controls_are_costly():
+    env = point_env(5.0)
+    start = TensorDict({"physics": physics_of(env, [0.5, 0, 0, 0])}, [1])
+    cheap, dear = (point_planner(env, control_cost=cost).plan(start) for cost in (1e-3, 10.0))
+    assert dear.abs().max() < 0.1 * cheap.abs().max()
+
+
+def test_output_tensordict():
+    env = point_env(5.0)
+    given, out = env.reset(), TensorDict()
+    assert point_planner(env)(given, out) is out
+    assert set(out.keys(True, True)) == {"action", ("plan", "actions"), ("plan", "planned")}
+    assert "action" not in given and "next" not in given
+
+
+def test_unstable_states_keep_their_plan_and_warn_once():
+    scene = load_scene("pendulum")
+    env = SceneEnv(scene, make_reward("balance", scene), num_threads=1)
+    planner = ILQGPlanner(env, 5, 1, seed=0)
+    physics = physics_of(env, [1.0, 0.0], [1.0, 0.99e10])
+    actions = torch.linspace(-0.9, 0.9, 10, dtype=torch.float64).reshape(2, 5, 1)
+    plan = {"actions": actions.clone(), "planned": torch.ones(2, 1, dtype=torch.bool)}
+    given = TensorDict({"physics": physics, "plan": plan}, [2])
+    physics[1, 1:] = torch.tensor([1e10, 1e10])
+    with pytest.warns(RuntimeWarning, match="unstable whatever is done") as caught:
+        planned = planner.plan(given)
+        planner.plan(given)
+        rest = planner.plan(given.exclude("plan"))
+    assert len(caught) == 1
+    assert torch.equal(planned[1], actions[1])
+    assert not torch.equal(planned[0], actions[0])
+    assert (rest[1] == 0).all()
+
+
+def test_a_reward_that_is_no_number_keeps_the_plan():
+    def reward(state, action, next_state, task):
+        return quadratic(state, action, next_state, None) * float("nan")
+
+    env = point_env(5.0, reward)
+    plan = {"actions": torch.ones(HORIZON, 2, dtype=torch.float64), "planned": torch.ones(1, dtype=torch.bool)}
+    with pytest.warns(RuntimeWarning, match="not finite"):
+        planned = point_planner(env).plan(env.reset().set("plan", TensorDict(plan)))
+    assert torch.equal(planned, plan["actions"])
+
+
+def test_a_gradient_that_is_no_number_keeps_the_plan():
+    def reward(state, action, next_state, task):
+        return quadratic(state, action, next_state, None) + 0 * (0 * next_state[..., 1, :1]).sqrt()
+
+    env = point_env(5.0, reward)
+    plan = {"actions": torch.ones(HORIZON, 2, dtype=torch.float64), "planned": torch.ones(1, dtype=torch.bool)}
+    planned = point_planner(env).plan(env.reset().set("plan", TensorDict(plan)))
+    assert torch.equal(planned, plan["actions"])
+
+
+def test_copies_and_pickles_plan_alike():
+    env = point_env(5.0)
+    planner = point_planner(env, num_threads=1)
+    start = env.reset()
+    planner(start.clone())
+    copies = [copy.deepcopy(planner), pickle.loads(pickle.dumps(planner))]
+    wanted = planner(start.clone())["action"]
+    for other in copies:
+        assert torch.equal(other(start.clone())["action"], wanted)
+
+
+def test_refuses_what_it_cannot_plan():
+    env = point_env(5.0)
+    for name, value in (("horizon", 0), ("iterations", 0), ("warm_up", -1), ("control_cost", -1.0)):
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            ILQGPlanner(env, **{"horizon": 3, name: value})
+    with pytest.raises(TypeError, match="SceneEnv, got TransformedEnv"):
+        ILQGPlanner(TransformedEnv(env), 3)  # pyright: ignore
+    with pytest.raises(TypeError, match="got ModelEnv"):
+        ILQGPlanner(ModelEnv.__new__(ModelEnv), 3)  # pyright: ignore
+    with pytest.raises(ValueError, match="no reward"):
+        ILQGPlanner(SceneEnv(env.scene), 3)
+    with pytest.raises(ValueError, match="no actions"):
+        ILQGPlanner(SceneEnv(load_scene(FREE_BODY), quadratic), 3)
+    unlimited = SceneEnv(env.scene, quadratic)
+    unlimited.scene = replace(env.scene, action_high=np.array([np.inf, 1.0]))
+    with pytest.raises(ValueError, match="without bounds"):
+        ILQGPlanner(unlimited, 3)
+    planner = ILQGPlanner(env, 3, 1)
+    start = env.reset()
+    with pytest.raises(KeyError, match="'physics'"):
+        planner(start.exclude("physics"))
+    with pytest.raises(ValueError, match="'physics' must be"):
+        planner(start.clone().set("physics", torch.zeros(2)))
+    with pytest.raises(ValueError, match="finite"):
+        planner(start.clone().set("physics", torch.full((env.scene.physics_size,), torch.nan, dtype=torch.float64)))
+    with pytest.raises(ValueError, match="comes from another planner"):
+        planner(start.clone().set("plan", TensorDict(actions=torch.zeros(4, 2), planned=torch.ones(1).bool())))
+    env.reward = lambda state, action, next_state, task: torch.zeros(*action.shape[:-1], 1)
+    with pytest.raises(ValueError, match="autograd can differentiate"):
+        planner(start.clone())
+    env.reward = lambda state, action, next_state, task: next_state[..., 1, 0]
+    with pytest.raises(ValueError, match="the reward must be"):
+        planner(start.clone())

@@ -1,0 +1,47 @@
+"""Recipes as a user starts them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def start() -> Callable[..., subprocess.Popen]:
+    """Start a recipe in the background."""
+    return _start
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., tuple[int, str, str]]:
+    """Exit code, output and errors of a recipe."""
+    return _run
+
+
+def _start(*options: str, recipe: str = "forward_model") -> subprocess.Popen:
+    """Start a recipe in the background."""
+    pytest.importorskip("hydra")
+    command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *options]
+    environment = os.environ | {"WANDB_MODE": "offline"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # Shells let what they start in the background ignore Ctrl-C, and so would the recipe.
+    return subprocess.Popen(command, env=environment, preexec_fn=_listen_to_ctrl_c, **pipes)
+
+
+def _listen_to_ctrl_c() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
+    """Exit code, output and errors of a recipe."""
+    process = _start(*options, recipe=recipe)
+    output, errors = process.communicate(timeout=120)
+    return process.returncode, output, errors

@@ -1,0 +1,4 @@
+"""Planners: gradient MPC through the learned model, iLQG on the true physics."""
+
+from torchrl_gn.planners.gradient_planner import GradientPlanner as GradientPlanner
+from torchrl_gn.planners.ilqg import ILQGPlanner as ILQGPlanner

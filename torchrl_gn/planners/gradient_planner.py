@@ -1,0 +1,239 @@
+"""Model-predictive control by gradients through the learned model."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import cast
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TensorDictPrimer
+from torchrl.modules.planners.common import MPCPlannerBase
+
+from torchrl_gn.data.controls import spline_controls
+from torchrl_gn.envs.model_env import ModelEnv
+from torchrl_gn.planners.plan import check_plannable, plan_primer, read_plan, write_plan
+
+OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
+
+
+class GradientPlanner(MPCPlannerBase):
+    """Choose the actions whose imagined rewards are highest, by gradient ascent.
+
+    (Paper, SM "MPC planner with learned models".)
+    At every control step the rewards of the next ``horizon`` steps are imagined in one rollout of the model
+    (:meth:`~torchrl_gn.envs.ModelEnv.imagine`), differentiated with respect to the actions, and the actions changed, a
+    number of times. The first is taken; the others, shifted by one step and with the last repeated, are where the
+    next control step's planning starts (receding horizon). The best sequence seen counts, not the last.
+
+    A plan is the TensorDict's entry ``plan``: the planner itself keeps nothing, serves any batch, and an episode's
+    first call is one without that entry. It then draws smooth random sequences and improves the best ones for
+    ``warm_up`` iterations. Where episodes end and begin anew inside one rollout, :meth:`make_tensordict_primer` clears
+    the plan; ``Collector(..., auto_register_policy_transforms=True)`` appends it to the environment by itself.
+
+    Plan with a specialised model, ``ModelEnv(specialize(bound, compile=True), reward)``: several times as fast.
+    Works under ``no_grad`` and not under ``inference_mode``, where nothing has a gradient.
+
+    Args:
+        env: the learned model with the reward to plan for.
+        horizon: control steps to look ahead.
+        iterations: changes of the plan at each control step (paper: 3 to 51).
+        warm_up: changes of a first plan. Default: ``iterations * horizon`` (paper), at most 200.
+        candidates: sequences that are improved at a time, each on its own; the best one acts.
+        samples: random sequences of which a first plan takes the best ones; at least ``candidates``. At every control
+            step half of the candidates, the worst ones, start anew close to the best.
+        noise: how far from the best, as a share of the actions' range.
+        optimizer: makes the optimiser of the actions, which it sees in units of half their range.
+            Default: Adam with a rate of 0.1.
+        action_cost: subtracted for each step's mean squared action, in those units.
+        seed: of the random sequences. Default: drawn from torch's global generator.
+
+    Raises:
+        TypeError: if ``env`` is no ``ModelEnv``.
+        ValueError: if a number is out of its range, the environment has no reward or the scene no actions; when
+            planning, if rewards do not depend on the actions.
+        RuntimeError: when planning, in inference mode.
+    """
+
+    def __init__(
+        self,
+        env: ModelEnv,
+        horizon: int,
+        iterations: int = 10,
+        *,
+        warm_up: int | None = None,
+        candidates: int = 1,
+        samples: int = 64,
+        noise: float = 0.25,
+        optimizer: OptimizerFactory | None = None,
+        action_cost: float = 0.0,
+        seed: int | None = None,
+    ) -> None:
+        if not isinstance(env, ModelEnv):
+            raise TypeError(
+                f"GradientPlanner plans through a ModelEnv, which has gradients; got {type(env).__name__}."
+                " On the true physics use ILQGPlanner."
+            )
+        check_plannable(env, horizon=horizon, iterations=iterations, candidates=candidates)
+        samples = max(samples, candidates)
+        if warm_up is not None and warm_up < 0:
+            raise ValueError(f"warm_up must not be negative, got {warm_up}")
+        if not 0 <= noise <= 1 or not action_cost >= 0:
+            raise ValueError(f"noise must be in [0, 1] and action_cost not negative, got {noise} and {action_cost}")
+        super().__init__(env)
+        self.horizon, self.iterations = horizon, iterations
+        self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
+        self.candidates, self.samples, self.noise, self.action_cost = candidates, samples, noise, action_cost
+        self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)
+        low, high = torch.as_tensor(env.scene.action_low), torch.as_tensor(env.scene.action_high)
+        self.register_buffer("middle", ((low + high) / 2).float())
+        self.register_buffer("half_range", ((high - low) / 2).float())
+        self.to(env.device)
+        seed = int(torch.randint(2**31, ()).item()) if seed is None else seed
+        self._rng = np.random.default_rng(seed)
+
+    middle: Tensor
+    half_range: Tensor
+
+    @property
+    def imagined(self) -> ModelEnv:
+        """The environment that is planned in."""
+        return cast(ModelEnv, self.env)
+
+    @property
+    def plan_shape(self) -> tuple[int, int, int]:
+        """Shape of a sample's plan: candidates, horizon, actions."""
+        return self.candidates, self.horizon, self.imagined.scene.num_actions
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Transform that clears the plan when an episode begins, for the environment that is acted in.
+
+        Of a recurrent model it also carries what that remembers.
+        """
+        memory = cast(TensorDictBase, self.imagined.world_model.own_memory()) if self._remembers else None
+        return plan_primer(self.plan_shape, torch.float32, self.imagined.device, memory)
+
+    def planning(self, td: TensorDictBase) -> Tensor:
+        """The action to take now, ``[*B, A]``; the rest of the plan is written to ``td``."""
+        if torch.is_inference_mode_enabled():
+            raise RuntimeError(
+                "GradientPlanner needs gradients, which torch.inference_mode() rules out; use torch.no_grad() there."
+            )
+        batch = td.shape
+        flat = td.reshape(-1)
+        plan, planned = read_plan(flat, self.plan_shape, torch.float32)
+        plan, planned = (plan - self.middle) / self.half_range, planned.flatten()
+        entries = self._entries(flat)
+        if self._remembers and "memory" not in entries.keys() and bool(planned.any()):
+            raise KeyError(
+                "The model remembers past states, and the environment drops its entry 'memory' between steps: append"
+                " the planner's make_tensordict_primer() to the environment that is acted in."
+            )
+        best = plan.clone()
+        for rows, iterations in ((~planned, self.warm_up), (planned, self.iterations)):
+            where = rows.nonzero().flatten()
+            if len(where) == 0:
+                continue
+            some = entries if len(where) == len(flat) else cast(TensorDictBase, entries[where])
+            begin = plan[where] if bool(planned[where[0]]) else self._first(some)
+            best[where] = self._improve(some, begin, iterations)
+        actions = best * self.half_range + self.middle
+        write_plan(td, actions.reshape(*batch, *self.plan_shape))
+        if self._remembers:
+            td.set(("next", "memory"), self._remember(entries, actions[:, 0, 0]).reshape(batch))
+        return actions[:, 0, 0].reshape(*batch, -1)
+
+    @property
+    def _remembers(self) -> bool:
+        return "memory" in self.imagined.world_model.in_keys
+
+    @torch.no_grad()
+    def _remember(self, entries: TensorDictBase, action: Tensor) -> TensorDictBase:
+        """What the model remembers once it has seen this state and action."""
+        action = self.env.action_spec.project(action)
+        return self.imagined.world_model(entries.copy().set("action", action))["next", "memory"]
+
+    def _entries(self, flat: TensorDictBase) -> TensorDictBase:
+        """What imagining reads, detached."""
+        keys = [key for key in (*self.imagined.world_model.in_keys, "task") if key != "action"]
+        return flat.select(*keys, strict=False).detach().to(self.imagined.device)
+
+    def _imagine(self, many: TensorDictBase, plan: Tensor) -> Tensor:
+        """Returns ``[B, K]`` of sequences ``[B, K, H, A]`` in units of half their range, from ``[B K]`` states."""
+        _, rewards = self.imagined.imagine(many, (plan * self.half_range + self.middle).flatten(0, 1))
+        total = rewards.sum((-2, -1)).reshape(plan.shape[:2])
+        return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
+
+    def _first(self, entries: TensorDictBase) -> Tensor:
+        """The best of random sequences ``[B, K, H, A]``; and doing nothing is among them."""
+        rows = len(entries)
+        drawn = self._splines(rows, self.samples)
+        drawn[:, 0] = (-self.middle / self.half_range).clamp(-1, 1)
+        if self.samples == self.candidates:
+            return drawn
+        with torch.no_grad():
+            total = self._imagine(_repeated(entries, self.samples), drawn).nan_to_num(
+                -torch.inf, -torch.inf, -torch.inf
+            )
+        best = total.topk(self.candidates, dim=1).indices
+        return drawn.gather(1, best[..., None, None].expand(-1, -1, *drawn.shape[2:]))
+
+    def _splines(self, rows: int, count: int) -> Tensor:
+        drawn = spline_controls(self.imagined.scene, rows * count, self.horizon, self._rng)
+        controls = torch.from_numpy(drawn).float().to(self.half_range.device)
+        return ((controls - self.middle) / self.half_range).reshape(rows, count, self.horizon, -1)
+
+    def _improve(self, entries: TensorDictBase, plan: Tensor, iterations: int) -> Tensor:
+        """Sequences ``[B, K, H, A]`` improved, the best one first."""
+        renewed = self.candidates // 2
+        if renewed:
+            noise = self.noise * self._splines(len(plan), renewed)
+            plan = torch.cat([plan[:, : self.candidates - renewed], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
+        # The same tensors in every iteration: what the model folds of them is folded once.
+        many = _repeated(entries, self.candidates)
+        best, record = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
+        actions = plan.clone().requires_grad_()
+        optimizer = self.optimizer([actions])
+        for _ in range(iterations):
+            with torch.enable_grad():
+                total = self._imagine(many, actions)
+                if not total.requires_grad:
+                    raise ValueError(
+                        f"The rewards that {self.imagined} imagines do not depend on the actions. Has its model been"
+                        " trained, and is the horizon long enough for the reward to show what actions do?"
+                    )
+                (gradient,) = torch.autograd.grad(-total.sum(), actions)
+            best, record = _keep_better(best, record, actions, total)
+            # A sequence whose rollout leaves all bounds has no usable gradient: it stays where it is.
+            usable = gradient.isfinite().flatten(2).all(-1)[..., None, None]
+            actions.grad = torch.where(usable, gradient, 0.0)
+            optimizer.step()
+            with torch.no_grad():
+                actions.clamp_(-1, 1)
+        with torch.no_grad():
+            best, record = _keep_better(best, record, actions, self._imagine(many, actions))
+        lost = int((record == -torch.inf).all(1).sum())
+        if lost:
+            warnings.warn(
+                f"{self.imagined}: every imagined rollout of {lost} of {len(plan)} states has predictions or rewards"
+                " that are not finite; their last plan is kept.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        order = record.argsort(dim=1, descending=True, stable=True)
+        return best.gather(1, order[..., None, None].expand_as(best))
+
+
+def _repeated(entries: TensorDictBase, count: int) -> TensorDictBase:
+    return entries if count == 1 else entries.repeat_interleave(count, dim=0)
+
+
+def _keep_better(best: Tensor, record: Tensor, actions: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """The better of sequences seen before and now, each by its return; one that is not finite is never better."""
+    total = total.detach()
+    better = total > record  # False for NaN
+    return torch.where(better[..., None, None], actions.detach(), best), torch.where(better, total, record)

@@ -1,0 +1,104 @@
+"""A planner's plan as an entry of the TensorDict, so that planners keep nothing themselves."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import TensorDictPrimer
+
+from torchrl_gn.envs.model_env import ModelEnv
+from torchrl_gn.envs.scene_env import SceneEnv
+
+# An entry that an environment does not know stays as it is from step to step, and so does a primer's, which also sets
+# it back when an episode begins.
+KEY = "plan"
+
+
+def check_plannable(env: ModelEnv | SceneEnv, **counts: int) -> None:
+    """Refuse what no planner can plan with.
+
+    Args:
+        env: the environment to plan in; it needs a reward and actions with bounds.
+        **counts: what must be at least 1, by name.
+
+    Raises:
+        ValueError: naming what is wrong.
+    """
+    for name, value in counts.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    scene = env.scene
+    if env.reward is None:
+        raise ValueError(f"{env} has no reward to plan for; give it one, as make_reward(task, scene).")
+    if scene.num_actions == 0:
+        raise ValueError(f"Scene {scene.name!r} has no actions to plan.")
+    if not (np.isfinite(scene.action_low) & np.isfinite(scene.action_high)).all():
+        raise ValueError(f"Scene {scene.name!r} has actions without bounds; give its motors a ctrlrange.")
+
+
+def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """The sequence of actions to go on from, and whether there is one.
+
+    Args:
+        tensordict: ``[*B]``.
+        shape: of a sample's sequences, ``(..., H, A)``.
+        dtype: of the actions.
+
+    Returns:
+        Actions ``[*B, *shape]``, zeros where there are none, and ``[*B, 1]`` bool, whether they were planned.
+
+    Raises:
+        ValueError: if they have another shape: the plan of another planner or horizon.
+    """
+    batch = tensordict.shape
+    plan = cast("TensorDictBase | None", tensordict.get(KEY, None))
+    if plan is None:
+        empty = torch.zeros(*batch, *shape, dtype=dtype, device=tensordict.device)
+        return empty, torch.zeros(*batch, 1, dtype=torch.bool, device=tensordict.device)
+    actions, planned = cast(Tensor, plan.get("actions")), cast(Tensor, plan.get("planned"))
+    if actions.shape != (*batch, *shape):
+        raise ValueError(
+            f"The TensorDict's plan is {list(actions.shape)}, this planner's is {[*batch, *shape]}: it comes from"
+            " another planner. Drop the entry 'plan', or give every planner its own episodes."
+        )
+    return actions.to(dtype), planned
+
+
+def write_plan(tensordict: TensorDictBase, actions: Tensor) -> None:
+    """Write what is left of a plan when its first action was taken, with the last one repeated.
+
+    Args:
+        tensordict: ``[*B]``; its entry ``plan`` is replaced.
+        actions: ``[*B, ..., H, A]``.
+    """
+    left = torch.cat([actions[..., 1:, :], actions[..., -1:, :]], dim=-2)
+    planned = torch.ones(*tensordict.shape, 1, dtype=torch.bool, device=actions.device)
+    plan = TensorDict({"actions": left, "planned": planned}, batch_size=tensordict.shape)
+    tensordict.set(KEY, plan)
+
+
+def plan_primer(
+    shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | None, memory: TensorDictBase | None = None
+) -> TensorDictPrimer:
+    """Transform that clears the plan when an episode begins; append it to the environment that is acted in.
+
+    Args:
+        shape: of a sample's sequences, ``(..., H, A)``.
+        dtype: of the actions.
+        device: of the environment.
+        memory: what a recurrent model remembers of nothing, zeros, to clear too.
+    """
+    spec = Composite(
+        actions=Unbounded(shape=torch.Size(shape), dtype=dtype, device=device),
+        planned=Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=device),
+    )
+    specs = {KEY: spec}
+    if memory is not None:
+        of = {str(key): Unbounded(shape=value.shape, dtype=value.dtype, device=device) for key, value in memory.items()}
+        specs["memory"] = Composite(of)
+    return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)

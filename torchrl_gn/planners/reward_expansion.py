@@ -1,0 +1,97 @@
+"""Value, gradient and curvature of a reward along a trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]  # state [*B, N, 13], action [*B, A], next state [*B, N, 13]
+
+
+class RewardExpansion:
+    """A reward of tensors as a function of arrays, with derivatives.
+
+    Autograd is opened inside, also under ``torch.no_grad`` and ``torch.inference_mode``; nothing flows
+    out of it.
+
+    Args:
+        reward: function ``(state, action, next_state, task) -> [*B, 1]``, each row by itself.
+        task: what the reward gets as task, without batch: a tensor, a TensorDict or None.
+        device: where the reward computes.
+    """
+
+    def __init__(self, reward: Callable[..., Tensor], task: Any, device: torch.device | str | None):
+        self.reward = reward
+        self.device = device
+        with torch.inference_mode(False):
+            # A clone, since autograd cannot record what inference mode made.
+            self.task = None if task is None else task.detach().clone()
+
+    def value(self, inputs: Inputs) -> np.ndarray:
+        """Rewards ``[*B]``."""
+        with torch.inference_mode(False), torch.no_grad():
+            return self._call(self._tensors(inputs)).cpu().numpy()
+
+    def derivatives(self, inputs: Inputs, jacobians: Inputs) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient and Gauss-Newton curvature by variables that the inputs depend on.
+
+        Args:
+            inputs: for ``T`` steps.
+            jacobians: of each input, flattened, by ``Z`` variables: ``[T, N * 13, Z]``, ``[T, A, Z]``,
+                ``[T, N * 13, Z]``.
+
+        Returns:
+            Gradient ``[T, Z]`` and curvature ``[T, Z, Z]``: that of the reward, of its inputs none.
+
+        Raises:
+            ValueError: the reward does not depend on its inputs differentiably.
+        """
+        num = jacobians[0].shape[-1]
+        with torch.inference_mode(False), torch.enable_grad():
+            columns = [torch.from_numpy(np.ascontiguousarray(j)).to(self.device) for j in jacobians]
+            gradients, _ = self._gradients(self._tensors(inputs))
+            terms = [_transposed(j, g.flatten(1)) for j, g in zip(columns, gradients, strict=True)]
+            gradient = (terms[0] + terms[1] + terms[2]).detach().cpu().numpy()
+            curvature = torch.zeros(len(inputs[1]), num, num, dtype=torch.float64)
+            if any(g.requires_grad for g in gradients):
+                # One copy of the trajectory a variable: rows do not mix, so one backward pass gives H J.
+                state, action, next_state = (np.broadcast_to(x, (num, *x.shape)) for x in inputs)
+                gradients, leaves = self._gradients(self._tensors((state, action, next_state)))
+                along = [j.permute(2, 0, 1).reshape(x.shape) for j, x in zip(columns, leaves, strict=True)]
+                pairs = [(g, v) for g, v in zip(gradients, along, strict=True) if g.requires_grad]
+                products = torch.autograd.grad(
+                    [g for g, _ in pairs], leaves, [v for _, v in pairs], allow_unused=True, materialize_grads=True
+                )
+                for j, p in zip(columns, products, strict=True):
+                    curvature += torch.einsum("tiz,yti->tzy", j, p.flatten(2)).detach().cpu()
+        return gradient, curvature.numpy()
+
+    def _gradients(self, leaves: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        leaves = tuple(leaf.requires_grad_() for leaf in leaves)
+        total = self._call(leaves).sum()
+        if not total.requires_grad:
+            raise ValueError(
+                f"iLQG needs a reward that autograd can differentiate; {self.reward} returned one without gradient."
+            )
+        gradients = torch.autograd.grad(total, leaves, create_graph=True, allow_unused=True, materialize_grads=True)
+        return gradients, leaves
+
+    def _call(self, tensors: tuple[Tensor, ...]) -> Tensor:
+        state, action, next_state = tensors
+        batch = action.shape[:-1]
+        task = None if self.task is None else self.task.expand(*batch, *self.task.shape)
+        value = self.reward(state, action, next_state, task)
+        if value.shape != (*batch, 1):
+            raise ValueError(f"the reward must be {[*batch, 1]}, {self.reward} returned {list(value.shape)}")
+        return value[..., 0]
+
+    def _tensors(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        return tuple(torch.from_numpy(np.array(x, dtype=np.float64, order="C")).to(self.device) for x in inputs)
+
+
+def _transposed(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix.transpose(1, 2) @ vector.unsqueeze(-1)).squeeze(-1)
