@@ -59,6 +59,22 @@ def test_matrix_is_blind_to_the_sign():
     assert torch.equal(quaternion.to_matrix(q), quaternion.to_matrix(-q))
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_few_and_many_are_computed_alike(dtype):
+    """Few go through one matrix product, many entry by entry: values and gradients."""
+    exact = torch.finfo(dtype).eps * 8
+    q, p = (torch.randn(5000, 4, generator=torch.Generator().manual_seed(k)).to(dtype) for k in (0, 1))
+    q[0] = 0
+    for function in (quaternion.to_matrix, lambda q: quaternion.product(q, p[: len(q)])):
+        leaves = [q.clone().requires_grad_(), q[:100].clone().requires_grad_()]
+        many, few = (function(leaf) for leaf in leaves)
+        torch.testing.assert_close(many[:100], few, rtol=exact, atol=exact)
+        gradients = [
+            torch.autograd.grad(out.square().sum(), leaf)[0] for out, leaf in zip((many, few), leaves, strict=True)
+        ]
+        torch.testing.assert_close(gradients[0][:100], gradients[1], rtol=20 * exact, atol=20 * exact)
+
+
 def test_conjugate_is_the_inverse():
     q = rotations(50)
     identity = torch.tensor([1.0, 0, 0, 0], dtype=q.dtype).expand_as(q)
