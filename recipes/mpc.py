@@ -233,9 +233,9 @@ def play(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv |
 
 def foresee(imagined: ModelEnv, now: TensorDictBase) -> Tensor:
     """The last state of the first episode's plan."""
-    plan = cast(Tensor, now["plan", "actions"])[:1, 0, :-1]
-    first = torch.cat((now["action"][:1, None], plan), dim=1)
-    return imagined.imagine(cast(TensorDictBase, now[:1]), first)[0][0, -1].detach()
+    # All episodes, as the planner has them: a compiled model is compiled for every number of rows.
+    actions = torch.cat((now["action"].unsqueeze(1), cast(Tensor, now["plan", "actions"])[:, 0, :-1]), dim=1)
+    return imagined.imagine(now, actions)[0][0, -1].detach()
 
 
 def distance_left(played: Episodes, target: Tensor) -> Tensor:

@@ -340,3 +340,19 @@ def test_bad_input_is_named():
     planner.planning(start)
     with pytest.raises(ValueError, match="comes from another planner"):
         GradientPlanner(env, 5, 1, warm_up=1, samples=2, seed=0).planning(start)
+
+
+def test_a_compiled_model_sees_one_number_of_rows(monkeypatch):
+    """Each other one would take minutes to compile for."""
+    env = point_env(20.0)
+    monkeypatch.setattr(env.world_model, "compile_steps", True, raising=False)
+    rows, imagine = [], env.imagine
+
+    def watched(entries, actions):
+        rows.append(len(actions))
+        return imagine(entries, actions)
+
+    monkeypatch.setattr(env, "imagine", watched)
+    start = at(1.0, -0.5)
+    GradientPlanner(env, HORIZON, 2, warm_up=3, samples=9, candidates=2, seed=0).planning(start)
+    assert set(rows) == {4} and len(rows) == 9 // 2 + 3 + 1

@@ -175,10 +175,13 @@ class GradientPlanner(MPCPlannerBase):
         drawn[:, 0] = (-self.middle / self.half_range).clamp(-1, 1)
         if self.samples == self.candidates:
             return drawn
+        # A compiled model is compiled for every number of rows, in minutes: give it the one that it gets later.
+        size = self.candidates if getattr(self.imagined.world_model, "compile_steps", False) else self.samples
+        drawn = drawn[:, : self.samples // size * size]
+        many = _repeated(entries, size)
         with torch.no_grad():
-            total = self._imagine(_repeated(entries, self.samples), drawn).nan_to_num(
-                -torch.inf, -torch.inf, -torch.inf
-            )
+            total = torch.cat([self._imagine(many, part) for part in drawn.split(size, dim=1)], dim=1)
+        total = total.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
         best = total.topk(self.candidates, dim=1).indices
         return drawn.gather(1, best[..., None, None].expand(-1, -1, *drawn.shape[2:]))
 
