@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 
 import pytest
@@ -11,12 +12,12 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import BatchSizeTransform, Compose, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import CEMPlanner, MPPIPlanner
 from torchrl.objectives.value import TDLambdaEstimator
 
-from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 
@@ -82,10 +83,10 @@ def test_time_limits_by_step_counter(env):
     assert not torch.equal(again, played["next", "state"][3])
 
 
-@pytest.mark.parametrize("batched", [False, True])
-def test_collector_and_replay_buffer(env, batched):
-    size = [BatchSizeTransform(batch_size=[4])] if batched else []
-    env = TransformedEnv(env, Compose(*size, StepCounter(max_steps=5)))
+@pytest.mark.parametrize("size", [None, 4])
+def test_collector_and_replay_buffer(env, size):
+    limit = StepCounter(max_steps=5)
+    env = TransformedEnv(env, limit) if size is None else batched(env, size).append_transform(limit)
     check_env_specs(env)
     policy = TensorDictModule(linear(1), in_keys=["state"], out_keys=["action"])
     collector = Collector(env, policy, frames_per_batch=40, total_frames=80, auto_register_policy_transforms=False)
@@ -99,6 +100,19 @@ def test_collector_and_replay_buffer(env, batched):
     assert sample["next", "state"].shape == (16, 2, 13)
     with torch.no_grad():
         torch.testing.assert_close(policy(sample.clone())["action"], sample["action"])
+
+
+def test_a_batch_has_starts_of_its_own(env):
+    many = batched(env, 2, 3)
+    for _ in range(2):
+        start = many.reset()
+        assert start.shape == (2, 3)
+        assert len({tuple(row) for row in start["state"].flatten(2).flatten(0, 1).tolist()}) == 6
+    copied = pickle.loads(pickle.dumps(many))
+    assert copied.rollout(3).shape == (2, 3, 3)
+    for wrong in ((), (0,)):
+        with pytest.raises(ValueError, match="at least 1"):
+            batched(env, *wrong)
 
 
 def test_serial_env(pendulum):

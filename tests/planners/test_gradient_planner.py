@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.envs import BatchSizeTransform, Compose, StepCounter, TransformedEnv
+from torchrl.envs import StepCounter
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.modules import FeatureSet, ForwardModel, specialize
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import FixTask, make_reward
@@ -203,8 +203,7 @@ def test_candidates_find_what_one_sequence_misses():
 def test_an_episode_that_begins_anew_is_planned_anew(monkeypatch):
     scene = load_scene(POINT.replace("LIMIT", "5"), timestep=STEP)
     planner = GradientPlanner(ModelEnv(Point(scene), quadratic), 4, 1, warm_up=3, samples=3, seed=0)
-    transforms = Compose(BatchSizeTransform(batch_size=[2]), StepCounter(2))
-    env = TransformedEnv(SceneEnv(scene, quadratic, seed=0), transforms)
+    env = batched(SceneEnv(scene, quadratic, seed=0), 2).append_transform(StepCounter(2))
     seen = []
     planning = planner.planning
 
@@ -245,7 +244,7 @@ def test_a_recurrent_model_remembers_what_was_played():
     start = acted.reset(TensorDict(batch_size=[2]))
     with pytest.raises(KeyError, match="make_tensordict_primer"):
         acted.rollout(2, planner, tensordict=start.clone(), auto_reset=False)
-    primed = TransformedEnv(acted, Compose(BatchSizeTransform(batch_size=[2]), planner.make_tensordict_primer()))
+    primed = batched(acted, 2).append_transform(planner.make_tensordict_primer())
     played = primed.rollout(4, planner)
     _, memory = bound.observe(played["state"], played["action"])
     for key, value in memory.items():

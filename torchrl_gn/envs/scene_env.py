@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from torchrl_gn.data.simulate import Simulator
@@ -29,6 +31,7 @@ class SceneEnv(EnvBase):
         - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which body
           states cannot give back.
         - ``action`` ``[*B, A]``: float32 in the spec, float64 accepted. MuJoCo clamps limited controls.
+        - ``variant`` ``[*B, 1]`` int64, only if there are several scenes: which of them a sample is of.
         - ``reward`` ``[*B, 1]`` float32; zero without ``reward``.
         - ``done``, ``terminated`` ``[*B, 1]``: true only where the simulation became unstable.
           Add TorchRL's ``StepCounter`` for a time limit.
@@ -41,11 +44,13 @@ class SceneEnv(EnvBase):
     given ones pass ``physics`` and ask for it: ``reset(tensordict, set_state=True)``
     (``set_state=False`` ignores the entry; TorchRL 0.14 warns when neither is said).
 
-    For a fixed number of environments in a collector, wrap it:
-    ``TransformedEnv(SceneEnv(scene), BatchSizeTransform(batch_size=[16]))``.
+    For a fixed number of environments in a collector: :func:`~torchrl_gn.envs.batched`.
+
+    Of several scenes, ``reset`` with ``set_state=True`` and an entry ``variant`` alone starts those variants.
 
     Args:
-        scene: the scene.
+        scene: the scene, or variants of one (:func:`~torchrl_gn.scenes.sample_variants`). A batch starts with them in
+            turn, or with those that the TensorDict's ``variant`` says; ``env.scene`` is the first.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``, for example
             from :func:`~torchrl_gn.rewards.make_reward`; ``task`` is the TensorDict's ``task``
             entry or None.
@@ -78,7 +83,7 @@ class SceneEnv(EnvBase):
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | Sequence[Scene],
         reward: RewardFunction | None = None,
         *,
         start_states: StartStates | None = None,
@@ -88,33 +93,52 @@ class SceneEnv(EnvBase):
         device: torch.device | str = "cpu",
     ):
         super().__init__(device=device)
-        self.scene = scene
+        self.scenes = (scene,) if isinstance(scene, Scene) else tuple(scene)
+        if not self.scenes:
+            raise ValueError("SceneEnv needs at least one scene.")
+        self.scene = self.scenes[0]
         self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
         self.num_threads = num_threads
         self.unstable_reward = finite_reward(unstable_reward)
-        self.starts = StartSampler(scene, start_states, seed)
+        self.starts = StartSampler(self.scenes, start_states, seed)
         self._simulator: Simulator | None = None
-        set_specs(self, scene, physics=True)
+        set_specs(self, self.scene, physics=True, variants=len(self.scenes))
 
     @property
     def simulator(self) -> Simulator:
         """The batched simulation, started when it is first needed."""
         if self._simulator is None:
-            self._simulator = Simulator(self.scene, num_threads=self.num_threads)
+            self._simulator = Simulator(self.scenes, num_threads=self.num_threads)
         return self._simulator
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDict:
         if tensordict is None:
             tensordict = TensorDict(batch_size=self.batch_size)
-        shape = tensordict.shape
-        if set_state:
+        shape, variant = tensordict.shape, None
+        if len(self.scenes) > 1:
+            variant = tensordict.get("variant", None)
+            if variant is None:
+                variant = (torch.arange(shape.numel()) % len(self.scenes)).reshape(*shape, 1)
+            variant = self.variant_of(TensorDict({"variant": variant}, batch_size=shape))
+        if set_state and ("physics" in tensordict.keys() or variant is None):
             physics = read(tensordict, "physics", (self.scene.physics_size,), self)
             require_finite(physics, f"{self}: 'physics'")
             physics = physics.cpu().to(torch.float64, copy=True)
         else:
-            physics = self.starts.draw(shape, tensordict.get("_reset", None))
-        entries = {"state": self.simulator.observe(physics), "physics": physics}
+            physics = self.starts.draw(shape, tensordict.get("_reset", None), variant)
+        entries = {"state": self.simulator.observe(physics, _each(variant)), "physics": physics}
+        if variant is not None:
+            entries["variant"] = variant
         return TensorDict(entries, batch_size=shape).to(self.device)
+
+    def variant_of(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Which variant each sample is of ``[*B, 1]``, on the CPU; None where there is one scene."""
+        if len(self.scenes) == 1:
+            return None
+        variant = read(tensordict, "variant", (1,), self).cpu()
+        if variant.dtype != torch.int64 or not bool(((variant >= 0) & (variant < len(self.scenes))).all()):
+            raise ValueError(f"{self}: 'variant' must be int64 in [0, {len(self.scenes)}), got {variant.flatten()[:5]}")
+        return variant
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         physics = read(tensordict, "physics", (self.scene.physics_size,), self)
@@ -122,7 +146,8 @@ class SceneEnv(EnvBase):
         require_finite(physics, f"{self}: 'physics'")
         require_finite(action, f"{self}: 'action'")
         controls = action.unsqueeze(-2).cpu().to(torch.float64)
-        simulated = self.simulator.rollout(physics.detach().cpu(), controls)
+        variant = self.variant_of(tensordict)
+        simulated = self.simulator.rollout(physics.detach().cpu(), controls, _each(variant))
         # Entry by entry: TensorDict.to costs as much as a small simulation.
         stable = simulated["stable"].to(self.device).unsqueeze(-1)
         state, next_state = simulated["state"].to(self.device).unbind(-3)
@@ -136,6 +161,8 @@ class SceneEnv(EnvBase):
             "done": ~stable,
             "terminated": ~stable,
         }
+        if variant is not None:
+            entries["variant"] = variant.to(self.device, copy=True)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -147,3 +174,7 @@ class SceneEnv(EnvBase):
     def __getstate__(self) -> dict:
         # Copies and worker processes start threads and MuJoCo data of their own.
         return {**super().__getstate__(), "_simulator": None}
+
+
+def _each(variant: Tensor | None) -> Tensor | None:
+    return None if variant is None else variant.squeeze(-1)

@@ -16,7 +16,7 @@ from torchrl_gn.scenes.scene import Scene
 RewardFunction = Callable[..., Tensor]
 
 
-def set_specs(env: EnvBase, scene: Scene, *, physics: bool) -> None:
+def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -> None:
     """Give an environment the specs of a scene.
 
     Observations are float64, as simulated. Actions and rewards are float32, the
@@ -27,19 +27,22 @@ def set_specs(env: EnvBase, scene: Scene, *, physics: bool) -> None:
         env: environment to set up, with its device already known.
         scene: the scene.
         physics: whether the full MuJoCo state is an entry of its own.
+        variants: how many variants of the scene there are; if several, an entry says which a sample is of.
     """
     device = env.device
 
     def unbounded(*shape: int) -> Unbounded:
         return Unbounded(shape=torch.Size(shape), dtype=torch.float64, device=device)
 
-    observation = {"state": unbounded(scene.num_nodes, 13)}
+    observation: dict[str, Unbounded | Bounded] = {"state": unbounded(scene.num_nodes, 13)}
     if physics:
         observation["physics"] = unbounded(scene.physics_size)
+    if variants > 1:
+        observation["variant"] = Bounded(0, variants - 1, shape=torch.Size((1,)), dtype=torch.int64, device=device)
     env.observation_spec = Composite(observation, device=device)
     # What a step reads besides the action: the physics, or the state where that is all there is.
-    carried = "physics" if physics else "state"
-    env.state_spec = Composite({carried: observation[carried].clone()}, device=device)
+    carried = {"physics" if physics else "state", "variant"} & observation.keys()
+    env.state_spec = Composite({key: observation[key].clone() for key in carried}, device=device)
     env.action_spec = Bounded(
         low=torch.as_tensor(scene.action_low, dtype=torch.float32),
         high=torch.as_tensor(scene.action_high, dtype=torch.float32),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.data.start_states import sample_start_states
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.start_states import draw_start_states, sample_start_states
 from torchrl_gn.scenes.scene import Scene
 
 StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndarray]
@@ -18,7 +19,7 @@ class StartSampler:
     """Draw start states of a scene, reproducibly.
 
     Args:
-        scene: the scene.
+        scenes: the scene, or variants of it.
         start_states: ``[M, S]`` full MuJoCo states to choose from, each equally likely,
             or a function ``(n, generator) -> [n, S]``. Default: the system's own
             reset distribution.
@@ -29,8 +30,11 @@ class StartSampler:
         ValueError: the start states are not ``[M, S]`` of finite numbers.
     """
 
-    def __init__(self, scene: Scene, start_states: StartStates | None = None, seed: int | None = None):
-        self.scene = scene
+    def __init__(
+        self, scenes: Scene | Sequence[Scene], start_states: StartStates | None = None, seed: int | None = None
+    ):
+        self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
+        self.scene = self.scenes[0]
         self._function: Callable[[int, np.random.Generator], np.ndarray] | None = None
         self._table: np.ndarray | None = None
         if isinstance(start_states, (Tensor, np.ndarray)):
@@ -45,13 +49,14 @@ class StartSampler:
             seed = int(torch.randint(2**31, ()).item())
         self._rng = np.random.default_rng(seed)
 
-    def draw(self, shape: torch.Size, reset: Tensor | None = None) -> Tensor:
+    def draw(self, shape: torch.Size, reset: Tensor | None = None, variant: Tensor | None = None) -> Tensor:
         """Start states for a batch.
 
         Args:
             shape: the batch ``*B``.
             reset: ``[*B]`` or ``[*B, 1]`` bool, which of them start anew (default all). The
                 others get a copy of one that does, to be overwritten by TorchRL.
+            variant: ``[*B, 1]`` which of several variants each of them is of.
 
         Returns:
             ``[*B, S]`` float64 full MuJoCo states, on the CPU.
@@ -61,17 +66,19 @@ class StartSampler:
         states = np.zeros((size, self.scene.physics_size))
         count = int(mask.sum())
         if count:
-            drawn = self._sample(count)
+            drawn = self._sample(count, None if variant is None else variant.reshape(size).cpu().numpy()[mask])
             states[:] = drawn[0]
             states[mask] = drawn
         return torch.from_numpy(states).reshape(*shape, -1)
 
-    def _sample(self, count: int) -> np.ndarray:
+    def _sample(self, count: int, variant: np.ndarray | None) -> np.ndarray:
         if self._table is not None:
             return self._table[self._rng.integers(len(self._table), size=count)]
         if self._function is not None:
             return self._checked(self._function(count, self._rng), count)
-        return sample_start_states(self.scene, count, self._rng)
+        if variant is None:
+            return sample_start_states(self.scene, count, self._rng)
+        return draw_start_states(Simulator(self.scenes), variant, self._rng)[0]
 
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:
         if isinstance(states, Tensor):

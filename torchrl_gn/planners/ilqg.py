@@ -106,17 +106,18 @@ class ILQGPlanner(MPCPlannerBase):
         self.control_cost, self.central, self.num_threads = control_cost, central, num_threads
         seed = int(torch.randint(2**31, ()).item()) if seed is None else seed
         self._rng = np.random.default_rng(seed)
-        self._simulator: Simulator | None = None
+        self._simulators: dict[int, Simulator] = {}
         self._warned = False
 
-    @property
-    def simulator(self) -> Simulator:
-        """The simulation to plan with: the environment's, or one of its own with another number of threads."""
-        if self.num_threads is None:
-            return self._scene_env.simulator
-        if self._simulator is None:
-            self._simulator = Simulator(self._scene_env.scene, self.num_threads)
-        return self._simulator
+    def simulator(self, variant: int = 0) -> Simulator:
+        """The simulation to plan with of one of the environment's scenes."""
+        env = self._scene_env
+        if self.num_threads is None and len(env.scenes) == 1:
+            return env.simulator
+        if variant not in self._simulators:
+            threads = env.num_threads if self.num_threads is None else self.num_threads
+            self._simulators[variant] = Simulator(env.scenes[variant], threads)
+        return self._simulators[variant]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that clears plans when episodes begin."""
@@ -153,16 +154,19 @@ class ILQGPlanner(MPCPlannerBase):
         known = planned.reshape(-1).tolist()
         # With the batch as one dimension, whatever stands behind it in a task.
         tasks = None if task is None else _flat(task, len(tensordict.shape))
+        variant = env.variant_of(tensordict)
+        which = [0] * len(states) if variant is None else variant.flatten().tolist()
         for row, state in enumerate(states):
             plan = plans[row] if known[row] else None
-            plans[row] = self._plan_row(state, plan, None if tasks is None else tasks[row])
+            task = None if tasks is None else tasks[row]
+            plans[row] = self._plan_row(self.simulator(which[row]), state, plan, task)
         return torch.from_numpy(plans).reshape(actions.shape).to(actions.device)
 
-    def _plan_row(self, physics: np.ndarray, plan: np.ndarray | None, task: Any) -> np.ndarray:
+    def _plan_row(self, simulator: Simulator, physics: np.ndarray, plan: np.ndarray | None, task: Any) -> np.ndarray:
         """The improved plan ``[H, A]`` of one state."""
         env = self._scene_env
         reward = RewardExpansion(cast(Any, env.reward), task, env.device)
-        solver = ILQGSolver(self.simulator, reward, control_cost=self.control_cost, central=self.central)
+        solver = ILQGSolver(simulator, reward, control_cost=self.control_cost, central=self.central)
         iterations = self.warm_up if plan is None else self.iterations
         if plan is not None:
             start = solver.simulate(physics, solver.controls(plan)[None])
@@ -204,7 +208,7 @@ class ILQGPlanner(MPCPlannerBase):
 
     def __getstate__(self) -> dict:
         # Copies and worker processes start threads and MuJoCo data of their own.
-        return {**super().__getstate__(), "_simulator": None}
+        return {**super().__getstate__(), "_simulators": {}}
 
 
 def _flat(task: Any, dims: int) -> Any:
