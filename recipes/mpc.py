@@ -6,7 +6,8 @@
 Plays episodes in MuJoCo, all from the same start states for every planner: gn plans by gradients through the learned
 model (paper, SM "MPC planner with learned models"), cem and mppi are TorchRL's own planners on that model, ilqg (paper,
 SM "Baseline Mujoco-based planner"), cem_true and mppi_true plan on MuJoCo itself, random plays random controls. A
-checkpoint of an inference model first identifies the system from random controls. Finished episodes are kept: the same
+checkpoint of an inference model first identifies the system from random controls; `variants=true` plays a random
+variant of the system in every episode, with a checkpoint that was trained on such. Finished episodes are kept: the same
 `run_dir` goes on, with more steps or planners too.
 
 Leaves config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
@@ -42,7 +43,7 @@ from torchrl_gn.modules import IdentifyingModel, specialize
 from torchrl_gn.planners import GradientPlanner, ILQGPlanner
 from torchrl_gn.pretrained import load_pretrained, pretrained_names
 from torchrl_gn.rewards import FixTask, Reward, make_reward
-from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.scenes import Scene, load_scene, sample_variants
 from torchrl_gn.training import RunFolder, Tracker, clean_exit, load_checkpoint
 
 ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
@@ -142,6 +143,15 @@ def fill_in(cfg: DictConfig) -> None:
         raise ValueError(f"There is no planner {unknown[0]!r}; use some of {[*ON_MODEL, *ON_PHYSICS]}.")
 
 
+def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
+    """The standard scene, and a variant for every episode if there are to be any."""
+    scene = load_scene(cfg.system)
+    if not cfg.variants:
+        return scene, [scene]
+    rng = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(2,)))
+    return scene, sample_variants(cfg.system, cfg.episodes, rng)
+
+
 def load_model(cfg: DictConfig, scene: Scene):
     """The trained model, bound to the scene, and the inference model if it has one."""
     fitting = (cfg.system, re.sub(r"^swimmer\d+$", "swimmerN", cfg.system))
@@ -152,7 +162,10 @@ def load_model(cfg: DictConfig, scene: Scene):
     if isinstance(checkpoint.trained, IdentifyingModel):
         bound, inference = checkpoint.trained.bind(scene)
         return specialize(bound, compile=cfg.compile), inference
-    return specialize(checkpoint.model.bind(scene), compile=cfg.compile), None
+    if cfg.variants and not checkpoint.config.get("parametrized"):
+        raise ValueError("The model was trained on one system, not on variants: give checkpoint=PATH of one that was.")
+    bound = checkpoint.model.bind(scene, static_key="static" if cfg.variants else None)
+    return specialize(bound, compile=cfg.compile), None
 
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:
@@ -190,17 +203,18 @@ def make_planner(
     return MPPIPlanner(where, ReturnToGo(), chosen.temperature, planning_horizon=cfg.horizon, **sizes)
 
 
-def begin(cfg: DictConfig, scene: Scene, env: SceneEnv, inference) -> TensorDictBase:
-    """Start states, after random controls to identify the system from if it has to be."""
-    now = env.reset(TensorDict(batch_size=[cfg.episodes]))
-    if inference is None:
-        return now
-    controls = torch.from_numpy(spline_controls(scene, cfg.episodes, cfg.phase, cfg.seed + 1))
-    simulated = env.simulator.rollout(now["physics"], controls)
-    entries = {"state": simulated["state"][:, -1], "physics": simulated["physics"][:, -1]}
-    with torch.no_grad():
-        entries["static"] = inference.identify(simulated["state"], controls)
-    return TensorDict(entries, batch_size=now.shape)
+def begin(cfg: DictConfig, env: SceneEnv, bound, inference) -> TensorDictBase:
+    """Start states with what the model reads of each system: true parameters, or what random controls showed of it."""
+    now = env.reset(TensorDict(batch_size=[cfg.episodes])).exclude("done", "terminated")
+    if inference is not None:
+        controls = torch.from_numpy(spline_controls(env.scene, cfg.episodes, cfg.phase, cfg.seed + 1))
+        simulated = env.simulator.rollout(now["physics"], controls)  # its scenes in turn, as reset has them
+        now.update({key: simulated[key][:, -1] for key in ("state", "physics")})
+        with torch.no_grad():
+            now["static"] = inference.identify(simulated["state"], controls)
+    elif bound is not None and bound.static_key is not None:
+        now["static"] = torch.stack([bound.static_of(scene) for scene in env.scenes])
+    return now
 
 
 def play(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv | None, played: Episodes) -> None:
@@ -215,9 +229,8 @@ def play(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv |
                 if name == "gn" and imagined is not None:
                     played.records["foreseen"].append(foresee(imagined, now))
                 stepped = env.step(now)
-                keep = {key: value for key, value in stepped.items() if key not in ("next", "action")}
-                keep.update({key: stepped["next", key] for key in ("state", "physics")})
-                played.now = TensorDict(keep, batch_size=now.shape)
+                played.now = stepped.exclude("next", "action", "done", "terminated")
+                played.now.update(stepped["next"].exclude("reward", "done", "terminated"))
                 reward = stepped["next", "reward"].squeeze(-1)
                 for key, value in (("state", played.now["state"]), ("action", now["action"]), ("reward", reward)):
                     played.records[key].append(value)
@@ -250,9 +263,9 @@ def main(cfg: DictConfig) -> None:
     fill_in(cfg)
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
-    scene = load_scene(cfg.system)
+    scene, scenes = make_scenes(cfg)
     reward = make_reward(cfg.reward, scene)
-    env = SceneEnv(scene, reward, seed=cfg.seed)
+    env = SceneEnv(scenes, reward, seed=cfg.seed)
     bound, inference = load_model(cfg, scene) if set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint else (None, None)
     imagined = None if bound is None else ModelEnv(bound, reward)
     run = RunFolder(cfg.run_dir, "mpc")
@@ -261,7 +274,7 @@ def main(cfg: DictConfig) -> None:
         run.refuse_changes(before, options(cfg), free=MAY_CHANGE)
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name=f"mpc-{scene.name}-{cfg.reward}", config=options(cfg))
-    start = begin(cfg, scene, env, inference)
+    start = begin(cfg, env, bound, inference)
     target = draw_targets(cfg, reward, scene, start["state"])
     if target is not None:
         start["target"] = target
@@ -293,12 +306,13 @@ def main(cfg: DictConfig) -> None:
         curves[name] = rewards
         tracker.log({f"{name}/{key}": value for key, value in of.items()}, len(played))
         if cfg.video:
-            film(played, scene, cfg, run.file(f"{name}.gif"))
+            film(played, scenes[0], cfg, run.file(f"{name}.gif"))
     run.write_metrics(metrics, seed=cfg.seed)
     plot_rewards(curves, run.file("rewards.png"), timestep=scene.timestep, ylabel=f"{cfg.reward} reward")
     tracker.log_files(run.written)
     tracker.close()
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]  # "way left" only where there is a way
+    rows, widths = list(zip(*columns, strict=True)), [max(map(len, column)) for column in columns]
     for row in rows:
         print("  ".join(map(str.ljust, row, widths)).rstrip())
     for path in run.written:
