@@ -13,16 +13,14 @@ SAMPLED = ("cem.iterations=1", "cem.candidates=4", "cem.top_k=2", "mppi.iteratio
 
 def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run):
     options = (*SMALL, *SAMPLED, "mppi.top_k=2", f"run_dir={tmp_path}")
-    code, output, errors = run(*options, "steps=2", "planner=[gn,random]", recipe="mpc")
+    code, output, errors = run(*options, "steps=2", "planner=[gn,random]", "video=false", recipe="mpc")
     assert code == 0, errors
     first = load_file(tmp_path / "gn.safetensors")["state"]
-    code, output, errors = run(
-        *options, "steps=4", "planner=[gn,ilqg,cem,mppi,cem_true,mppi_true,random,nothing]", recipe="mpc"
-    )
+    code, output, errors = run(*options, "steps=4", "planner=[gn,ilqg,mppi,cem_true,random]", recipe="mpc")
     assert code == 0, errors
     assert "warning" not in errors.lower()
     played = {path.stem: load_file(path)["state"] for path in tmp_path.glob("*.safetensors")}
-    assert len(played) == 8 and {len(states[0]) for states in played.values()} == {5}
+    assert len(played) == 5 and {len(states[0]) for states in played.values()} == {5}
     assert (played["gn"][:, :3] == first).all()
     assert all((states[:, 0] == first[:, 0]).all() for states in played.values())
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -34,20 +32,10 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run):
     assert code == 1 and "other options: horizon=5 (was 4)" in errors and "Traceback" not in errors
 
 
-def test_a_swimmer_goes_for_its_target(tmp_path, run):
-    options = ("system=swimmer6", "steps=2", "video=false", f"run_dir={tmp_path}")
-    code, output, errors = run(*SMALL, *options, recipe="mpc")
-    assert code == 0, errors
-    assert "way left" in output
-    assert 0.9 < json.loads((tmp_path / "metrics.json").read_text())["gn/distance_left"] < 1.1
-
-
 def test_bad_options_are_named(tmp_path, run):
     for option, message in (
         ("planner=gradient", "There is no planner 'gradient'"),
-        ("reward=fly", "no reward 'fly' for scene 'pendulum'"),
         ("system=two_poles", "'two_poles' is no system of the paper: say which reward it gets"),
-        ("horizon=0", "horizon must be at least 1"),
     ):
         code, _, errors = run(*SMALL[:1], option, f"run_dir={tmp_path / option.split(chr(61))[0]}", recipe="mpc")
         assert code == 1 and message in errors and "Traceback" not in errors, errors
