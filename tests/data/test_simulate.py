@@ -149,7 +149,10 @@ def test_bad_input_is_refused_and_named(swimmer: Scene) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_unstable_simulations_are_told(threads: int, tmp_path, monkeypatch, capfd) -> None:
+def test_unstable_simulations_are_told(threads: int, tmp_path, monkeypatch, capfd, request) -> None:
+    before = mujoco.get_mju_user_warning()  # dm_control sets one, if a test has imported it
+    request.addfinalizer(lambda: mujoco.set_mju_user_warning(before))
+    mujoco.set_mju_user_warning(None)
     monkeypatch.chdir(tmp_path)
     scene = load_scene(EXPLODING)
     simulator = Simulator(scene, threads)

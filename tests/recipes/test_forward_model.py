@@ -82,9 +82,6 @@ def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path, r
     assert {path.name for path in tmp_path.glob("*/rollout.gif")} and (tmp_path / "errors.png").is_file()
     saved = load_checkpoint(tmp_path)
     assert [scene.name for scene in saved.scenes()] == ["swimmer3", "pendulum"]
-    code, _, errors = run(*small, "steps=8", "parametrized=true", f"run_dir={tmp_path}")
-    assert code == 0, errors
-    assert load_checkpoint(tmp_path).training["progress"]["step"] == 8
 
 
 def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path, run):
