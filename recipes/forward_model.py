@@ -31,7 +31,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
 from tqdm import tqdm
 
-from torchrl_gn.data import TrajectoryDataset, collect_trajectories, create_dataset, trajectory_buffer
+from torchrl_gn.data import TrajectoryDataset, collect_trajectories, trajectory_buffer
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_training_curve, report, summary
 from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
@@ -45,7 +45,7 @@ from torchrl_gn.training import (
     load_checkpoint,
     make_optimizer,
 )
-from torchrl_gn.training.progress import collecting, train_with_progress
+from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
 
 # A run may go on with more time, another logger or other threads, and nothing else.
 MAY_CHANGE = (
@@ -103,18 +103,8 @@ def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]
     tasks = []
     for scene in scenes:
         parametrized = cfg.parametrized and (len(scenes) == 1 or has_variants(scene))
-        with collecting(f"data of {scene.name}") as show:
-            dataset = create_dataset(
-                folder / f"{scene.name}{'_variants' if parametrized else ''}",
-                scene,
-                train=cfg.data.train,
-                validation=cfg.data.validation,
-                test=cfg.data.test,
-                steps=cfg.data.length,
-                seed=cfg.data.seed,
-                variants=(cfg.data.variants or cfg.data.train) if parametrized else None,
-                progress=show,
-            )
+        variants = (cfg.data.variants or cfg.data.train) if parametrized else None
+        dataset = dataset_with_progress(folder, scene, cfg.data, variants=variants)
         tasks.append(Task(scene, dataset, mixture(cfg, dataset)))
     return tasks
 

@@ -32,7 +32,6 @@ from torchrl_gn.data import (
     Simulator,
     TrajectoryDataset,
     collect_trajectories,
-    create_dataset,
     spline_controls,
     trajectory_buffer,
 )
@@ -60,7 +59,7 @@ from torchrl_gn.training import (
     load_checkpoint,
     make_optimizer,
 )
-from torchrl_gn.training.progress import collecting, train_with_progress
+from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
 from torchrl_gn.training.sweep import Run, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
@@ -204,17 +203,7 @@ def main(cfg: DictConfig) -> None:
     tracker = Tracker(cfg.logger, run.path / "log", name=f"inference_model-{scene.name}", config=options(cfg))
 
     data = Path(cfg.data.folder) if cfg.data.folder else run.data
-    sizes = cfg.data.train, cfg.data.validation, cfg.data.test
-    with collecting(f"data of {scene.name}") as show:
-        dataset = create_dataset(
-            data / f"{scene.name}_variants",
-            scene,
-            *sizes,
-            steps=cfg.data.length,
-            seed=cfg.data.seed,
-            variants=cfg.data.train,
-            progress=show,
-        )
+    dataset = dataset_with_progress(data, scene, cfg.data, variants=cfg.data.train)
     trainer = make_trainer(cfg, model, scene, dataset)
     if not begun:
         trainer.loss.fit_normalizers(trajectory_buffer(dataset.train, batch_size=20_000, seed=cfg.seed).sample())

@@ -36,7 +36,7 @@ from torchrl.modules import CEMPlanner, MPPIPlanner
 from tqdm import tqdm
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.data import sample_start_states, spline_controls
+from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards, rollout_video
 from torchrl_gn.modules import IdentifyingModel, specialize
@@ -88,7 +88,6 @@ class Episodes:
     Args:
         path: file that they are kept in.
         start: TensorDict to begin from.
-        seconds: of planning in every step.
     """
 
     def __init__(self, path: Path, start: TensorDictBase) -> None:
@@ -116,9 +115,9 @@ class Episodes:
 
     def save(self) -> None:
         """Write everything, atomically."""
-        now = {f"now.{key}": value for key, value in self.now.flatten_keys(".").items()}
         if not len(self):
             return
+        now = {f"now.{key}": value for key, value in self.now.flatten_keys(".").items()}
         values = {name: self[name] for name in self.records}
         with atomic_path(self.path) as temporary:
             save_file({key: value.contiguous() for key, value in (now | values).items()}, temporary)
@@ -170,15 +169,14 @@ def load_model(cfg: DictConfig, scene: Scene):
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:
     """Where every episode should get to: a place for a swimmer's head, a random pose for an arm."""
-    rng = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(1,)))
-    count = len(state)
     if reward.target_shape is None:
         return None
+    rng, count = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(1,))), len(state)
     if reward.target_shape == (3,):
         angle = torch.from_numpy(rng.uniform(-np.pi, np.pi, count))
         way = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=-1)
         return state[:, 1, :3] + cfg.target_distance * way
-    return SceneEnv(scene).simulator.observe(sample_start_states(scene, count, rng))
+    return Simulator(scene).observe(sample_start_states(scene, count, rng))
 
 
 def make_planner(

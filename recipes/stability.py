@@ -233,13 +233,15 @@ def unstable_model(s: Setting) -> float:
         for parameter in weights.core.parameters():
             parameter *= 2
     model = s.bind(weights, s.scene)
-    rollout = model.rollout
+    rollout = model.rollout_and_memory
 
-    def counted(state: Tensor, actions: Tensor, static: TensorDictBase | None = None) -> Tensor:
+    def counted(
+        state: Tensor, actions: Tensor, static: TensorDictBase | None = None, memory: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDictBase | None]:
         predicted.append(actions.shape[:-1].numel())
-        return rollout(state, actions, static)
+        return rollout(state, actions, static, memory)
 
-    model.rollout = counted
+    model.rollout_and_memory = counted
     guarded = guarded_rollout(model, s.state, s.action.unsqueeze(1).expand(-1, 1000, -1))
     return sum(predicted) / (1000 * len(s.state)) if bool(guarded.diverged.all()) else torch.inf
 

@@ -90,6 +90,19 @@ def test_observe_equals_rollout(swimmer: Scene) -> None:
     assert torch.equal(simulator.observe(result["physics"]), result["state"])
 
 
+@pytest.mark.parametrize("memory", [None, 1])
+def test_a_step_equals_that_of_a_rollout(memory: int | None) -> None:
+    scene = load_scene("cheetah")
+    simulator = Simulator(scene, 1, memory=memory)
+    physics, actions = _inputs(scene, 3, 2)
+    played = simulator.rollout(physics, actions)
+    for t in range(2):
+        after, state = simulator.step(physics, actions[:, t])
+        np.testing.assert_array_equal(after, played["physics"][:, t + 1])
+        np.testing.assert_array_equal(state, played["state"][:, t])
+        physics = after
+
+
 def test_scenes_of_different_mass() -> None:
     xml = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/>
       <geom type="capsule" size=".05" fromto="0 0 0 0 0 1" mass="{}"/></body></worldbody>
@@ -105,6 +118,8 @@ def test_scenes_of_different_mass() -> None:
         assert torch.equal(in_turn["state"][i], alone[i % 2]["state"][i])
         assert torch.equal(chosen["state"][i], alone[1 if i < 2 else 0]["state"][i])
     assert torch.equal(together.observe(in_turn["physics"][:, -1]), in_turn["state"][:, -1])
+    stepped, _ = together.step(physics, actions[:, 0], np.array([1, 1, 0, 0]))
+    np.testing.assert_array_equal(stepped, chosen["physics"][:, 1])
     with pytest.raises(ValueError, match="variant must lie in"):
         together.rollout(physics, actions, torch.tensor([0, 1, 2, 0]))
     with pytest.raises(ValueError, match="node_names"):
@@ -144,6 +159,8 @@ def test_bad_input_is_refused_and_named(swimmer: Scene) -> None:
         simulator.rollout(physics, actions[:1])
     with pytest.raises(ValueError, match=r"must be \[\*B, 17\], got \[2, 16\]"):
         simulator.observe(physics[:, 1:])
+    with pytest.raises(ValueError, match=r"must be \[2, 5\].*got \[1, 5\]"):
+        simulator.step(physics, actions[:1, 0])
     with pytest.raises(ValueError, match="num_threads"):
         Simulator(swimmer, 0)
 
@@ -163,6 +180,12 @@ def test_unstable_simulations_are_told(threads: int, tmp_path, monkeypatch, capf
     # One step from time 0, as an environment takes it: the time after MuJoCo's reset looks right.
     assert simulator.rollout(physics, actions[:, :1])["stable"].tolist() == [True, False, True, True]
     assert simulator.rollout(physics, actions[:, :3])["stable"].tolist() == [True, False, True, True]
+    after = physics.copy()
+    after[:, 0] = 3.0
+    for t in range(4):
+        after, _ = simulator.step(after, actions[:, t])  # what was unstable once stays so
+        assert np.isnan(after).all(1).tolist() == [False, True, False, t == 3]
+    assert np.isfinite(after[[0, 2]]).all()
     physics[0, 1] = 1e11  # MuJoCo resets such a state
     assert simulator.rollout(physics, actions * 0)["stable"].tolist() == [False, True, True, True]
     assert not list(tmp_path.iterdir())  # no MUJOCO_LOG.TXT

@@ -27,13 +27,13 @@ def no_limits(swimmer, monkeypatch) -> None:
 @pytest.fixture
 def sizes(swimmer, monkeypatch) -> list[int]:
     """Batch sizes and lengths of the rollouts that the model is asked for."""
-    asked, plain = [], swimmer.rollout
+    asked, plain = [], swimmer.rollout_and_memory
 
-    def counted(state, actions, static=None):
+    def counted(state, actions, static=None, memory=None):
         asked.append((len(state), actions.shape[-2]))
-        return plain(state, actions, static)
+        return plain(state, actions, static, memory)
 
-    monkeypatch.setattr(swimmer, "rollout", counted)
+    monkeypatch.setattr(swimmer, "rollout_and_memory", counted)
     return asked
 
 

@@ -21,6 +21,7 @@ from torchrl_gn.rewards import FixTask, make_reward
 from torchrl_gn.scenes import load_scene
 
 STEP, SPEED_WEIGHT, CONTROL_COST, HORIZON = 0.1, 0.1, 0.02, 12
+SMALL = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
 POINT = """
 <mujoco model="cart">
   <option timestep="0.1" gravity="0 0 0"/>
@@ -92,6 +93,16 @@ def returns(env: ModelEnv, start: TensorDict, actions: torch.Tensor) -> torch.Te
     return env.imagine(start, actions)[1].sum((-2, -1)).double()
 
 
+def check_that_it_imagines_what_stepping_gives(env: ModelEnv, start: TensorDict, actions: torch.Tensor) -> None:
+    states, rewards = env.imagine(start, actions)
+    now = start.clone()
+    for t, action in enumerate(actions.unbind(1)):
+        stepped = env.step(now.set("action", action))["next"]
+        torch.testing.assert_close(states[:, t + 1], stepped["state"])
+        torch.testing.assert_close(rewards[:, t], stepped["reward"])
+        now = stepped.exclude("reward", "done", "terminated")
+
+
 def trained(scene, **options):
     """A forward model that has seen data, and no more."""
     torch.manual_seed(0)
@@ -126,13 +137,7 @@ def test_limits_bind():
 def test_it_imagines_what_stepping_gives():
     env, start = point_env(2.0), at(0.3, 0.7, -0.2)
     actions = torch.randn(3, 5, 1)
-    states, rewards = env.imagine(start, actions)
-    now = start.clone()
-    for t in range(5):
-        stepped = env.step(now.set("action", actions[:, t]))["next"]
-        torch.testing.assert_close(states[:, t + 1], stepped["state"])
-        torch.testing.assert_close(rewards[:, t], stepped["reward"])
-        now = stepped.select("state")
+    check_that_it_imagines_what_stepping_gives(env, start, actions)
     with pytest.raises(ValueError, match=r"actions must be \[\*B, H, 1\]"):
         env.imagine(start, actions[:2])
 
@@ -140,18 +145,11 @@ def test_it_imagines_what_stepping_gives():
 @pytest.mark.parametrize("kind", ["bound", "specialized", "recurrent"])
 def test_a_trained_kind_of_model_imagines_what_stepping_gives_and_differentiates_it(kind):
     scene = load_scene("cartpole")
-    small = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
     core = {"core": "recurrent", "memory": [4, 4, 4]} if kind == "recurrent" else {}
-    bound = trained(scene, **small, **core)
+    bound = trained(scene, **SMALL, **core)
     env = ModelEnv(specialize(bound) if kind == "specialized" else bound, make_reward("balance", scene), seed=0)
     start, actions = env.reset(TensorDict(batch_size=[2])), torch.rand(2, 4, 1, dtype=torch.float64) - 0.5
-    states, rewards = env.imagine(start, actions)
-    now = start.clone()
-    for t in range(4):
-        stepped = env.step(now.set("action", actions[:, t]))["next"]
-        torch.testing.assert_close(states[:, t + 1], stepped["state"])
-        torch.testing.assert_close(rewards[:, t], stepped["reward"])
-        now = stepped.exclude("reward", "done", "terminated")
+    check_that_it_imagines_what_stepping_gives(env, start, actions)
 
     def total(actions):
         states, _ = env.imagine(start, actions)
@@ -221,9 +219,8 @@ def test_an_episode_that_begins_anew_is_planned_anew(monkeypatch):
 
 def test_a_task_is_fixed_when_planning_starts():
     scene = load_scene("swimmer3")
-    small = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
     reward = make_reward("reach", scene)
-    imagined = ModelEnv(specialize(trained(scene, **small)), reward)
+    imagined = ModelEnv(specialize(trained(scene, **SMALL)), reward)
     planner = GradientPlanner(imagined, 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
     env = SceneEnv(scene, reward, seed=0)
     start = env.reset(TensorDict(batch_size=[2]))
@@ -236,8 +233,7 @@ def test_a_task_is_fixed_when_planning_starts():
 
 def test_a_recurrent_model_remembers_what_was_played():
     scene = load_scene("pendulum")
-    small = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
-    bound = trained(scene, core="recurrent", memory=[4, 4, 4], **small)
+    bound = trained(scene, core="recurrent", memory=[4, 4, 4], **SMALL)
     reward = make_reward("balance", scene)
     planner = GradientPlanner(ModelEnv(bound, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
     acted = SceneEnv(scene, reward, seed=0)
@@ -254,9 +250,8 @@ def test_a_recurrent_model_remembers_what_was_played():
 
 def test_what_an_inference_model_wrote_is_planned_with():
     scene = load_scene("pendulum")
-    small = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
     torch.manual_seed(0)
-    model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=[3, 3, 3], link=False, **small).double()
+    model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=[3, 3, 3], link=False, **SMALL).double()
     bound = model.bind(scene, static_key="static")
     seen = collect_trajectories(scene, 5, 20, seed=0)
     bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])

@@ -161,6 +161,46 @@ class Simulator:
             state[row] = data.sensordata[where].reshape(state.shape[1:])
         return torch.from_numpy(state.reshape(*batch, *state.shape[1:]))
 
+    def step(
+        self, physics: np.ndarray, actions: np.ndarray, variant: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Advance states by one control step, as :meth:`rollout` but seeing bodies before it only.
+
+        That saves one physics step: half the time of scenes that take one a control step. But whether the next states
+        can be simulated on from, only the next step tells. And a first physics step from time 0 that is unstable goes
+        unnoticed: MuJoCo's reset, to time 0, then sets nothing back, and the next state is that of the reset one.
+
+        Args:
+            physics: ``[n, S]`` float64, full MuJoCo states. Those that are not finite are unstable, so that steps can
+                follow steps.
+            actions: ``[n, A]`` float64.
+            variant: as for :meth:`rollout`.
+
+        Returns:
+            Next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, 13]``, float64.
+
+        Raises:
+            ValueError: a wrong shape.
+            TypeError: ``physics`` is not float64.
+        """
+        scene = self.scene
+        start = self._checked_physics(physics, finite=False)
+        which = self._variants(variant, start.shape[:-1])
+        if actions.shape != (*start.shape[:-1], scene.num_actions):
+            raise ValueError(
+                f"actions of {scene.name!r} must be {[*start.shape[:-1], scene.num_actions]} to fit physics"
+                f" {list(start.shape)}, got {list(actions.shape)}"
+            )
+        after, state = np.empty_like(start), np.empty((len(start), scene.num_nodes, 13))
+        for rows in self._chunks(len(start), scene.substeps):
+            path, sensors = self._advance(
+                start[rows], np.repeat(actions[rows, None], scene.substeps, axis=1), which[rows]
+            )
+            stable = self._is_stable(start[rows], path)
+            after[rows] = np.where(stable[:, None], path[:, -1], np.nan)
+            state[rows] = sensors[:, 0, scene.sensor_slice].reshape(state[rows].shape)
+        return after, state
+
     def settle(
         self, physics: np.ndarray, steps: int, variant: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -208,7 +248,7 @@ class Simulator:
         size = max(self.num_threads, self.memory // (row * steps))
         return (slice(first, min(first + size, count)) for first in range(0, count, size))
 
-    def _checked_physics(self, physics: Tensor | np.ndarray) -> np.ndarray:
+    def _checked_physics(self, physics: Tensor | np.ndarray, *, finite: bool = True) -> np.ndarray:
         array = _as_array(physics, "physics")
         if array.dtype != np.float64:
             raise TypeError(f"physics must be float64 (anything else would round it), got {array.dtype}")
@@ -216,7 +256,8 @@ class Simulator:
             raise ValueError(
                 f"physics of {self.scene.name!r} must be [*B, {self.scene.physics_size}], got {list(array.shape)}"
             )
-        require_finite(array, "physics")
+        if finite:
+            require_finite(array, "physics")
         return array
 
     def _variants(self, variant: Tensor | np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:

@@ -169,9 +169,9 @@ class ModelEnv(ModelBasedEnvBase):
             entries, each = tensordict.select(*self.world_model.in_keys, strict=False), [state]
             for action in actions.unbind(-2):
                 # The model writes into its input: give it a shallow copy.
-                entries = self.world_model(entries.copy().set("action", action)).get("next")
-                each.append(cast(Tensor, entries.get("state")))
-                entries = tensordict.select(*self.world_model.in_keys, strict=False).update(entries)
+                predicted = self.world_model(entries.copy().set("action", action)).get("next")
+                each.append(cast(Tensor, predicted.get("state")))
+                entries = entries.copy().update(predicted)
             states = torch.stack(each, dim=-3)
         task = cast("Tensor | None", tensordict.get("task", None))
         if task is not None:

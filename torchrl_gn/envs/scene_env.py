@@ -114,12 +114,11 @@ class SceneEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDict:
         if tensordict is None:
             tensordict = TensorDict(batch_size=self.batch_size)
-        shape, variant = tensordict.shape, None
-        if len(self.scenes) > 1:
-            variant = tensordict.get("variant", None)
-            if variant is None:
-                variant = (torch.arange(shape.numel()) % len(self.scenes)).reshape(*shape, 1)
-            variant = self.variant_of(TensorDict({"variant": variant}, batch_size=shape))
+        shape = tensordict.shape
+        if len(self.scenes) > 1 and tensordict.get("variant", None) is None:
+            in_turn = (torch.arange(shape.numel()) % len(self.scenes)).reshape(*shape, 1)
+            tensordict = tensordict.copy().set("variant", in_turn)
+        variant = self.variant_of(tensordict)
         if set_state and ("physics" in tensordict.keys() or variant is None):
             physics = read(tensordict, "physics", (self.scene.physics_size,), self)
             require_finite(physics, f"{self}: 'physics'")

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.data.start_states import draw_start_states, sample_start_states
+from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.scene import Scene
 
 StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndarray]
@@ -45,9 +46,7 @@ class StartSampler:
 
     def seed(self, seed: int | None) -> None:
         """Start the draws afresh."""
-        if seed is None:
-            seed = int(torch.randint(2**31, ()).item())
-        self._rng = np.random.default_rng(seed)
+        self._rng = numpy_generator(seed)
 
     def draw(self, shape: torch.Size, reset: Tensor | None = None, variant: Tensor | None = None) -> Tensor:
         """Start states for a batch.
@@ -76,8 +75,7 @@ class StartSampler:
             return self._table[self._rng.integers(len(self._table), size=count)]
         if self._function is not None:
             return self._checked(self._function(count, self._rng), count)
-        if variant is None:
-            return sample_start_states(self.scene, count, self._rng)
+        variant = np.zeros(count, dtype=np.int64) if variant is None else variant
         return draw_start_states(Simulator(self.scenes), variant, self._rng)[0]
 
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:

@@ -267,15 +267,22 @@ class BoundForwardModel(TensorDictModuleBase):
             ValueError: if a shape does not fit the scene.
         """
         self._check_shapes(state, action, static)
-        return self._advance(state, action, self.fold(static))
+        return self._advance(state, action, self.fold(static))[0]
 
-    def rollout(self, state: Tensor, actions: Tensor, static: TensorDictBase | None = None) -> Tensor:
+    def rollout(
+        self,
+        state: Tensor,
+        actions: Tensor,
+        static: TensorDictBase | None = None,
+        memory: TensorDictBase | None = None,
+    ) -> Tensor:
         """States from a start state under a sequence of actions.
 
         Args:
             state: ``[*B, N, 13]`` start states.
             actions: ``[*B, T, A]``; ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``.
             static: static values of every rollout, or without batch; by default the scene's.
+            memory: what a recurrent model remembers of the states before the start; by default there were none.
 
         Returns:
             ``[*B, T + 1, N, 13]``; the first is the start state itself.
@@ -283,15 +290,29 @@ class BoundForwardModel(TensorDictModuleBase):
         Raises:
             ValueError: if a shape does not fit the scene.
         """
+        return self.rollout_and_memory(state, actions, static, memory)[0]
+
+    def rollout_and_memory(
+        self,
+        state: Tensor,
+        actions: Tensor,
+        static: TensorDictBase | None = None,
+        memory: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDictBase | None]:
+        """As :meth:`rollout`, with what a recurrent model remembers at its end, to go on from; others remember None."""
         for action in actions.unbind(-2)[:1]:
             self._check_shapes(state, action, static)
         states, folded = [state], self.fold(static)
         for action in actions.unbind(-2):
-            states.append(self._advance(states[-1], action, folded))
-        return torch.stack(states, dim=-3)
+            state, memory = self._advance(state, action, folded, memory)
+            states.append(state)
+        return torch.stack(states, dim=-3), memory
 
-    def _advance(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
-        return self.layout.apply(state, self._delta(state, action, folded))
+    def _advance(
+        self, state: Tensor, action: Tensor, folded: Folded, memory: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDictBase | None]:
+        """Next state, and what a recurrent model remembers after it; shapes are not checked."""
+        return self.layout.apply(state, self._delta(state, action, folded)), None
 
     def fold(self, static: TensorDictBase | None = None) -> Folded:
         """What predictions of the same bodies share, to pass to :meth:`delta` for many steps.
@@ -313,16 +334,6 @@ class BoundForwardModel(TensorDictModuleBase):
     ) -> tuple[Tensor, TensorDictBase | None]:
         """As :meth:`delta`, with what a recurrent model remembers; this one remembers nothing."""
         return self.delta(state, action, folded), None
-
-    def rollout_and_memory(
-        self,
-        state: Tensor,
-        actions: Tensor,
-        static: TensorDictBase | None = None,
-        memory: TensorDictBase | None = None,
-    ) -> tuple[Tensor, TensorDictBase | None]:
-        """As :meth:`rollout`, with what a recurrent model remembers at its end; this one remembers nothing."""
-        return self.rollout(state, actions, static), None
 
     def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         seen = self.frame.see(state, folded.values)

@@ -46,9 +46,8 @@ class BoundRecurrentModel(BoundForwardModel):
         state, action = (tensordict[key] for key in self.in_keys[:2])
         folded = self.fold(self.static_in(tensordict))
         self._check_shapes(state, action)
-        memory = tensordict.get("memory", None)
-        delta, memory = self.delta_and_memory(state, action, folded, memory)
-        tensordict.set(self.out_keys[0], self.layout.apply(state, delta))
+        next_state, memory = self._advance(state, action, folded, tensordict.get("memory", None))
+        tensordict.set(self.out_keys[0], next_state)
         return tensordict.set(self.out_keys[1], memory)
 
     def own_memory(self) -> TensorDict:
@@ -82,6 +81,12 @@ class BoundRecurrentModel(BoundForwardModel):
     def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
         return self.delta_and_memory(state, action, folded)[0]
 
+    def _advance(
+        self, state: Tensor, action: Tensor, folded: Folded, memory: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDict]:
+        delta, memory = self.delta_and_memory(state, action, folded, memory)
+        return self.layout.apply(state, delta), memory
+
     def observe(
         self, states: Tensor, actions: Tensor, static: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDict]:
@@ -102,46 +107,10 @@ class BoundRecurrentModel(BoundForwardModel):
             raise ValueError("There is no state to remember.")
         folded, memory, predictions = self.fold(static), None, []
         for state, action in zip(states.unbind(-3), actions.unbind(-2), strict=True):
-            delta, memory = self.delta_and_memory(state, action, folded, memory)
-            predictions.append(self.layout.apply(state, delta))
+            predicted, memory = self._advance(state, action, folded, memory)
+            predictions.append(predicted)
         assert memory is not None
         return torch.stack(predictions, dim=-3), memory
-
-    def rollout(
-        self,
-        state: Tensor,
-        actions: Tensor,
-        static: TensorDictBase | None = None,
-        memory: TensorDictBase | None = None,
-    ) -> Tensor:
-        """States from a start state under a sequence of actions, remembering what comes on the way.
-
-        Args:
-            state: ``[*B, N, 13]`` start states.
-            actions: ``[*B, T, A]``.
-            static: static values of every rollout, or without batch; by default the scene's.
-            memory: of the states before the start, as :meth:`observe` gives it.
-
-        Returns:
-            ``[*B, T + 1, N, 13]``; the first is the start state itself.
-        """
-        return self.rollout_and_memory(state, actions, static, memory)[0]
-
-    def rollout_and_memory(
-        self,
-        state: Tensor,
-        actions: Tensor,
-        static: TensorDictBase | None = None,
-        memory: TensorDictBase | None = None,
-    ) -> tuple[Tensor, TensorDictBase | None]:
-        """As :meth:`rollout`, with the memory at its end, to go on from."""
-        for action in actions.unbind(-2)[:1]:
-            self._check_shapes(state, action, static)
-        states, folded = [state], self.fold(static)
-        for action in actions.unbind(-2):
-            delta, memory = self.delta_and_memory(states[-1], action, folded, memory)
-            states.append(self.layout.apply(states[-1], delta))
-        return torch.stack(states, dim=-3), memory
 
 
 def _graph(memory: TensorDictBase, edge_index: Tensor) -> Graph:

@@ -109,13 +109,15 @@ class SpecializedForwardModel(BoundForwardModel):
         given = {} if static is None else dict(static.items())
         return given.keys() == self._given.keys() and all(self._given[name].same(given[name]) for name in given)
 
-    def _advance(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
+    def _advance(
+        self, state: Tensor, action: Tensor, folded: Folded, memory: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDictBase | None]:
         if not self.compile_steps:
             return super()._advance(state, action, folded)
         if self._compiled is None:
             plain = super()._advance
-            self._compiled = CompiledStep(lambda state, action: plain(state, action, folded), lambda: self._folds)
-        return self._compiled(state, action)
+            self._compiled = CompiledStep(lambda state, action: plain(state, action, folded)[0], lambda: self._folds)
+        return self._compiled(state, action), None
 
     @torch.no_grad()
     def _fold(self, values: SceneValues) -> Folded:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import cast
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -15,6 +14,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.data.controls import spline_controls
+from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.planners.plan import check_plannable, plan_primer, read_plan, write_plan
 
@@ -93,8 +93,7 @@ class GradientPlanner(MPCPlannerBase):
         self.register_buffer("middle", ((low + high) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         self.to(env.device)
-        seed = int(torch.randint(2**31, ()).item()) if seed is None else seed
-        self._rng = np.random.default_rng(seed)
+        self._rng = numpy_generator(seed)
 
     middle: Tensor
     half_range: Tensor
@@ -126,7 +125,7 @@ class GradientPlanner(MPCPlannerBase):
         batch = td.shape
         flat = td.reshape(-1)
         plan, planned = read_plan(flat, self.plan_shape, torch.float32)
-        plan, planned = (plan - self.middle) / self.half_range, planned.flatten()
+        plan, planned = self._scaled(plan), planned.flatten()
         entries = self._entries(flat)
         if self._remembers and "memory" not in entries.keys() and bool(planned.any()):
             raise KeyError(
@@ -141,11 +140,19 @@ class GradientPlanner(MPCPlannerBase):
             some = entries if len(where) == len(flat) else cast(TensorDictBase, entries[where])
             begin = plan[where] if bool(planned[where[0]]) else self._first(some)
             best[where] = self._improve(some, begin, iterations)
-        actions = best * self.half_range + self.middle
+        actions = self._actions(best)
         write_plan(td, actions.reshape(*batch, *self.plan_shape))
         if self._remembers:
             td.set(("next", "memory"), self._remember(entries, actions[:, 0, 0]).reshape(batch))
         return actions[:, 0, 0].reshape(*batch, -1)
+
+    def _scaled(self, actions: Tensor) -> Tensor:
+        """Actions ``[*B, A]`` in units of half their range, from -1 to 1 around its middle."""
+        return (actions - self.middle) / self.half_range
+
+    def _actions(self, scaled: Tensor) -> Tensor:
+        """Actions ``[*B, A]`` in the actuators' units."""
+        return scaled * self.half_range + self.middle
 
     @property
     def _remembers(self) -> bool:
@@ -164,7 +171,7 @@ class GradientPlanner(MPCPlannerBase):
 
     def _imagine(self, many: TensorDictBase, plan: Tensor) -> Tensor:
         """Returns ``[B, K]`` of sequences ``[B, K, H, A]`` in units of half their range, from ``[B K]`` states."""
-        _, rewards = self.imagined.imagine(many, (plan * self.half_range + self.middle).flatten(0, 1))
+        _, rewards = self.imagined.imagine(many, self._actions(plan).flatten(0, 1))
         total = rewards.sum((-2, -1)).reshape(plan.shape[:2])
         return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
 
@@ -172,7 +179,7 @@ class GradientPlanner(MPCPlannerBase):
         """The best of random sequences ``[B, K, H, A]``; and doing nothing is among them."""
         rows = len(entries)
         drawn = self._splines(rows, self.samples)
-        drawn[:, 0] = (-self.middle / self.half_range).clamp(-1, 1)
+        drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
         if self.samples == self.candidates:
             return drawn
         # A compiled model is compiled for every number of rows, in minutes: give it the one that it gets later.
@@ -188,7 +195,7 @@ class GradientPlanner(MPCPlannerBase):
     def _splines(self, rows: int, count: int) -> Tensor:
         drawn = spline_controls(self.imagined.scene, rows * count, self.horizon, self._rng)
         controls = torch.from_numpy(drawn).float().to(self.half_range.device)
-        return ((controls - self.middle) / self.half_range).reshape(rows, count, self.horizon, -1)
+        return self._scaled(controls).reshape(rows, count, self.horizon, -1)
 
     def _improve(self, entries: TensorDictBase, plan: Tensor, iterations: int) -> Tensor:
         """Sequences ``[B, K, H, A]`` improved, the best one first."""

@@ -14,6 +14,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.data.controls import spline_controls
+from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
@@ -104,8 +105,7 @@ class ILQGPlanner(MPCPlannerBase):
         super().__init__(env)
         self.horizon, self.iterations, self.warm_up = horizon, iterations, warm_up
         self.control_cost, self.central, self.num_threads = control_cost, central, num_threads
-        seed = int(torch.randint(2**31, ()).item()) if seed is None else seed
-        self._rng = np.random.default_rng(seed)
+        self._rng = numpy_generator(seed)
         self._simulators: dict[int, Simulator] = {}
         self._warned = False
 

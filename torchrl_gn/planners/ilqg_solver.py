@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.planners.ddp import QuadraticModel, backward_pass
-from torchrl_gn.planners.linearize import Tangent, linearize, step_batch
+from torchrl_gn.planners.linearize import Tangent, linearize
 from torchrl_gn.planners.reward_expansion import RewardExpansion
 
 # Candidates of an iteration, all simulated at once: dampings, as multiples of the last one that did, times step sizes.
@@ -152,17 +152,17 @@ class ILQGSolver:
         """Simulate ``count`` copies of a state under a policy: controls, MuJoCo states, body states, whether stable."""
         controls = np.empty((count, steps, self.scene.num_actions))
         paths = np.empty((count, steps + 1, len(physics)))
-        bodies = np.empty((count, steps + 1, 13 * self.scene.num_nodes))
+        states = np.empty((count, steps + 1, self.scene.num_nodes, 13))
         paths[:, 0] = physics
         for t in range(steps):
             controls[:, t] = policy(t, paths[:, t])
-            paths[:, t + 1], bodies[:, t] = step_batch(self.simulator, paths[:, t], self.actions(controls[:, t]))
+            paths[:, t + 1], states[:, t] = self.simulator.step(paths[:, t], self.actions(controls[:, t]))
         # One step more shows the last state, and whether it can be simulated on from.
-        beyond, bodies[:, steps] = step_batch(self.simulator, paths[:, steps], self.actions(controls[:, -1]))
+        beyond, states[:, steps] = self.simulator.step(paths[:, steps], self.actions(controls[:, -1]))
         stable = np.array(
             [np.isfinite(path).all() and np.isfinite(last).all() for path, last in zip(paths, beyond, strict=True)]
         )
-        return controls, paths, bodies.reshape(count, steps + 1, -1, 13), stable
+        return controls, paths, states, stable
 
     def _best(
         self, controls: np.ndarray, paths: np.ndarray, states: np.ndarray, stable: np.ndarray

@@ -9,6 +9,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from torchrl_gn.data import TrajectoryDataset, create_dataset
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
 from torchrl_gn.training.tracking import Tracker
@@ -29,6 +30,26 @@ def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
             bar.update(done - bar.n)
 
         yield show
+
+
+def dataset_with_progress(
+    folder: Path, scene: Scene, data: Mapping[str, Any], *, variants: int | None = None
+) -> TrajectoryDataset:
+    """Make a system's data set, finish it or open the one that is there, with a progress bar.
+
+    Args:
+        folder: holds the data sets, each in a folder of its own: ``<name>``, of variants ``<name>_variants``.
+        scene: the scene.
+        data: configuration of the data: trajectories to ``train``, for ``validation`` and to ``test``, their ``length``
+            in control steps, and their ``seed``.
+        variants: number of random variants in each split. Default: all trajectories are of the scene itself.
+    """
+    name = scene.name if variants is None else f"{scene.name}_variants"
+    sizes = {split: data[split] for split in ("train", "validation", "test")}
+    with collecting(f"data of {scene.name}") as show:
+        return create_dataset(
+            folder / name, scene, **sizes, steps=data["length"], seed=data["seed"], variants=variants, progress=show
+        )
 
 
 def train_with_progress(
