@@ -180,8 +180,7 @@ def test_unstable_simulations_are_told(threads: int, tmp_path, monkeypatch, capf
     # One step from time 0, as an environment takes it: the time after MuJoCo's reset looks right.
     assert simulator.rollout(physics, actions[:, :1])["stable"].tolist() == [True, False, True, True]
     assert simulator.rollout(physics, actions[:, :3])["stable"].tolist() == [True, False, True, True]
-    after = physics.copy()
-    after[:, 0] = 3.0
+    after = physics.copy()  # at time 0, to which MuJoCo's reset sets back
     for t in range(4):
         after, _ = simulator.step(after, actions[:, t])  # what was unstable once stays so
         assert np.isnan(after).all(1).tolist() == [False, True, False, t == 3]

@@ -117,11 +117,11 @@ class Simulator:
             # Sensor row t is the state before physics step t: one more step shows the last state.
             repeated = np.repeat(controls[rows], held, axis=1)
             last = controls[rows, -1:] if steps else np.zeros((len(repeated), 1, scene.num_actions))
-            after, sensors = self._advance(start[rows], np.concatenate([repeated, last], axis=1), which[rows])
+            controls_now = np.concatenate([repeated, last], axis=1)
+            after, sensors, stable[rows] = self._advance(start[rows], controls_now, which[rows])
             state[rows] = sensors[:, ::held, scene.sensor_slice].reshape(state[rows].shape)
             recorded[rows, 0] = start[rows]
             recorded[rows, 1:] = after[:, held - 1 :: held][:, :steps]
-            stable[rows] = self._is_stable(start[rows], after)
         result = {
             "state": torch.from_numpy(state.reshape(*batch, *state.shape[1:])),
             "physics": torch.from_numpy(recorded.reshape(*batch, *recorded.shape[1:])),
@@ -167,8 +167,7 @@ class Simulator:
         """Advance states by one control step, as :meth:`rollout` but seeing bodies before it only.
 
         That saves one physics step: half the time of scenes that take one a control step. But whether the next states
-        can be simulated on from, only the next step tells. And a first physics step from time 0 that is unstable goes
-        unnoticed: MuJoCo's reset, to time 0, then sets nothing back, and the next state is that of the reset one.
+        can be simulated on from, only the next step tells.
 
         Args:
             physics: ``[n, S]`` float64, full MuJoCo states. Those that are not finite are unstable, so that steps can
@@ -193,10 +192,8 @@ class Simulator:
             )
         after, state = np.empty_like(start), np.empty((len(start), scene.num_nodes, 13))
         for rows in self._chunks(len(start), scene.substeps):
-            path, sensors = self._advance(
-                start[rows], np.repeat(actions[rows, None], scene.substeps, axis=1), which[rows]
-            )
-            stable = self._is_stable(start[rows], path)
+            held = np.repeat(actions[rows, None], scene.substeps, axis=1)
+            path, sensors, stable = self._advance(start[rows], held, which[rows])
             after[rows] = np.where(stable[:, None], path[:, -1], np.nan)
             state[rows] = sensors[:, 0, scene.sensor_slice].reshape(state[rows].shape)
         return after, state
@@ -219,22 +216,31 @@ class Simulator:
         settled, stable = np.empty_like(start), np.empty(len(start), dtype=bool)
         for rows in self._chunks(len(start), steps + 1):
             controls = np.zeros((len(start[rows]), steps + 1, self.scene.num_actions))
-            after, _ = self._advance(start[rows], controls, which[rows])
+            after, _, stable[rows] = self._advance(start[rows], controls, which[rows])
             settled[rows] = after[:, -2]
-            stable[rows] = self._is_stable(start[rows], after)
         settled[:, 0] = start[:, 0]
         return settled, stable
 
-    def _advance(self, start: np.ndarray, controls: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Physics after ``[n, t, S]`` and sensors before ``[n, t, nsensordata]`` each physics step."""
+    def _advance(
+        self, start: np.ndarray, controls: np.ndarray, which: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Physics ``[n, t, S]`` after and sensors ``[n, t, nsensordata]`` before each physics step; what is stable."""
+        # What is unstable is seen by its time, which MuJoCo's reset sets back to 0: from 0 on it could not be seen.
+        zero = start[:, 0] == 0
+        if zero.any():
+            start = start.copy()
+            start[zero, 0] = 1.0
         with _quiet():
-            return self._pool.rollout(
+            after, sensors = self._pool.rollout(
                 [self.scenes[i].model for i in which] if len(self.scenes) > 1 else self.scene.model,
                 self._data,
                 start,
                 controls if self.scene.num_actions else None,
                 nstep=controls.shape[1],
             )
+        stable = self._is_stable(start, after)
+        after[zero, :, 0] = np.cumsum(np.full(after.shape[1], self.scene.model.opt.timestep))  # added up as MuJoCo does
+        return after, sensors, stable
 
     def _is_stable(self, start: np.ndarray, after: np.ndarray) -> np.ndarray:
         """MuJoCo repeats the state of an unstable simulation, after a reset that sets its time back."""
