@@ -117,6 +117,26 @@ def test_place_matters_along_other_axes_and_without_recentring(scenes, make_mode
     assert (absolute.delta(along, action) - absolute.delta(state, action)).norm() > 1e-3
 
 
+@pytest.mark.parametrize(("name", "hidden"), [("swimmer6", [0, 1]), ("cheetah", [0]), ("pendulum", [])])
+def test_positions_along_invariant_axes_can_be_hidden(scenes, make_model, random_states, random_actions, name, hidden):
+    """One body moved alone, which no joint would let it, changes what the network sees of other axes only."""
+    scene = scenes[name]
+    bound = make_model(scene, positions=False, link=False, recenter=False).bind(scene)
+    state, action = random_states(scene, 10, seed=3), random_actions(scene, 10)
+    seen = bound.dynamic_graph(state, action).nodes
+    for axis in range(3):
+        moved = state.clone()
+        moved[:, 1, axis] += 0.5
+        same = torch.equal(bound.dynamic_graph(moved, action).nodes, seen)
+        assert same or axis not in hidden
+        assert not same or axis in hidden or not scene.live[:, axis].any()
+    default = make_model(scene, link=False, recenter=False).bind(scene)
+    for axis in hidden:
+        moved = state.clone()
+        moved[:, 1, axis] += 0.5
+        assert not torch.equal(default.dynamic_graph(moved, action).nodes, default.dynamic_graph(state, action).nodes)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["swimmer6", "arm"])
 def test_predictions_turn_with_the_scene(scenes, make_model, random_states, random_actions, name, dtype):

@@ -75,6 +75,26 @@ def test_batches_are_independent_graphs(random_graph, edge_index, batch):
         assert_same_graph(got, algorithm_1(block, one))
 
 
+def test_means_do_not_tell_one_graph_from_two_copies_of_it(random_graph):
+    graph = random_graph(GraphSize(3, 2, 4), EDGES, NODES)
+    two = Graph(
+        torch.cat((graph.nodes, graph.nodes), -2),
+        torch.cat((graph.edges, graph.edges), -2),
+        graph.globals_,
+        torch.cat((EDGES, EDGES + NODES), 1),
+    )
+    for pool, same in (("mean", True), ("sum", False)):
+        torch.manual_seed(0)
+        block = GNBlock(GraphSize(3, 2, 4), GraphSize(3, 2, 5), pool=pool, **HIDDEN).double()
+        one, both = block(graph), block(two)
+        assert torch.allclose(one.globals_, both.globals_, rtol=0, atol=1e-13) is same
+        torch.testing.assert_close(both.nodes[..., :NODES, :], one.nodes, rtol=0, atol=1e-13)
+    empty = Graph(graph.nodes, graph.edges[..., :0, :], graph.globals_, EDGES[:, :0])
+    assert GNBlock(GraphSize(3, 2, 4), GraphSize(3, 2, 5), pool="mean").double()(empty).globals_.isfinite().all()
+    with pytest.raises(ValueError, match="pool='max' is not known"):
+        GNBlock(GraphSize(3, 2, 4), GraphSize(3, 2, 5), pool="max")  # pyright: ignore[reportArgumentType]
+
+
 def test_without_a_global_update_none_is_built():
     block = GNBlock(GraphSize(3, 2, 4), GraphSize(5, 6, 0), **HIDDEN)
     assert block.global_mlp is None

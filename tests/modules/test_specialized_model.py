@@ -103,14 +103,16 @@ def trees(draw) -> str:
     latent=st.integers(1, 6),
     encoding=st.sampled_from(["matrix", "quaternion"]),
     static=st.sampled_from(["scene", "none"]),
-    flags=st.tuples(*[st.booleans()] * 4),
+    flags=st.tuples(*[st.booleans()] * 5),
+    pool=st.sampled_from(["sum", "mean"]),
 )
 def test_random_scenes_are_predicted_as_by_the_plain_model(
-    fit, random_states, random_actions, xml, depth, latent, encoding, static, flags
+    fit, random_states, random_actions, xml, depth, latent, encoding, static, flags, pool
 ):
     scene = load_scene(xml)
     torch.manual_seed(0)
-    options = dict(zip(("integrate", "joint_axes", "recenter", "align"), flags, strict=True))
+    options = dict(zip(("integrate", "joint_axes", "recenter", "align", "positions"), flags, strict=True))
+    options["pool"] = pool
     hidden = {"edge_hidden": [7] * depth, "node_hidden": [6] * depth, "global_hidden": [5] * depth}
     model = ForwardModel(FeatureSet.of(scene), static=static, encoding=encoding, latent=latent, **options, **hidden)
     fit(model, scene)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from torchrl_gn.modules.folded_core import FoldedCore, fold_core
-from torchrl_gn.modules.gn_block import GNBlock
+from torchrl_gn.modules.gn_block import GNBlock, Pool
 from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
 from torchrl_gn.modules.linear import ACTIVATIONS
 
@@ -27,9 +27,10 @@ class GNCore(nn.Module):
         node_hidden: hidden sizes of both node MLPs.
         global_hidden: hidden sizes of the global MLP.
         activation: between the layers of all MLPs.
+        pool: as of :class:`GNBlock`.
 
     Raises:
-        ValueError: if an MLP has no hidden layer, or the activation is not known.
+        ValueError: if an MLP has no hidden layer, or the activation or ``pool`` is not known.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class GNCore(nn.Module):
         node_hidden: Sequence[int] = (128, 128),
         global_hidden: Sequence[int] = (128, 128),
         activation: str = "relu",
+        pool: Pool = "sum",
     ) -> None:
         super().__init__()
         if activation not in ACTIVATIONS:
@@ -54,7 +56,7 @@ class GNCore(nn.Module):
             )
         between = GraphSize(latent, latent, latent)
         hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
-        self.first = GNBlock(in_size, between, activation=activation, **hidden)
+        self.first = GNBlock(in_size, between, activation=activation, pool=pool, **hidden)
         self.second = GNBlock(in_size + between, GraphSize(out_nodes, latent, 0), activation=activation, **hidden)
 
     def forward(self, graph: Graph) -> Graph:

@@ -244,6 +244,8 @@ def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -
 
     weight, bias = _first_layer(first.global_mlp)
     wg, wsg, wn, we = weight.split((g, sg, node_out.shape[0], edge_out.shape[0]), dim=1)
+    if first.pool == "mean":
+        wn, we = wn / num_nodes, we / max(num_edges, 1)
     table = bias + F.linear(static_globals, wsg) + num_nodes * (wn @ node_bias) + num_edges * (we @ edge_bias)
     first_global = _factors(first.global_mlp, (wn @ node_out, we @ edge_out, wg), table)
     global_out, global_bias = _last_layer(first.global_mlp)

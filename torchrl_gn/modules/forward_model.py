@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -13,6 +13,7 @@ from torchrl_gn.modules.ablated_core import AblatedCore, UnfoldedCore
 from torchrl_gn.modules.contacts import Contacts
 from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.folded_core import FoldedCore
+from torchrl_gn.modules.gn_block import Pool
 from torchrl_gn.modules.graph import Graph, GraphSize
 from torchrl_gn.modules.mlp_core import FoldedMLP, MLPCore
 from torchrl_gn.modules.normalizer import Normalizer
@@ -95,6 +96,9 @@ class ForwardModel(nn.Module):
         controls: how many controls act at a joint; several only without ``joint_axes``.
         recenter: make the prediction independent of where a translation-invariant scene
             is (paper: on for single systems, off when several train together).
+        positions: show the network where bodies are along axes of translation invariance. Where joints pin all
+            bodies together orientations tell it too, and a network without positions is at home in scenes larger
+            than those it was trained on.
         align: make the prediction independent of how a rotation-invariant scene is turned
             (:attr:`Scene.heading <torchrl_gn.scenes.Scene>`); the paper does not.
         link: keep bodies that joints pin together together: of the predicted positions and
@@ -106,6 +110,7 @@ class ForwardModel(nn.Module):
             (:class:`~torchrl_gn.modules.AblatedCore`; paper, SM Figure "Ablation study of the architecture"):
             ``"interaction_network"``, ``"no_edge_update"``, ``"no_node_update"`` or ``"no_global_update"``.
         skip: whether the second graph network also reads what the first read.
+        pool: whether globals see the ``"sum"`` (paper) of all nodes and edges or their ``"mean"``.
         memory: numbers of node, edge and global features that a recurrent core remembers.
         latent: features of the graph between the two GN blocks.
         edge_hidden: hidden sizes of the edge MLPs.
@@ -132,10 +137,12 @@ class ForwardModel(nn.Module):
         contacts: bool = True,
         controls: int = 1,
         recenter: bool = True,
+        positions: bool = True,
         align: bool = True,
         link: bool = True,
         core: CoreKind = "gn",
         skip: bool = True,
+        pool: Pool = "sum",
         memory: Sequence[int] = (20, 20, 20),
         latent: int = 128,
         edge_hidden: Sequence[int] = (128, 128),
@@ -158,7 +165,7 @@ class ForwardModel(nn.Module):
         self.encoding: Encoding = encoding
         self.integrate, self.joint_axes = integrate, joint_axes
         self.contacts = contacts
-        self.recenter, self.align, self.link = recenter, align, link
+        self.recenter, self.positions, self.align, self.link = recenter, positions, align, link
         self.options = {
             "static": static,
             "inferred": list(inferred),
@@ -168,10 +175,12 @@ class ForwardModel(nn.Module):
             "contacts": contacts,
             "controls": controls,
             "recenter": recenter,
+            "positions": positions,
             "align": align,
             "link": link,
             "core": core,
             "skip": skip,
+            "pool": pool,
             "memory": list(memory),
             "latent": latent,
             "edge_hidden": list(edge_hidden),
@@ -208,14 +217,13 @@ class ForwardModel(nn.Module):
             self.core = MLPCore(in_size, out, items=(nodes, edges), hidden=mlp_hidden, activation=activation)
             return
         hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
+        sizes: dict[str, Any] = {"latent": latent, "activation": activation, "pool": pool, **hidden}
         if core == "recurrent":
-            sizes = {"latent": latent, "activation": activation, **hidden}
             self.core = RecurrentCore(self.dynamic_size, self.static_size, out, memory=memory, **sizes)
         elif core == "gn" and skip:
-            self.core = GNCore(in_size, out, latent=latent, activation=activation, **hidden)
+            self.core = GNCore(in_size, out, **sizes)
         else:
             ablation = "none" if core == "gn" else core
-            sizes = {"latent": latent, "activation": activation, **hidden}
             self.core = AblatedCore(in_size, out, ablation=ablation, skip=skip, **sizes)
 
     def values_of(self, scene: Scene) -> SceneValues:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -11,6 +12,8 @@ from torchrl.modules import MLP
 
 from torchrl_gn.modules.graph import Graph, GraphSize
 from torchrl_gn.modules.linear import ACTIVATIONS
+
+Pool = Literal["sum", "mean"]
 
 
 class GNBlock(MessagePassing):
@@ -31,6 +34,11 @@ class GNBlock(MessagePassing):
         node_hidden: hidden sizes of the node MLP.
         global_hidden: hidden sizes of the global MLP.
         activation: ``"relu"`` (paper), ``"silu"``, ``"gelu"`` or ``"tanh"``.
+        pool: what the globals see of all nodes and edges: their ``"sum"`` (paper) or their ``"mean"``, which does not
+            grow with the graph.
+
+    Raises:
+        ValueError: if ``pool`` is neither.
     """
 
     def __init__(
@@ -42,8 +50,12 @@ class GNBlock(MessagePassing):
         node_hidden: Sequence[int] = (128, 128),
         global_hidden: Sequence[int] = (128, 128),
         activation: str = "relu",
+        pool: Pool = "sum",
     ) -> None:
         super().__init__(aggr="sum", node_dim=-2)
+        if pool not in get_args(Pool):
+            raise ValueError(f"pool={pool!r} is not known; use one of {list(get_args(Pool))}.")
+        self.pool: Pool = pool
         self.in_size, self.out_size = in_size, out_size
         g, n, e = in_size.globals_, in_size.nodes, in_size.edges
         edges, nodes = out_size.edges or e, out_size.nodes or n
@@ -63,7 +75,9 @@ class GNBlock(MessagePassing):
             received = self.propagate(edge_index, edges=edges, size=(num_nodes, num_nodes))
             nodes = self.node_mlp(torch.cat((_per_item(globals_, num_nodes), nodes, received), dim=-1))
         if self.global_mlp is not None:
-            globals_ = self.global_mlp(torch.cat((globals_, nodes.sum(-2), edges.sum(-2)), dim=-1))
+            count = [max(x.shape[-2], 1) if self.pool == "mean" else 1 for x in (nodes, edges)]
+            pooled = (x.sum(-2) / n for x, n in zip((nodes, edges), count, strict=True))
+            globals_ = self.global_mlp(torch.cat((globals_, *pooled), dim=-1))
         return Graph(nodes, edges, globals_, edge_index)
 
     def edge_update(self, nodes_j: Tensor, nodes_i: Tensor, edges: Tensor, globals_: Tensor) -> Tensor:

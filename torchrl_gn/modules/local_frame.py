@@ -59,6 +59,7 @@ class LocalFrame(Float64Buffers):
     joint_node: Tensor
     predicted: Tensor
     shifted: Tensor
+    visible: Tensor
 
     def __init__(self, scene: Scene, model: ForwardModel) -> None:
         super().__init__()
@@ -80,6 +81,13 @@ class LocalFrame(Float64Buffers):
             # [N, 3]: which positions move when the scene is shifted; the world stays at 0.
             "shifted": predicted[:, None] * invariant,
         }
+        # Of a scene that turns about an axis, both others must be invariant to be hidden in every heading.
+        across = invariant.bool() if self.heading is None else torch.arange(3) != self.heading.axis
+        self.hides = bool(not model.positions and invariant.any() and invariant.bool()[across].all())
+        if self.hides:
+            visible = torch.ones(scene.num_nodes, self.layout.size)
+            visible[:, self.layout.slices["position"]] -= values["shifted"]
+            values["visible"] = visible
         if self.joint_axes:
             values["joint_node"] = torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2)
         self.constants(values)
@@ -149,7 +157,8 @@ class LocalFrame(Float64Buffers):
             assert matrices is not None
             axes = (matrices[..., self.joint_node, :, :] @ values.joint_axis.to(state.dtype).unsqueeze(-1)).squeeze(-1)
             controls = torch.cat((controls, axes, controls * axes), dim=-1)  # [*B, E, 7]
-        features = self.layout.encode(state, self.encoding, matrices)
+        shown = state * self.visible.to(state.dtype) if self.hides else state
+        features = self.layout.encode(shown, self.encoding, matrices)
         if self.contacts is not None:
             touching = self.contacts(state, matrices, values.contact_offset, values.contact_radius)
             features = torch.cat((features, touching), dim=-1)
