@@ -1,16 +1,17 @@
 """How well models trained on random control predict a swimmer that swims on purpose.
 
     python recipes/data_shift.py [system=swimmer6] [minutes=4] [seeds=[0]] [run_dir=PATH]
+    python recipes/data_shift.py policy=runs/ddpg/<time>
 
-Finds a gait, waves of control that travel along the body, that carries the true swimmer far (cross-entropy
-method), and lets it swim with variations of it. Graph networks and an MLP are then trained for equal time on random
-trajectories, and on a mixture with as many in which the swimmer swims, and compared on trajectories of their training,
-of random control never trained on, and of swimming (paper, Figure "Swimmer6 prediction errors ... for data in the
-training set, in the validation set, and data from DDPG agent trajectories"). Finished runs are kept; the same run_dir
-goes on. What came out: docs/results.md.
+Lets the true swimmer swim: by a learned policy (of recipes/ddpg.py or svg.py, to random targets), or by variations of
+a gait, waves of control that travel along the body and carry it far (found by the cross-entropy method). Graph networks
+and an MLP are then trained for equal time on random trajectories, and on a mixture with as many in which the swimmer
+swims, and compared on trajectories of their training, of random control never trained on, and of swimming (paper,
+Figure "Swimmer6 prediction errors ... for data in the training set, in the validation set, and data from DDPG agent
+trajectories"). Finished runs are kept; the same run_dir goes on. What came out: docs/results.md.
 
-Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, a video of the gait as
-gait.gif, and each run with its log to its run folder.
+Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, a video of the swimmer as
+swimming.gif, and each run with its log to its run folder.
 """
 
 from __future__ import annotations
@@ -25,10 +26,14 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_gn.data import Simulator, create_dataset, sample_start_states
+from torchrl_gn.envs import SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, rollout_video
+from torchrl_gn.modules import Agent, SwimmerObservation
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
 from torchrl_gn.training.sweep import Run, report_sweep, run_all
@@ -83,6 +88,24 @@ def swim(scene: Scene, gait: np.ndarray, count: int, steps: int, rng: np.random.
     return TensorDict({"state": found["state"][:, going:].clone(), "action": action}, [count])
 
 
+def swim_by_policy(scene: Scene, agent: Agent, count: int, steps: int, seed: int) -> TensorDict:
+    """Trajectories ``[count]`` under a learned policy, each to a target of its own, begun when it has got going."""
+    env, going = SceneEnv(scene, seed=seed), 100
+    policy = TensorDictSequential([SwimmerObservation(scene), agent.policy])
+    generator = torch.Generator().manual_seed(seed)
+    now = env.reset(TensorDict(batch_size=[count]))
+    targets = 4 * torch.rand(count, 2, generator=generator, dtype=torch.float64) - 2  # the suite's, metres
+    now["target"] = torch.cat((targets, torch.full((count, 1), 0.05, dtype=torch.float64)), dim=1)
+    states, actions = [], []
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in tqdm(range(going + steps + 1), desc="swimming", leave=False):
+            states.append(now["state"])
+            actions.append(policy(now)["action"].double())
+            now.update(env.step(now)["next"].select("state", "physics"))
+    kept = {"state": torch.stack(states[going:], 1), "action": torch.stack(actions[going:-1], 1)}
+    return TensorDict(kept, [count])
+
+
 def make_runs(cfg: DictConfig, folder: Path, swimming: Path) -> dict[tuple[str, str], list[Run]]:
     """Trainings of every network on either data, one for each seed."""
     runs = {}
@@ -123,12 +146,23 @@ def main(cfg: DictConfig) -> None:
         cfg.data_dir = str(folder.data)
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
     scene, rng = load_scene(cfg.system), np.random.default_rng(cfg.seed)
-    gait, far = find_gait(scene, cfg, rng)
-    swimming = {name: swim(scene, gait, cfg.swimming[name], cfg.length, rng) for name in ("train", "test")}
+    metrics: dict[str, float | int] = {}
+    if cfg.policy is not None:
+        agent, sizes = load_checkpoint(cfg.policy).agent, cfg.swimming
+        swimming = {
+            name: swim_by_policy(scene, agent, sizes[name], cfg.length, cfg.seed + index)
+            for index, name in enumerate(("train", "test"))
+        }
+    else:
+        gait, far = find_gait(scene, cfg, rng)
+        print(f"The gait: {far:.2f} m in {cfg.search.steps * scene.timestep:g} s.")
+        swimming = {name: swim(scene, gait, cfg.swimming[name], cfg.length, rng) for name in ("train", "test")}
+        metrics["gait/distance"] = far
+        metrics |= {f"gait/{name}": float(value) for name, value in zip(("height", "Hz", "lag"), gait, strict=True)}
     place = folder.path / "swimming"
     swimming["train"].memmap(str(place), copy_existing=True)
     state = swimming["test"]["state"][0]
-    rollout_video(scene, state, state, folder.file("gait.gif"))
+    rollout_video(scene, state, state, folder.file("swimming.gif"))
 
     runs = make_runs(cfg, folder.path, place)
     failed = run_all([run for of in runs.values() for run in of], cfg.jobs)
@@ -150,8 +184,6 @@ def main(cfg: DictConfig) -> None:
                 found = results.setdefault(key, {}).setdefault(test, {}).setdefault(error, [])
                 found.append(errors[error].total)
 
-    metrics: dict[str, float | int] = {"gait/distance": far}
-    metrics |= {f"gait/{name}": float(value) for name, value in zip(("height", "Hz", "lag"), gait, strict=True)}
     bars: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
     for (network, trained_on), of in results.items():
         for test, error in itertools.product(tests, ERRORS):
@@ -162,7 +194,6 @@ def main(cfg: DictConfig) -> None:
             if math.isfinite(center):
                 bars.setdefault(ERRORS[error], {}).setdefault(f"{network}, {trained_on}", {})[test] = (center, spread)
     lines = table(results) if results else []
-    print(f"The gait: {far:.2f} m in {cfg.search.steps * scene.timestep:g} s.")
     report_sweep(folder, lines, bars, metrics, failed, seed=cfg.seed)
 
 

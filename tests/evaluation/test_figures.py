@@ -15,6 +15,7 @@ from torchrl_gn.evaluation import (
     plot_bars,
     plot_body_trajectory,
     plot_errors,
+    plot_learning_curves,
     plot_motions,
     plot_training_curve,
     summary,
@@ -106,6 +107,18 @@ def test_training_curve_and_errors(tmp_path):
         ["constant", "prediction", "1.000", "1.000"],
         *([["b,", "rollout_error_100:", *row.split()[2:]] for row in rows[6:]]),
     ]
+
+
+def test_learning_curves_of_one_or_several_seeds(tmp_path):
+    curves = {
+        "SVG(1)": ([0, 100, 200], [[0.0, 5.0, 9.0], [1.0, 2.0, 12.0], [0.5, 3.0, 7.0]]),
+        "DDPG": ([0, 200], [[0.0, 4.0]]),
+    }
+    assert is_picture(plot_learning_curves(curves, tmp_path / "curves.png"))
+    curves["SVG(0)"] = ([0, 100, 200], [[0.0, 5.0, 9.0], [1.0, 2.0]])
+    with pytest.raises(ValueError, match=r"Every seed of 'SVG\(0\)' must have 3 returns, got \[3, 2\]"):
+        plot_learning_curves(curves, tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
 
 
 def test_motions_count_whole_turns(scenes, tmp_path):

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchrl_gn.modules import FeatureSet, ForwardModel, Graph, GraphSize, quaternion
-from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.modules import FeatureSet, ForwardModel, Graph, GraphSize, ObservationModel, quaternion
+from torchrl_gn.scenes import ObservationGraph, Scene, load_scene
 
 # Every joint type, two joints between the same two nodes, a tilted slider, a joint without motor.
 ZOO = """
@@ -134,5 +134,56 @@ def random_graph() -> Callable[..., Graph]:
             features(size.globals_),
             edge_index,
         )
+
+    return make
+
+
+def _branching() -> ObservationGraph:
+    return ObservationGraph(
+        name="branching",
+        observation={"height": 1, "angles": 3, "velocities": 4, "goal": 2},
+        nodes={
+            "torso": ("height", "velocities[0:2]"),
+            "arm": ("velocities[2]",),
+            "leg": (),
+            "foot": ("velocities[3]",),
+        },
+        joints={("torso", "arm"): ("angles[0]",), ("torso", "leg"): ("angles[1:3]",), ("leg", "foot"): ()},
+        globals_=("goal",),
+        actions={("torso", "leg"): (2, 0), ("leg", "foot"): (1,)},
+        identity=True,
+    )
+
+
+@pytest.fixture(scope="session")
+def observation_graphs() -> dict[str, ObservationGraph]:
+    """A chain of equal links, and a tree whose nodes and joints have unlike numbers of features."""
+    return {"swimmer3": ObservationGraph.swimmer(3), "branching": _branching()}
+
+
+@pytest.fixture(scope="session")
+def transitions() -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+    """Made-up float64 observations, actions and next observations of a graph, every number on its own scale."""
+
+    def draw(graph: ObservationGraph, count: int = 50, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        size, actions = graph.num_observations, graph.num_actions
+        observation, change = torch.randn(2, count, size, generator=generator, dtype=torch.float64)
+        scale = torch.arange(1, size + 1, dtype=torch.float64)
+        action = 2 * torch.rand(count, actions, generator=generator, dtype=torch.float64) - 1
+        return scale * observation + 1, action, scale * (observation + 0.1 * change) + 1.5
+
+    return draw
+
+
+@pytest.fixture
+def make_observation_model(transitions) -> Callable[..., ObservationModel]:
+    """A small float64 model with random weights that has seen made-up transitions."""
+
+    def make(graph: ObservationGraph, *, seed: int = 0, **options) -> ObservationModel:
+        torch.manual_seed(seed)
+        model = ObservationModel(graph, **({"latent": 4, "hidden": (8,), "mlp_hidden": (8, 8)} | options)).double()
+        model.update_normalizers(*transitions(graph))
+        return model
 
     return make

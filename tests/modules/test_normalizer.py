@@ -224,3 +224,14 @@ def test_limit_cuts_off_what_is_far_outside():
     assert got[3].isnan()
     with pytest.raises(ValueError, match="limit=0"):
         Normalizer(1, limit=0)
+
+
+def test_statistics_stay_the_tensors_that_they_were():
+    """TorchRL's losses hold on to the buffers of a module."""
+    normalizer, other = Normalizer(3), fitted(samples(9, 3))
+    held = dict(normalizer.named_buffers())
+    normalizer.update(samples(9, 3))
+    normalizer.merge(fitted(samples(5, 3, seed=1)))
+    normalizer.load_state_dict(other.state_dict())
+    for name, buffer in normalizer.named_buffers():
+        assert buffer is held[name] and torch.equal(buffer, getattr(other, name))

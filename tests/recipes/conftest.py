@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import subprocess
@@ -45,3 +46,26 @@ def _run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
     process = _start(*options, recipe=recipe)
     output, errors = process.communicate(timeout=120)
     return process.returncode, output, errors
+
+
+@pytest.fixture
+def call(capfd) -> Callable[..., tuple[int, str, str]]:
+    """As ``run``, in this process and without Hydra's command line: for runs shorter than the recipe's imports."""
+    hydra = pytest.importorskip("hydra")
+
+    def call(*options: str, recipe: str) -> tuple[int, str, str]:
+        spec = importlib.util.spec_from_file_location(f"recipe_{recipe}", ROOT / "recipes" / f"{recipe}.py")
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+            config = hydra.compose(recipe, overrides=list(options))
+        capfd.readouterr()
+        code = 0
+        try:
+            module.main(config)
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        return code, *capfd.readouterr()
+
+    return call

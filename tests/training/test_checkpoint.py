@@ -9,8 +9,10 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from tensordict import TensorDict
 
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.modules import Agent
+from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import checkpoint as module
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.checkpoint import CheckpointError, load_checkpoint, package_versions, save_checkpoint
@@ -117,6 +119,32 @@ def test_the_file_is_safetensors_and_holds_no_pickle(saved):
 
 def test_a_run_folder_stands_for_the_checkpoint_in_it(tmp_path, saved, trained):
     assert same(dict(load_checkpoint(tmp_path).model.state_dict()), dict(trained.model.state_dict()))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_agent_comes_back_with_its_statistics(tmp_path, dtype):
+    torch.manual_seed(0)
+    sizes = {"latent": 4, "hidden": [8]}
+    options = {"policy": "graph", "model": "gn", "learned_reward": True, "hidden": [8]}
+    agent = Agent(ObservationGraph.swimmer(3), model_options=sizes, policy_options=sizes, **options).to(dtype)
+    observation, action, after = torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13)
+    agent.update_normalizers(observation, action, after)
+    save_checkpoint(tmp_path / "c.safetensors", agent)
+    loaded = load_checkpoint(tmp_path / "c.safetensors")
+    again = loaded.agent
+    assert loaded.scenes() == [] and same(dict(again.state_dict()), dict(agent.state_dict()))
+    td = TensorDict({"observation": observation.to(dtype)}, [20])
+    chosen = [each.value(each.policy(td.clone())) for each in (agent, again)]
+    assert (chosen[0] == chosen[1]).all()
+    assert agent.model is not None and again.model is not None
+    assert torch.equal(again.model.step(observation, action), agent.model.step(observation, action))
+    with pytest.raises(CheckpointError, match="The checkpoint holds a Agent, no ForwardModel"):
+        _ = loaded.model
+
+
+def test_a_model_is_no_agent(saved):
+    with pytest.raises(CheckpointError, match="The checkpoint holds a ForwardModel, no Agent"):
+        _ = load_checkpoint(saved).agent
 
 
 def refused(path, message: str) -> None:

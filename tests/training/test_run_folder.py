@@ -57,3 +57,16 @@ def test_a_run_goes_on_with_its_own_options_only(tmp_path):
         run.refuse_changes(before, {**before, "system": "jaco", "model": {"latent": 64, "static": "scene"}}, free=[])
     with pytest.raises(ValueError, match=r"model\.skip=True \(was None\)"):
         run.refuse_changes(before, {**before, "model": {**before["model"], "skip": True}}, free=[])
+
+
+def test_single_options_of_a_group_may_be_free(tmp_path):
+    run = RunFolder(tmp_path, "recipe")
+    before = {"trainer": {"frames": 100, "seed": 1}, "frames": 5}
+    more = {"trainer": {"frames": 200, "seed": 1}, "frames": 5}
+    run.refuse_changes(before, more, free=["trainer.frames"])
+    run.refuse_changes(before, more, free=["trainer"])
+    for free in (["frames"], ["trainer.seed"], ["trainer.frame"]):
+        with pytest.raises(ValueError, match=r"options: trainer\.frames=200 \(was 100\)\. Name"):
+            run.refuse_changes(before, more, free=free)
+    with pytest.raises(ValueError, match=r"options: frames=6 \(was 5\), trainer\.seed=2 \(was 1\)\. Name"):
+        run.refuse_changes(before, {"trainer": {"frames": 3, "seed": 2}, "frames": 6}, free=["trainer.frames"])

@@ -3,3 +3,5 @@
 from torchrl_gn.envs.batched import batched as batched
 from torchrl_gn.envs.model_env import ModelEnv as ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv as SceneEnv
+from torchrl_gn.envs.suite_env import observation_env as observation_env
+from torchrl_gn.envs.suite_env import suite_env as suite_env

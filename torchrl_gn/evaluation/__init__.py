@@ -8,6 +8,7 @@ from torchrl_gn.evaluation.errors import evaluate_errors as evaluate_errors
 from torchrl_gn.evaluation.errors import squared_errors as squared_errors
 from torchrl_gn.evaluation.figures import plot_bars as plot_bars
 from torchrl_gn.evaluation.figures import plot_errors as plot_errors
+from torchrl_gn.evaluation.figures import plot_learning_curves as plot_learning_curves
 from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog
 from torchrl_gn.evaluation.figures import plot_rewards as plot_rewards
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve

@@ -73,6 +73,40 @@ def plot_rewards(
     return save(figure, path)
 
 
+def plot_learning_curves(
+    curves: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float]]]], path: str | os.PathLike
+) -> Path:
+    """Returns over environment steps: the median of the seeds, and pale their quartiles (paper, "Learning curves").
+
+    Args:
+        curves: environment steps ``[T]`` and returns ``[S, T]`` of ``S`` seeds by label.
+        path: file to write; its suffix is the format.
+
+    Returns:
+        The written path.
+
+    Raises:
+        ValueError: if a seed has not as many returns as there are steps.
+    """
+    figure = new_figure((6.4, 3.8))
+    axes = figure.subplots()
+    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    for number, (label, (frames, returns)) in enumerate(curves.items()):
+        if any(len(of) != len(frames) for of in returns):
+            raise ValueError(
+                f"Every seed of {label!r} must have {len(frames)} returns, got {[len(of) for of in returns]}."
+            )
+        low, median, high = np.quantile(np.asarray(returns, float), (0.25, 0.5, 0.75), axis=0)
+        color = colors[number % len(colors)]
+        axes.fill_between(frames, low, high, color=color, alpha=0.15, linewidth=0)
+        axes.plot(frames, median, color=color, label=label, linewidth=1.6)
+    axes.set_xlabel("environment steps")
+    axes.set_ylabel("return of an episode")
+    axes.legend(frameon=False, fontsize=9)
+    clean(axes)
+    return save(figure, path)
+
+
 def plot_training_curve(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     path: str | os.PathLike,

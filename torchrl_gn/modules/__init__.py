@@ -1,6 +1,7 @@
 """Graph networks, state maths and forward models."""
 
 from torchrl_gn.modules.ablated_core import AblatedCore as AblatedCore
+from torchrl_gn.modules.agent import Agent as Agent
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel as BoundForwardModel
 from torchrl_gn.modules.bound_forward_model import UnseenFeatureWarning as UnseenFeatureWarning
 from torchrl_gn.modules.bound_recurrent_model import BoundRecurrentModel as BoundRecurrentModel
@@ -12,11 +13,15 @@ from torchrl_gn.modules.graph import Graph as Graph
 from torchrl_gn.modules.graph import GraphSize as GraphSize
 from torchrl_gn.modules.graph import graph_concat as graph_concat
 from torchrl_gn.modules.graph import graph_split as graph_split
+from torchrl_gn.modules.graph_policy import GraphPolicy as GraphPolicy
 from torchrl_gn.modules.inference_model import BoundInferenceModel as BoundInferenceModel
 from torchrl_gn.modules.inference_model import IdentifyingModel as IdentifyingModel
 from torchrl_gn.modules.inference_model import InferenceModel as InferenceModel
+from torchrl_gn.modules.learned_reward import LearnedReward as LearnedReward
 from torchrl_gn.modules.mlp_core import MLPCore as MLPCore
 from torchrl_gn.modules.normalizer import Normalizer as Normalizer
+from torchrl_gn.modules.observation_model import ObservationModel as ObservationModel
+from torchrl_gn.modules.observation_network import ObservationNetwork as ObservationNetwork
 from torchrl_gn.modules.precision import fast_matmul as fast_matmul
 from torchrl_gn.modules.recurrent_core import RecurrentCore as RecurrentCore
 from torchrl_gn.modules.specialized_model import SpecializedForwardModel as SpecializedForwardModel
@@ -25,3 +30,4 @@ from torchrl_gn.modules.state_layout import BODY_STATE as BODY_STATE
 from torchrl_gn.modules.state_layout import Component as Component
 from torchrl_gn.modules.state_layout import StateLayout as StateLayout
 from torchrl_gn.modules.state_layout import joint_layout as joint_layout
+from torchrl_gn.modules.swimmer_observation import SwimmerObservation as SwimmerObservation

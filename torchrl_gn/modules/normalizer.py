@@ -101,11 +101,13 @@ class Normalizer(Float64Buffers):
         self.count.copy_(total)
         self._refresh()
 
+    @torch.no_grad()
     def _refresh(self) -> None:
         std = (self.m2 / self.count.clamp(min=1)).sqrt()
         constant = (std <= self.floor) | (std <= 1e-7 * self.mean.abs())
-        self.std = torch.where(constant, 0.0, std)
-        self.inverse_std = torch.where(constant, 0.0, 1 / torch.where(constant, 1.0, std))
+        # In place: TorchRL's losses hold on to a module's buffers.
+        self.std.copy_(torch.where(constant, 0.0, std))
+        self.inverse_std.copy_(torch.where(constant, 0.0, 1 / torch.where(constant, 1.0, std)))
 
     def forward(self, features: Tensor, dtype: torch.dtype | None = None) -> Tensor:
         """Normalise.

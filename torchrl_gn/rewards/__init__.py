@@ -14,3 +14,4 @@ from torchrl_gn.rewards.reach import Reach as Reach
 from torchrl_gn.rewards.registry import available_rewards as available_rewards
 from torchrl_gn.rewards.registry import make_reward as make_reward
 from torchrl_gn.rewards.reward import Reward as Reward
+from torchrl_gn.rewards.target_distance import TargetDistance as TargetDistance

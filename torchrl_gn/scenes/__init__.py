@@ -10,6 +10,7 @@ Example:
 from torchrl_gn.scenes.errors import SceneChangedWarning, SceneError, UnsupportedSceneError
 from torchrl_gn.scenes.joint_chain import JointChain, chain_states
 from torchrl_gn.scenes.load import load_scene, scene_from_description
+from torchrl_gn.scenes.observation_graph import ObservationGraph
 from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
 from torchrl_gn.scenes.scene_values import SceneValues
 from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange
@@ -19,6 +20,7 @@ __all__ = [
     "SYSTEMS",
     "Attachment",
     "JointChain",
+    "ObservationGraph",
     "ParameterRange",
     "Scene",
     "SceneChangedWarning",

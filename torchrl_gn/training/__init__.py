@@ -7,6 +7,10 @@ from torchrl_gn.training.checkpoint import load_checkpoint as load_checkpoint
 from torchrl_gn.training.checkpoint import package_versions as package_versions
 from torchrl_gn.training.checkpoint import save_checkpoint as save_checkpoint
 from torchrl_gn.training.exit import clean_exit as clean_exit
+from torchrl_gn.training.learning import learn_with_progress as learn_with_progress
+from torchrl_gn.training.learning import report_learning as report_learning
+from torchrl_gn.training.off_policy import OffPolicyTrainer as OffPolicyTrainer
+from torchrl_gn.training.off_policy import mean_return as mean_return
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer
 from torchrl_gn.training.optimizers import make_optimizer as make_optimizer
 from torchrl_gn.training.run_folder import RunFolder as RunFolder

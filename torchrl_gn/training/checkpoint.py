@@ -10,7 +10,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.modules import ForwardModel, IdentifyingModel
+from torchrl_gn.modules import Agent, ForwardModel, IdentifyingModel
 from torchrl_gn.scenes import Scene, scene_from_description
 
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
@@ -39,11 +39,18 @@ _PACKAGES = (
 )
 
 
-KINDS: dict[str, type[ForwardModel] | type[IdentifyingModel]] = {
+Trained = ForwardModel | IdentifyingModel | Agent
+"""What a checkpoint can hold."""
+
+KINDS: dict[str, type[Trained]] = {
     "forward_model": ForwardModel,
     "identifying_model": IdentifyingModel,
+    "agent": Agent,
 }
 """What checkpoints hold, by the name that they call it."""
+
+
+_Kind = TypeVar("_Kind", bound=Trained)
 
 
 class CheckpointError(ValueError):
@@ -63,7 +70,7 @@ class Checkpoint:
         training: nested state of the training, empty if only the model was saved.
     """
 
-    trained: ForwardModel | IdentifyingModel
+    trained: Trained
     scene_descriptions: list[dict]
     config: dict
     versions: dict
@@ -77,8 +84,20 @@ class Checkpoint:
         Raises:
             CheckpointError: if it is another kind of model.
         """
-        if not isinstance(self.trained, ForwardModel):
-            raise CheckpointError(f"The checkpoint holds a {type(self.trained).__name__}, no ForwardModel.")
+        return self._as(ForwardModel)
+
+    @property
+    def agent(self) -> Agent:
+        """The agent.
+
+        Raises:
+            CheckpointError: if it is a model without a policy.
+        """
+        return self._as(Agent)
+
+    def _as(self, kind: type[_Kind]) -> _Kind:
+        if not isinstance(self.trained, kind):
+            raise CheckpointError(f"The checkpoint holds a {type(self.trained).__name__}, no {kind.__name__}.")
         return self.trained
 
     def scenes(self) -> list[Scene]:
@@ -110,9 +129,9 @@ def package_versions() -> dict[str, str]:
 
 def save_checkpoint(
     path: str | os.PathLike,
-    model: ForwardModel | IdentifyingModel,
+    model: Trained,
     *,
-    scene: Scene | Sequence[Scene],
+    scene: Scene | Sequence[Scene] = (),
     config: Mapping[str, Any] | None = None,
     metrics: Mapping[str, Any] | None = None,
     training: Mapping[str, Any] | None = None,
@@ -122,7 +141,7 @@ def save_checkpoint(
     Args:
         path: file to write, ``.safetensors``.
         model: the model.
-        scene: the scene, or scenes, it is trained on.
+        scene: the scene, or scenes, it is trained on; none of an agent, which holds its graph.
         config: configuration of the run, plain JSON-able values.
         metrics: what was measured of the model, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
@@ -141,7 +160,7 @@ def save_checkpoint(
         "metrics": dict(metrics or {}),
         "training": plain,
     }
-    text = json.dumps(description, sort_keys=True)
+    text = json.dumps(description)  # in their order: that of an observation is where its numbers are
     digest = _digest(tensors, text)
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"format": str(FORMAT), "description": text, "sha256": digest})
@@ -183,7 +202,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     description = json.loads(text)
     model = KINDS[description["kind"]].from_description(description["model"])
     weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
-    model.to(next(value.dtype for name, value in weights.items() if "core." in name))
+    model.to(next(value.dtype for name, value in weights.items() if name.endswith(".weight")))
     model.load_state_dict(weights)
     return Checkpoint(
         trained=model,

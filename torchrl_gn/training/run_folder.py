@@ -64,7 +64,7 @@ class RunFolder:
         Args:
             before: configuration that the run was begun with.
             now: configuration that it is to go on with.
-            free: names of top-level options that may differ, for example ``"minutes"``.
+            free: names of options that may differ, for example ``"minutes"``, ``"data.folder"`` or all of ``"data"``.
 
         Raises:
             ValueError: naming every other option that differs.
@@ -73,7 +73,7 @@ class RunFolder:
         changed = [
             f"{name}={new.get(name)} (was {old.get(name)})"
             for name in sorted(old.keys() | new.keys())
-            if old.get(name) != new.get(name) and name.split(".")[0] not in free
+            if old.get(name) != new.get(name) and not {name, name.split(".")[0]} & set(free)
         ]
         if changed:
             raise ValueError(

@@ -1,0 +1,104 @@
+"""How long a step of policy learning takes: experience, and updates with the plain and the fast model.
+
+    python recipes/benchmark_svg.py [repeats=30] [batch_size=256] [horizons=[0,1,3]]
+
+Times, in turn and several times, one update (losses of policy, value and model, gradients, optimiser) of SVG(N) with a
+graph network that is evaluated by message passing (plain), folded (what recipes/svg.py uses), and with an MLP in its
+place, beside a step of the environments. Results: docs/performance.md.
+
+Writes config.yaml, metrics.json and the table as table.md to its run folder.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from torchrl.objectives import HardUpdate, ValueEstimators
+from tqdm import tqdm
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.envs import observation_env
+from torchrl_gn.modules import Agent
+from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
+from torchrl_gn.rewards import TargetDistance
+from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.training import RunFolder, clean_exit
+
+
+def make_update(cfg: DictConfig, graph: ObservationGraph, batch: TensorDictBase, horizon: int, way: str) -> Callable:
+    """One update of an agent whose model is ``plain``, ``folded`` or an ``mlp``."""
+    kind = None if horizon == 0 else ("mlp" if way == "mlp" else "gn")
+    agent = Agent(graph, hidden=cfg.hidden, model=kind, model_options={**cfg.model_options, "plain": way == "plain"})
+    agent.update_normalizers(*(batch[key] for key in ("observation", "action", ("next", "observation"))))
+    loss = SVGLoss(
+        agent.policy,
+        agent.value,
+        agent.model,
+        TargetDistance(graph) if horizon else None,
+        steps=horizon,
+        delay_actor=True,
+    )
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=0.99)
+    targets = HardUpdate(loss)
+    losses = [loss] if agent.model is None else [loss, ObservationModelLoss(agent.model)]
+    optimizer = torch.optim.Adam([weight for each in losses for weight in each.parameters()], lr=1e-4)
+
+    def update() -> None:
+        found = [each(batch) for each in losses]
+        total = sum(value for out in found for name, value in out.items() if str(name).startswith("loss_"))
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+        targets.step()
+
+    return update
+
+
+@hydra.main(version_base="1.3", config_path="config", config_name="benchmark_svg")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    torch.set_num_threads(cfg.threads)
+    torch.manual_seed(cfg.seed)
+    run = RunFolder(cfg.run_dir, "benchmark_svg")
+    run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    graph = ObservationGraph.of_task("swimmer", cfg.task)
+    env = observation_env(graph, "swimmer", cfg.task, num_envs=cfg.num_envs, timestep=0.02, seed=cfg.seed)
+    steps = -(-cfg.batch_size // cfg.num_envs)
+    batch = env.rollout(steps, break_when_any_done=False).reshape(-1)[: cfg.batch_size]
+    policy, start = Agent(graph, hidden=cfg.hidden).policy, env.reset()
+    ways: dict[str, Callable] = {f"{cfg.num_envs} environment steps": lambda: env.step(policy(start.copy()))}
+    for horizon in cfg.horizons:
+        for way in ("plain", "folded", "mlp") if horizon else ("no model",):
+            ways[f"SVG({horizon}), {way}"] = make_update(cfg, graph, batch, horizon, way)
+
+    seconds = {name: [] for name in ways}
+    for turn in tqdm(range(cfg.repeats + 3), desc="measuring", leave=False):
+        for name, once in ways.items():
+            begun = time.perf_counter()
+            with torch.set_grad_enabled("environment" not in name):
+                once()
+            if turn >= 3:
+                seconds[name].append(time.perf_counter() - begun)
+    medians = {name: statistics.median(found) for name, found in seconds.items()}
+    lines = ["| | ms | a second | against plain |", "|---|---|---|---|"]
+    for name, median in medians.items():
+        plain = medians.get(f"{name.split(',')[0]}, plain")
+        lines.append(
+            f"| {name} | {1e3 * median:.2f} | {1 / median:.0f} | {f'{plain / median:.2f}x' if plain else ''} |"
+        )
+    with atomic_path(run.file("table.md")) as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
+    run.write_metrics({f"{name}/ms": 1e3 * median for name, median in medians.items()}, seed=cfg.seed)
+    print("\n".join(lines))
+    for path in run.written:
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""Learn a policy by DDPG, TorchRL's own loss: the model-free rival, and a source of policy trajectories.
+
+    python recipes/ddpg.py [task=swimmer6] [key=value ...]
+
+The paper's baseline agent (SM "DDPG"), with the environments, networks, replay buffer and updates of recipes/svg.py, so
+that only the losses differ. Curves over several seeds: recipes/learning_curves.py. A run that was stopped goes on with
+the same `run_dir`. What came out: docs/results.md.
+
+Leaves config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
+recipes/config/ddpg.yaml.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, cast
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictSequential
+from torchrl.modules import AdditiveGaussianModule
+from torchrl.objectives import DDPGLoss, ValueEstimators
+
+from torchrl_gn.envs import observation_env
+from torchrl_gn.modules import Agent
+from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.training import (
+    OffPolicyTrainer,
+    RunFolder,
+    Tracker,
+    clean_exit,
+    learn_with_progress,
+    load_checkpoint,
+    mean_return,
+    report_learning,
+)
+
+MAY_CHANGE = ("trainer.frames", "threads", "logger", "run_dir", "checkpoint_seconds")  # when a run goes on
+
+
+def options(cfg: DictConfig) -> dict[str, Any]:
+    """Options as plain values."""
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+
+
+@hydra.main(version_base=None, config_path="config", config_name="ddpg")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    torch.manual_seed(cfg.seed)
+    torch.set_num_threads(cfg.threads)
+    run = RunFolder(cfg.run_dir, "ddpg")
+    begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
+    if begun:
+        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
+    graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, options(cfg)["task"]["graph"])
+    agent = begun.agent if begun else Agent(graph, stochastic=False, hidden=cfg.hidden)
+    run.write_config(OmegaConf.to_yaml(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"ddpg-{cfg.task.name}", config=options(cfg))
+
+    task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
+    make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)
+    judged = make_env(num_envs=cfg.evaluate_episodes)
+    loss = DDPGLoss(agent.policy, agent.value, delay_actor=True)
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.gamma)
+    env = make_env(num_envs=cfg.num_envs, seed=cfg.seed)
+    noise = AdditiveGaussianModule(env.action_spec, sigma_init=cfg.noise, sigma_end=cfg.noise)
+    trainer = OffPolicyTrainer(
+        agent,
+        [loss],
+        env,
+        TensorDictSequential([agent.policy, noise]),
+        lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
+        torch.optim.Adam(loss.parameters(), lr=cfg.lr),
+        seed=cfg.seed,
+        **options(cfg.trainer),
+    )
+    learn_with_progress(trainer, run.checkpoint, begun, tracker, config=options(cfg))
+    report_learning(trainer, run, tracker, label="DDPG", seed=cfg.seed)
+
+
+if __name__ == "__main__":
+    main()

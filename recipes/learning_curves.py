@@ -1,0 +1,85 @@
+"""Learning curves of agents over several seeds, in one figure.
+
+    python recipes/learning_curves.py [only=[SVG(1),SVG(0)]] [seeds=[0,1,2]] ["overrides=['trainer.frames=100000']"]
+
+Reproduces the paper's Figure "Learning curves for Swimmer6 SVG agents": the median return over seeds with quartiles, of
+every agent that recipes/config/learning_curves.yaml names. Each is a run of recipes/svg.py or recipes/ddpg.py. Finished
+runs are kept and interrupted ones go on when the recipe is started again with the same run_dir. What came out:
+docs/results.md.
+
+Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
+folder.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import hydra
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_gn.evaluation import plot_learning_curves
+from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training.sweep import Run, folder_name, report_sweep, run_all
+
+
+def make_runs(cfg: DictConfig, folder: Path) -> dict[str, list[Run]]:
+    """Every agent's runs, a seed each."""
+    chosen = list(cfg.agents) if cfg.only is None else list(cfg.only)
+    unknown = [name for name in chosen if name not in cfg.agents]
+    if unknown:
+        raise ValueError(f"Agents {unknown} are not known; use some of {list(cfg.agents)}.")
+    runs: dict[str, list[Run]] = {name: [] for name in chosen}
+    for seed, name in itertools.product(cfg.seeds, chosen):  # seed by seed, so that early figures compare
+        agent = cfg.agents[name]
+        overrides = (f"seed={seed}", f"threads={cfg.threads}", *cfg.overrides, *agent.overrides)
+        recipe = Path(__file__).with_name(f"{agent.recipe}.py")
+        runs[name].append(Run(recipe, folder / folder_name(name) / f"seed{seed}", overrides, f"{name}, seed {seed}"))
+    return runs
+
+
+def quartiles(values: list[float]) -> tuple[float, float, float]:
+    """Lower quartile, median, upper quartile."""
+    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
+    return float(low), float(middle), float(high)
+
+
+@hydra.main(config_path="config", config_name="learning_curves", version_base="1.3")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    folder = RunFolder(cfg.run_dir, "learning_curves")
+    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    runs = make_runs(cfg, folder.path)
+    in_turn = [run for of in zip(*runs.values(), strict=True) for run in of]
+    failed = run_all(in_turn, cfg.jobs, desc="learning")
+
+    curves, metrics = {}, {}
+    lines = [
+        "| agent | seeds | last tenth of the returns | best | frames | updates | minutes | updates/s |",
+        "|---" * 8 + "|",
+    ]
+    for name, of in runs.items():
+        found = [(run, run.metrics) for run in of]
+        done = [(json.loads((run.folder / "curve.json").read_text()), values) for run, values in found if values]
+        if not done:
+            continue
+        curves[name] = (done[0][0]["frames"], [curve["returns"] for curve, _ in done])
+        cells = [name, str(len(done))]
+        for key in ("last_tenth_return", "best_return"):
+            low, middle, high = quartiles([values[key] for _, values in done])
+            metrics |= {f"{name}/{key}": middle, f"{name}/{key}/low": low, f"{name}/{key}/high": high}
+            cells.append(f"{middle:.0f} ({low:.0f} to {high:.0f})")
+        for key, scale in (("frames", 1), ("updates", 1), ("learning_seconds", 1 / 60), ("updates_per_second", 1)):
+            metrics[f"{name}/{key}"] = quartiles([values[key] for _, values in done])[1]
+            cells.append(f"{scale * metrics[f'{name}/{key}']:,.0f}")
+        lines.append("| " + " | ".join(cells) + " |")
+    if curves:
+        plot_learning_curves(curves, folder.file("curves.png"))
+    report_sweep(folder, lines, {}, metrics, failed, seed=cfg.seeds[0])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""Learn a policy by stochastic value gradients through a forward model that learns beside it.
+
+    python recipes/svg.py [horizon=1] [task=swimmer6] [key=value ...]
+
+Reproduces the agents of the paper's Figure "Learning curves for Swimmer6 SVG agents": SVG(1) differentiates through a
+graph network that predicts observations, SVG(0) (`horizon=0`) through the value alone. Policy, value and model start
+from nothing and learn from the same replay buffer. Curves over several seeds, and all agents in one figure:
+recipes/learning_curves.py. A run that was stopped goes on with the same `run_dir`. What came out: docs/results.md.
+
+Leaves config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
+recipes/config/svg.yaml.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, cast
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.objectives import LossModule, ValueEstimators
+
+from torchrl_gn.envs import observation_env
+from torchrl_gn.modules import Agent
+from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
+from torchrl_gn.rewards import TargetDistance
+from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.training import (
+    OffPolicyTrainer,
+    RunFolder,
+    Tracker,
+    clean_exit,
+    learn_with_progress,
+    load_checkpoint,
+    mean_return,
+    report_learning,
+)
+
+MAY_CHANGE = ("trainer.frames", "threads", "logger", "run_dir", "checkpoint_seconds")  # when a run goes on
+
+
+def options(cfg: DictConfig) -> dict[str, Any]:
+    """Options as plain values."""
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+
+
+def make_losses(cfg: DictConfig, agent: Agent) -> list[LossModule]:
+    """SVG(N), and the losses of what it plans with."""
+    known = cfg.task.reward == "known"
+    reward = TargetDistance(agent.graph) if known and cfg.horizon else agent.reward
+    loss = SVGLoss(agent.policy, agent.value, agent.model, reward, steps=cfg.horizon, delay_actor=True)
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.gamma)
+    return [loss] if agent.model is None else [loss, ObservationModelLoss(agent.model, agent.reward)]
+
+
+def make_optimizer(cfg: DictConfig, losses: list[LossModule]) -> torch.optim.Optimizer:
+    """One for all, the model with a rate of its own."""
+    groups = [{"params": list(losses[0].parameters()), "lr": cfg.lr}]
+    groups += [{"params": list(loss.parameters()), "lr": cfg.model_lr} for loss in losses[1:]]
+    return torch.optim.Adam(groups)
+
+
+@hydra.main(version_base=None, config_path="config", config_name="svg")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    torch.manual_seed(cfg.seed)
+    torch.set_num_threads(cfg.threads)
+    run = RunFolder(cfg.run_dir, "svg")
+    begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
+    if begun:
+        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
+    graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, options(cfg)["task"]["graph"])
+    more = options(cfg.agent)
+    if cfg.horizon == 0:
+        more["model"] = None
+    learned = cfg.task.reward == "learned" and cfg.horizon > 0
+    agent = begun.agent if begun else Agent(graph, learned_reward=learned, **more)
+    run.write_config(OmegaConf.to_yaml(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"svg{cfg.horizon}-{cfg.task.name}", config=options(cfg))
+
+    task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
+    make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)
+    judged = make_env(num_envs=cfg.evaluate_episodes)
+    losses = make_losses(cfg, agent)
+    trainer = OffPolicyTrainer(
+        agent,
+        losses,
+        make_env(num_envs=cfg.num_envs, seed=cfg.seed),
+        agent.policy,
+        lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
+        make_optimizer(cfg, losses),
+        seed=cfg.seed,
+        **options(cfg.trainer),
+    )
+    learn_with_progress(trainer, run.checkpoint, begun, tracker, config=options(cfg))
+    report_learning(trainer, run, tracker, label=f"SVG({cfg.horizon})", seed=cfg.seed)
+
+
+if __name__ == "__main__":
+    main()

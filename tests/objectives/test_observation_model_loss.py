@@ -1,0 +1,126 @@
+"""The loss of a forward model of observations: its scale, what counts in it, and TorchRL's contract."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.modules import LearnedReward, ObservationModel
+from torchrl_gn.objectives import ObservationModelLoss
+from torchrl_gn.scenes import ObservationGraph
+
+GRAPH = ObservationGraph.swimmer(3)
+
+
+def transitions(*batch: int, seed: int = 0, unit: float = 1.0) -> TensorDict:
+    """Random float64 steps; angles and targets are measured in ``unit``."""
+    generator = torch.Generator().manual_seed(seed)
+    scale = torch.ones(GRAPH.num_observations, dtype=torch.float64)
+    scale[:4] = unit
+
+    def draw(size: int) -> torch.Tensor:
+        return torch.randn(*batch, size, generator=generator, dtype=torch.float64)
+
+    observation, action = draw(GRAPH.num_observations), draw(GRAPH.num_actions)
+    after = observation + 0.1 * draw(GRAPH.num_observations) + 0.02
+    after = {"observation": scale * after, "reward": draw(1)}
+    return TensorDict({"observation": scale * observation, "action": action, "next": after}, batch)
+
+
+@pytest.fixture
+def make_loss() -> Callable[..., ObservationModelLoss]:
+    def make(*, rewarded: bool = False, unit: float = 1.0, change: slice | None = None) -> ObservationModelLoss:
+        torch.manual_seed(0)
+        model = ObservationModel(GRAPH, latent=4, hidden=(8,)).double()
+        reward = LearnedReward(13, 2, hidden=(8,)).double() if rewarded else None
+        loss, seen = ObservationModelLoss(model, reward), transitions(200, unit=unit)
+        if change is not None:
+            seen["next", "observation"][:, change] = seen["observation"][:, change]
+        loss.update_normalizers(seen)
+        return loss
+
+    return make
+
+
+def test_a_perfect_model_costs_nothing(make_loss):
+    loss, batch = make_loss(), transitions(9, seed=1)
+    batch["next", "observation"] = loss.model.step(batch["observation"], batch["action"]).detach()
+    assert loss(batch)["loss_model"] < 1e-24
+
+
+def test_the_value_is_the_mean_error_in_the_spread_of_changes(make_loss):
+    loss, batch = make_loss(), transitions(9, seed=1)
+    error = (loss.model(batch.clone())["next", "observation"] - batch["next", "observation"]) / loss.model.change_std
+    torch.testing.assert_close(loss(batch)["loss_model"], error.square().mean(), rtol=1e-10, atol=0)
+    shaped = loss(transitions(9, seed=1).reshape(3, 3))
+    torch.testing.assert_close(shaped["loss_model"], error.square().mean(), rtol=1e-10, atol=0)
+
+
+def test_units_do_not_matter(make_loss):
+    values = [make_loss(unit=unit)(transitions(9, seed=1, unit=unit))["loss_model"] for unit in (1.0, 57.3, 1e-3)]
+    torch.testing.assert_close(values[1:], [values[0]] * 2, rtol=1e-8, atol=0)
+
+
+def test_numbers_that_never_varied_do_not_count(make_loss):
+    """The target stood still: whatever it does now costs nothing, and the mean is over the others."""
+    loss, batch = make_loss(change=slice(2, 4)), transitions(9, seed=1)
+    assert (loss.model.change_std == 0).nonzero().flatten().tolist() == [2, 3]
+    before = loss(batch)["loss_model"]
+    batch["next", "observation"][:, 2:4] += 100
+    assert torch.equal(loss(batch)["loss_model"], before)
+    counted = [index for index in range(13) if index not in (2, 3)]
+    error = loss.model(batch.clone())["next", "observation"] - batch["next", "observation"]
+    scaled = error[:, counted] / loss.model.change_std[counted]
+    torch.testing.assert_close(before, scaled.square().mean(), rtol=1e-10, atol=0)
+    fresh = ObservationModelLoss(ObservationModel(GRAPH, latent=4, hidden=(8,)))
+    assert fresh(transitions(9).float())["loss_model"] == 0  # nothing was seen
+
+
+def test_rewards_are_compared_as_they_are(make_loss):
+    loss, batch = make_loss(rewarded=True), transitions(9, seed=1)
+    assert loss.reward is not None
+    predicted = loss.reward(batch["observation"], batch["action"], batch["next", "observation"])
+    out = loss(batch)
+    expected = (predicted - batch["next", "reward"]).square().mean()
+    torch.testing.assert_close(out["loss_reward"], expected, rtol=1e-12, atol=0)
+    assert torch.equal(out["loss_model"], make_loss()(batch)["loss_model"])
+    loss.set_keys(reward=("task", "score"))
+    batch["next", "task"] = TensorDict({"score": batch["next"].pop("reward")}, batch.batch_size)
+    assert torch.equal(loss(batch)["loss_reward"], out["loss_reward"])
+
+
+def test_each_loss_trains_its_own_network(make_loss):
+    loss, batch = make_loss(rewarded=True), transitions(9, seed=1)
+    for name, network in (("loss_model", loss.model), ("loss_reward", loss.reward)):
+        loss.zero_grad(set_to_none=True)
+        loss(batch)[name].backward()
+        reached = {weight for weight in loss.parameters() if weight.grad is not None}
+        assert reached == set(network.parameters())
+        assert all(weight.grad.abs().sum() > 0 for weight in reached if weight.grad is not None)
+
+
+def test_entries_may_be_given_one_by_one_and_are_left_alone(make_loss):
+    loss, batch = make_loss(rewarded=True), transitions(9, seed=1)
+    before, expected = batch.clone(), loss(batch)
+    assert (batch == before).all() and set(batch.keys(True)) == set(before.keys(True))
+    named = {"_".join(key) if isinstance(key, tuple) else key: batch[key] for key in loss.in_keys}
+    assert all(torch.equal(value, expected[key]) for key, value in zip(loss.out_keys, loss(**named), strict=True))
+
+
+def test_what_is_missing_or_not_finite_is_named_and_changes_nothing(make_loss):
+    loss = make_loss(rewarded=True)
+    before = {name: value.clone() for name, value in loss.state_dict().items()}
+    for key in loss.in_keys:
+        missing, broken = transitions(9).exclude(key), transitions(9)
+        broken[key][4, 0] = torch.nan
+        for call in (loss, loss.update_normalizers):
+            with pytest.raises(KeyError) as caught:
+                call(missing)
+            assert f"ObservationModelLoss needs {key!r}, there is" in str(caught.value.args[0])
+            with pytest.raises(ValueError, match="has nan at index") as refused:
+                call(broken)
+            assert str(refused.value).startswith(f"{key!r} has nan at index (4, 0)")
+    assert all(torch.equal(value, before[name]) for name, value in loss.state_dict().items())

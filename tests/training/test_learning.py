@@ -1,0 +1,60 @@
+"""What is left of a policy that was learned at a terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+
+from torchrl_gn.training import (
+    RunFolder,
+    Tracker,
+    learn_with_progress,
+    load_checkpoint,
+    report_learning,
+)
+
+CONFIG = {"checkpoint_seconds": 1000}
+
+
+@pytest.fixture
+def tracker(tmp_path) -> Tracker:
+    return Tracker("none", tmp_path / "log", name="run", config=CONFIG)
+
+
+def test_an_interrupted_run_is_saved_and_goes_on(make_learner, tracker, tmp_path):
+    path, trainer = tmp_path / "c.safetensors", make_learner(frames=100)
+    evaluate = trainer.evaluate
+
+    def interrupt() -> float:
+        if trainer.frames == 100:
+            raise KeyboardInterrupt
+        return evaluate()
+
+    trainer.evaluate = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        learn_with_progress(trainer, path, None, tracker, config=CONFIG)
+    begun = load_checkpoint(path)
+    assert begun.config == CONFIG and begun.training["progress"]["frames"] == 100
+    again = make_learner(begun.agent, frames=140)
+    learn_with_progress(again, path, begun, tracker, config=CONFIG)
+    saved = load_checkpoint(path).training
+    assert saved["progress"]["frames"] == 140 and saved["curve"]["frames"] == [0, 120, 140]
+    assert torch.equal(saved["buffer"]["action"][:100], begun.training["buffer"]["action"])
+
+
+def test_a_report_holds_the_curve_and_its_last_tenth(make_learner, tracker, tmp_path, capsys):
+    trainer, run = make_learner(), RunFolder(tmp_path / "run", "svg")
+    trainer.frames, trainer.updates, trainer.seconds = 200, 50, 4.0
+    trainer.curve.returns = [float(value) for value in range(20)]
+    trainer.curve.frames = [10.0 * value for value in range(20)]
+    report_learning(trainer, run, tracker, label="SVG(1)", seed=7)
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    expected = {"return": 19, "best_return": 19, "last_tenth_return": 18.5, "frames": 200, "seed": 7}
+    expected |= {"updates_per_second": 12.5, "frames_per_second": 50}
+    assert all(math.isclose(metrics[name], value) for name, value in expected.items())
+    assert json.loads((tmp_path / "run" / "curve.json").read_text())["returns"] == trainer.curve.returns
+    printed = capsys.readouterr().out.split()
+    assert all(str(path) in printed for path in (*run.written, run.checkpoint))

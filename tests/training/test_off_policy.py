@@ -1,0 +1,174 @@
+"""Learning from a replay buffer: that it learns, when it updates, and that it goes on as if never stopped."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_gn.training import load_checkpoint, mean_return, save_checkpoint
+
+
+def spend(trainer) -> list:
+    return list(trainer.run())
+
+
+def same(first: dict, second: dict) -> bool:
+    return first.keys() == second.keys() and all(torch.equal(value, second[key]) for key, value in first.items())
+
+
+def contents(trainer) -> torch.Tensor:
+    """Everything remembered, in the order that it was learned."""
+    state = trainer.state_dict()["buffer"]
+    keys = ("observation", "action", "next.observation", "next.reward")
+    return torch.cat([state[key] for key in keys], -1)
+
+
+def test_the_points_are_an_environment(point_env):
+    check_env_specs(point_env())
+
+
+def test_svg_learns_to_hold_a_point(make_learner):
+    trainer = make_learner(frames=400, updates_per_frame=0.3, target_interval=10, lr=2e-2)
+    progress = spend(trainer)
+    first, *_, last = trainer.curve.returns
+    assert first < -10 and last > -1  # staying where it starts gives -20 / 3
+    assert progress[-1].evaluation == last and progress[-1].losses["loss_model"] < 0.05
+
+
+def test_updates_come_at_the_stated_ratio_and_evaluations_where_they_are_due(make_learner):
+    trainer = make_learner(frames=200, random_frames=60, updates_per_frame=1 / 32, evaluate_frames=50)
+    progress = spend(trainer)
+    assert [each.frames for each in progress] == list(range(20, 201, 20))
+    assert [each.updates for each in progress] == [0, 0, 0, 0, 1, 1, 2, 3, 3, 4]  # 0.625 every 20 frames from 60 on
+    assert [bool(each.losses) for each in progress] == [False] * 4 + [True, False, True, True, False, True]
+    assert trainer.curve.frames == [0, 60, 100, 160, 200]
+    assert trainer.curve.updates == [0, 0, 1, 3, 4]
+    assert all(each.evaluation is not None for each in progress if each.frames in trainer.curve.frames)
+
+
+def test_targets_are_copied_after_their_interval(make_learner):
+    trainer = make_learner(frames=100)  # all of them random
+    spend(trainer)
+    loss = trainer.losses[0]
+    first = loss.target_value_network_params.clone()
+    for updates in range(1, 11):
+        trainer._update()
+        copied = (loss.target_value_network_params == loss.value_network_params).all()
+        assert bool(copied) == (updates in (5, 10))  # HardUpdate's interval of 4 are 4 updates in between
+        assert bool((loss.target_value_network_params == first).all()) == (updates < 5)
+
+
+def test_every_transition_is_remembered_and_counted_once(make_learner):
+    trainer = make_learner(frames=120, capacity=80)
+    spend(trainer)
+    assert len(trainer.buffer) == 80 and trainer.frames == 120
+    assert trainer.agent.model.change_normalizer.count[0] == 120
+    kept = contents(trainer)
+    torch.testing.assert_close(kept[:, 2], kept[:, 0] + 0.2 * kept[:, 1])
+    torch.testing.assert_close(kept[:, 3], -kept[:, 2].square())
+
+
+@pytest.mark.parametrize("capacity", [1000, 90])
+def test_a_stopped_run_goes_on_where_it_was(make_learner, tmp_path, capacity):
+    trainer = make_learner(frames=300, capacity=capacity)
+    for progress in trainer.run():
+        if progress.frames == 160:
+            break
+    save_checkpoint(tmp_path / "c.safetensors", trainer.agent, training=trainer.state_dict())
+    saved = load_checkpoint(tmp_path / "c.safetensors")
+    again = make_learner(saved.agent, seed=1, frames=300, capacity=capacity)
+    again.load_state_dict(saved.training)
+    assert (again.frames, again.updates, again.owed, again.seconds) == (160, 6, trainer.owed, trainer.seconds)
+    assert vars(again.curve) == vars(trainer.curve) and again.target.counter == trainer.target.counter
+    assert torch.equal(contents(again), contents(trainer))
+    for loss, other in zip(trainer.losses, again.losses, strict=True):
+        assert same(loss.state_dict(), other.state_dict())
+    assert same(trainer.agent.state_dict(), again.agent.state_dict())
+    trained = [*again.agent.policy.parameters(), *again.agent.value.parameters()]
+    assert all(weight is own for weight, own in zip(again.losses[0].parameters(), trained, strict=True))
+    rest = spend(again)
+    assert [each.frames for each in rest] == list(range(180, 301, 20))
+    assert again.curve.frames == [0, 100, 200, 300] and rest[-1].updates == again.updates
+
+
+def test_the_next_update_after_a_stop_is_the_one_that_would_have_been(make_learner):
+    trainer = make_learner(frames=200)
+    spend(trainer)
+    state = copy.deepcopy(trainer.state_dict())
+    again = make_learner(seed=1, frames=400)
+    again.load_state_dict(state)
+    torch.set_rng_state(state["generators"]["global"])
+    expected = [trainer._update() for _ in range(3)]
+    torch.set_rng_state(state["generators"]["global"])
+    assert [again._update() for _ in range(3)] == expected
+    assert same(trainer.agent.state_dict(), again.agent.state_dict())
+
+
+@pytest.mark.parametrize("capacity", [1000, 90])
+def test_a_finished_run_goes_on_with_more_frames(make_learner, capacity):
+    """The buffer of a finished run is full: what is learned now comes behind, or replaces the oldest."""
+    trainer = make_learner(frames=200, capacity=capacity)
+    spend(trainer)
+    again = make_learner(trainer.agent, frames=260, capacity=capacity)
+    again.load_state_dict(trainer.state_dict())
+    spend(again)
+    before, after = contents(trainer), contents(again)
+    assert (len(before), len(after)) == ((200, 260) if capacity == 1000 else (90, 90))
+    assert torch.equal(before[-30:], after[-90:-60])
+    torch.testing.assert_close(after[:, 2], after[:, 0] + 0.2 * after[:, 1])
+    assert again.curve.frames[: len(trainer.curve.frames)] == trainer.curve.frames
+
+
+def test_a_finished_run_asked_for_fewer_frames_does_nothing(make_learner):
+    trainer = make_learner(frames=200)
+    spend(trainer)
+    again = make_learner(trainer.agent, frames=100)
+    again.load_state_dict(trainer.state_dict())
+    assert spend(again) == [] and again.frames == 200
+    assert torch.equal(contents(again), contents(trainer)[-100:])
+
+
+@pytest.mark.parametrize("broken", ["loss", "gradient"])
+def test_what_is_not_finite_stops_before_any_weight_is_touched(make_learner, broken):
+    trainer = make_learner()
+    spend(trainer)
+    before = {name: weight.clone() for name, weight in trainer.agent.named_parameters()}
+    moments = [moment["exp_avg"].clone() for moment in trainer.optimizer.state.values()]
+    if broken == "loss":
+        object.__setattr__(trainer.losses[0], "reward", lambda x, u, after: after * math.nan)
+        message = r"Losses are \{'loss_actor': nan, .* at update 10; lower the learning rate"
+    else:  # the root's slope at 0
+        object.__setattr__(trainer.losses[0], "reward", lambda x, u, after: (after * 0).sqrt())
+        message = "The gradient is not finite at update 10"
+    with pytest.raises(FloatingPointError, match=message):
+        trainer._update()
+    assert all(torch.equal(weight, before[name]) for name, weight in trainer.agent.named_parameters())
+    after = [moment["exp_avg"] for moment in trainer.optimizer.state.values()]
+    assert all(map(torch.equal, moments, after)) and trainer.updates == 10
+
+
+def test_batches_must_fill_the_environments(make_learner):
+    for wrong in (30, 0, 2):
+        with pytest.raises(ValueError, match=f"frames_per_batch={wrong} must be a multiple of 4 environments"):
+            make_learner(frames_per_batch=wrong)
+
+
+def test_a_return_ends_with_its_episode(point_env):
+    """Rewards are the number of the step: 1 + 2 + ... to the end of each episode."""
+    still = TensorDictModule(nn.Identity(), ["observation"], ["action"])
+    env = point_env(3, (2, 5, 7), pay=lambda count: count.float())
+    assert mean_return(env, still, 7) == pytest.approx((3 + 15 + 28) / 3)
+    assert mean_return(env, still, 7) == pytest.approx((3 + 15 + 28) / 3)
+    assert mean_return(env, still, 4) == pytest.approx((3 + 10 + 10) / 3)
+
+
+def test_evaluation_plays_the_same_episodes_and_does_not_explore(make_learner, point_env):
+    policy, env = make_learner().agent.policy, point_env(5)
+    first, same, other = (mean_return(env, policy, 20, seed=seed) for seed in (1, 1, 2))
+    assert first == same != other

@@ -1,0 +1,113 @@
+"""Tasks of the DeepMind Control Suite as flat observations."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+import torch
+from torchrl.envs import CatTensors, DMControlWrapper, DoubleToFloat, EnvBase, SerialEnv, TransformedEnv
+
+from torchrl_gn.scenes import ObservationGraph
+
+
+def suite_env(
+    domain: str,
+    task: str,
+    *,
+    num_envs: int = 1,
+    timestep: float | None = None,
+    steps: int | None = 1000,
+    keys: Sequence[str] | None = None,
+    seed: int = 0,
+) -> EnvBase:
+    """A suite task with its observation in one entry ``observation`` ``[num_envs, O]`` float32.
+
+    Physics, observation, reward and ends of episodes are the suite's own (by TorchRL's ``DMControlWrapper``, one after
+    the other in this process).
+
+    Args:
+        domain: of the suite, for example ``"swimmer"``.
+        task: of the domain, for example ``"swimmer6"``; of the swimmer also any other number of links from 3 on.
+        num_envs: how many.
+        timestep: control step, seconds, a whole multiple of the physics step; by default the suite's.
+        steps: control steps in an episode; None: the suite's time limit.
+        keys: the suite's entries in the order that they are put together in, by default the suite's own.
+        seed: of start states and targets; every environment has its own.
+
+    Raises:
+        ValueError: if there is no such task, the control step does not fit, or a number is not positive.
+
+    Example:
+        >>> suite_env("swimmer", "swimmer6", num_envs=2, timestep=0.02).reset()["observation"].shape
+        torch.Size([2, 25])
+    """
+    if num_envs < 1 or (steps is not None and steps < 1):
+        raise ValueError(f"num_envs={num_envs} and steps={steps} must be at least 1.")
+    seeds = np.random.SeedSequence(seed).generate_state(num_envs).tolist()
+    make = partial(_make, domain, task, timestep, steps)
+    order = tuple(_load(domain, task, 0).observation_spec()) if keys is None else tuple(keys)
+    env = SerialEnv(num_envs, [partial(make, seed=int(each)) for each in seeds])
+    env = TransformedEnv(env, DoubleToFloat())
+    env.append_transform(CatTensors(in_keys=list(order), out_key="observation", sort=False))
+    return env
+
+
+def observation_env(graph: ObservationGraph, domain: str, task: str, **options) -> EnvBase:
+    """The task whose observations a graph arranges, see :func:`suite_env`.
+
+    Raises:
+        ValueError: if the task's observation or action is another than the graph's.
+    """
+    loaded = _load(domain, task, 0)
+    observation = {name: int(np.prod(entry.shape)) for name, entry in loaded.observation_spec().items()}
+    actions = int(np.prod(loaded.action_spec().shape))
+    arranged = {name: observation.get(name) for name in graph.observation}
+    if arranged != dict(graph.observation) or actions != graph.num_actions:
+        raise ValueError(
+            f"Task {domain} {task} has observations {observation} and {actions} actions, graph {graph.name!r} arranges"
+            f" {dict(graph.observation)} and {graph.num_actions}."
+        )
+    return suite_env(domain, task, keys=list(graph.observation), **options)
+
+
+@cache
+def _suite() -> tuple[Any, Any, Any]:
+    """The suite, its swimmers, and environments; imported when needed, and kept from looking for a display."""
+    before = os.environ.get("MUJOCO_GL")
+    os.environ.setdefault("MUJOCO_GL", "off")
+    try:
+        from dm_control import suite
+        from dm_control.rl import control
+        from dm_control.suite import swimmer
+    finally:
+        if before is None:
+            del os.environ["MUJOCO_GL"]
+    return suite, swimmer, control
+
+
+def _load(domain: str, task: str, seed: int) -> Any:
+    suite, swimmer, _ = _suite()
+    links = task.removeprefix("swimmer")
+    if domain == "swimmer" and links.isdigit() and (domain, task) not in suite.ALL_TASKS:
+        return swimmer.swimmer(int(links), random=seed)
+    if (domain, task) not in suite.ALL_TASKS:
+        known = sorted(name for owner, name in suite.ALL_TASKS if owner == domain) or sorted(suite.TASKS_BY_DOMAIN)
+        raise ValueError(f"The suite has no task {domain} {task}; there are {', '.join(known)}.")
+    return suite.load(domain, task, {"random": seed})
+
+
+def _make(domain: str, task: str, timestep: float | None, steps: int | None, *, seed: int) -> DMControlWrapper:
+    loaded = _load(domain, task, seed)
+    step = loaded.control_timestep() if timestep is None else timestep
+    physics_step = loaded.physics.timestep()
+    if not 0 < step < np.inf or abs(step / physics_step - round(step / physics_step)) > 1e-6:
+        raise ValueError(f"timestep={timestep} must be a positive multiple of the physics step, {physics_step} s.")
+    # Half a step less: an episode ends at the first step that reaches the limit, whatever its last digit is.
+    limit = loaded._step_limit * loaded.control_timestep() if steps is None else (steps - 0.5) * step
+    *_, control = _suite()
+    env = control.Environment(loaded.physics, loaded.task, time_limit=limit, control_timestep=step)
+    return DMControlWrapper(env, device=torch.device("cpu"))

@@ -1,0 +1,107 @@
+"""Loss of a forward model of observations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torchrl.objectives import LossModule
+
+from torchrl_gn.finite import require_finite
+from torchrl_gn.modules import LearnedReward, ObservationModel
+
+
+class ObservationModelLoss(LossModule):
+    """Squared error of predicted changes of observations, and of predicted rewards.
+
+    Each number's error is in the spread of its change; numbers that never varied do not count. The model is trained
+    jointly with a policy, from the same replay buffer (paper, "Model-based reinforcement learning").
+
+    Differentiated: the weights of the model and of the reward. The input TensorDict is never changed.
+
+    Args:
+        model: the forward model.
+        reward: learned reward; None: the reward is known.
+
+    Input: ``observation`` ``[*B, O]``, ``action`` ``[*B, A]``, ``("next", "observation")`` and, with a learned reward,
+    ``("next", "reward")`` ``[*B, 1]``.
+
+    Output: the scalar ``loss_model`` and, with a learned reward, ``loss_reward``.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that :meth:`set_keys` can change.
+
+        Attributes:
+            reward: read under ``"next"``.
+        """
+
+        reward: NestedKey = "reward"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    model: ObservationModel
+    reward: LearnedReward | None
+
+    def __init__(self, model: ObservationModel, reward: LearnedReward | None = None) -> None:
+        super().__init__()
+        self.model, self.reward = model, reward
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        pass
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that the loss reads."""
+        reward = self.tensor_keys.reward
+        next_reward = ("next", reward) if isinstance(reward, str) else ("next", *reward)
+        return [*self.model.in_keys, *self.model.out_keys, *([] if self.reward is None else [next_reward])]
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Keys that the loss writes."""
+        return ["loss_model", *([] if self.reward is None else ["loss_reward"])]
+
+    def update_normalizers(self, tensordict: TensorDictBase) -> None:
+        """Take newly collected transitions ``[*B]`` into the model's statistics, each once.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if a number is not finite; no statistic is changed.
+        """
+        self.model.update_normalizers(*self._read(tensordict)[:3])
+
+    def _read(self, tensordict: TensorDictBase) -> list[torch.Tensor]:
+        values = []
+        for key in self.in_keys:
+            value = tensordict.get(key, None)
+            if value is None:
+                raise KeyError(
+                    f"{type(self).__name__} needs {key!r}, there is {sorted(map(str, tensordict.keys(True)))}."
+                )
+            require_finite(value, repr(key))
+            values.append(value)
+        return values
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of a batch of transitions.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if a number is not finite.
+        """
+        observation, action, next_observation, *rewards = self._read(tensordict)
+        inverse = torch.where(self.model.change_std > 0, 1 / self.model.change_std, 0).to(observation.dtype)
+        target = (next_observation - observation) * inverse
+        error = (self.model.normalized_change(observation, action) - target) * (inverse > 0)
+        count = (inverse > 0).sum().clamp(min=1)
+        losses = {"loss_model": error.square().sum(-1).mean() / count}
+        if self.reward is not None:
+            predicted = self.reward(observation, action, next_observation)
+            losses["loss_reward"] = (predicted - rewards[0]).square().mean()
+        return TensorDict(losses, [])

@@ -1,0 +1,165 @@
+"""Stochastic value gradients of a policy, through a learned model or without one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, cast
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType
+from torchrl.objectives import DDPGLoss
+
+ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Reward ``[*B, 1]`` of observations, actions and next observations."""
+
+
+class SVGLoss(DDPGLoss):
+    r"""Losses of SVG(N) (paper, SM "SVG"): TorchRL's DDPG with a stochastic policy and a model under its policy's loss.
+
+    The policy maximises, from observations :math:`x_t` of the replay buffer,
+
+    .. math::
+        \mathbb{E}\Big[\sum_{k=0}^{N-1} \gamma^k r(x_{t+k}, a_{t+k}, x_{t+k+1}) + \gamma^N Q(x_{t+N}, a_{t+N})\Big],
+        \quad a_{t+k} \sim \pi(\cdot | x_{t+k}), \quad x_{t+k+1} = g(x_{t+k}, a_{t+k})
+
+    with reparameterised actions, so that its gradient runs through the model :math:`g`, the reward and the value.
+    ``steps=0`` is the model-free SVG(0). Paper: the last action is printed as :math:`a_t`, a misprint. Imagined steps
+    do not end an episode.
+
+    The value's loss is DDPG's with actions drawn from the target policy; everything about keys, target networks,
+    ``make_value_estimator`` (which sets gamma) and priorities is as in :class:`~torchrl.objectives.DDPGLoss`. With a
+    deterministic policy and ``steps=0`` it *is* DDPG.
+
+    Differentiated: the policy's weights in ``loss_actor``, the value's in ``loss_value``. Model and reward are no part
+    of this module: they get no gradient from it, and ``parameters()`` and ``to()`` leave them out; train the model
+    with :class:`~torchrl_gn.objectives.ObservationModelLoss`. Changes of their weights count at the next call.
+
+    Args:
+        actor_network: policy, for example a ``ProbabilisticActor``; one that does not sample is DDPG's.
+        value_network: writes ``state_action_value``.
+        model: TensorDict module from observation and action to ``("next", observation)``, for example an
+            :class:`~torchrl_gn.modules.ObservationModel`. Not read with ``steps=0``.
+        reward: reward of an imagined step, known or learned.
+        steps: ``N``, steps through the model.
+        **options: of :class:`~torchrl.objectives.DDPGLoss`.
+
+    Raises:
+        ValueError: if ``steps`` is negative, or there are steps but no model or reward.
+
+    Input: as DDPG's: what the policy reads, ``action``, and under ``"next"`` the same and ``reward``, ``done`` and
+    ``terminated``.
+
+    Output: ``loss_actor`` and ``loss_value``, and for reading along ``pred_value``, ``target_value``, their largest,
+    and ``td_error``.
+    """
+
+    deterministic_sampling_mode: Any = ExplorationType.RANDOM  # actions are drawn
+    model: TensorDictModuleBase | None
+    reward: ObservedReward | None
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        value_network: TensorDictModule,
+        model: TensorDictModuleBase | None = None,
+        reward: ObservedReward | None = None,
+        *,
+        steps: int = 1,
+        **options: Any,
+    ) -> None:
+        if steps < 0:
+            raise ValueError(f"steps={steps} must be 0 or more.")
+        if steps and (model is None or reward is None):
+            raise ValueError(f"steps={steps} need a model and a reward; use steps=0 without.")
+        super().__init__(actor_network, value_network, **options)
+        self.steps = steps
+        self._share_statistics()
+        # Not registered: their weights are none of this loss's.
+        object.__setattr__(self, "model", model)
+        object.__setattr__(self, "reward", reward)
+
+    def _share_statistics(self) -> None:
+        """Let target networks read the statistics of what they are copies of: TorchRL's updaters copy weights only."""
+        for name in ("actor_network", "value_network"):
+            target = cast(TensorDictBase | None, self._modules.get(f"target_{name}_params"))
+            if target is not None:
+                own = cast(TensorDictBase, self._modules[f"{name}_params"])
+                for buffer, _ in getattr(self, name).named_buffers(remove_duplicate=False):
+                    key = tuple(buffer.split("."))
+                    target.set(key, own.get(key))
+
+    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
+        """Loss of the policy, and nothing more to read along."""
+        weights = self._maybe_get_priority_weight(tensordict)
+        keys = [*self.actor_in_keys, *self.value_exclusive_keys]
+        now = tensordict.select(*keys, *self._carried, strict=False).detach()
+        value, discount = cast(Tensor | float, 0.0), 1.0
+        gamma = cast(Tensor, self.value_estimator.gamma) if self.steps else 1.0
+        with ExitStack() as stack:
+            for module, parameters in (
+                (self.actor_network, self.actor_network_params),
+                (self.value_network, self._cached_detached_value_params),
+            ):
+                stack.enter_context(_with_weights(module, parameters))
+            stack.enter_context(_frozen(self.model, self.reward))
+            for _ in range(self.steps):
+                now = self.actor_network(now)
+                now, reward = self._imagine(now)
+                value = value + discount * reward
+                discount = discount * gamma
+            now = self.value_network(self.actor_network(now))
+            value = value + discount * now.get(self.tensor_keys.state_action_value)
+        loss = self._reduce_loss(-value.squeeze(-1), tensordict=tensordict, weights=weights)
+        self._clear_weakrefs(
+            tensordict,
+            loss,
+            "value_network_params",
+            "target_value_network_params",
+            "target_actor_network_params",
+            "actor_network_params",
+        )
+        return loss, {}
+
+    @property
+    def _carried(self) -> list[NestedKey]:
+        """What the model reads but for the action: imagined steps pass it on."""
+        keys = self.model.in_keys if self.steps and self.model is not None else []
+        return [key for key in keys if key not in self.actor_network.out_keys]
+
+    def _imagine(self, now: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+        """The next step's entries, and the reward ``[*B, 1]`` of getting there."""
+        assert self.model is not None and self.reward is not None
+        observation, action = (cast(Tensor, now.get(key)) for key in self.model.in_keys[:2])
+        predicted = cast(TensorDictBase, self.model(now.copy()).get("next"))
+        next_observation = cast(Tensor, predicted.get(self.model.in_keys[0]))
+        reward = self.reward(observation, action, next_observation)
+        return now.select(*self.value_exclusive_keys, *self._carried, strict=False).update(predicted), reward
+
+
+@contextmanager
+def _with_weights(module: nn.Module, weights: TensorDictBase) -> Iterator[None]:
+    # A TensorDict's own exit leaves the weights in the module if there was an error.
+    swapped = weights.to_module(module, preserve_module_state=False)
+    swapped.__enter__()
+    try:
+        yield
+    finally:
+        swapped.__exit__(None, None, None)
+
+
+@contextmanager
+def _frozen(*modules: object) -> Iterator[None]:
+    """Cut the weights of networks from gradients; what is no network has none."""
+    networks = [module for module in modules if isinstance(module, nn.Module)]
+    trained = [weight for network in networks for weight in network.parameters() if weight.requires_grad]
+    try:
+        for weight in trained:
+            weight.requires_grad_(False)
+        yield
+    finally:
+        for weight in trained:
+            weight.requires_grad_(True)

@@ -1,0 +1,255 @@
+"""Learning a policy from its own experience, kept in a replay buffer."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import HardUpdate, LossModule
+
+from torchrl_gn.modules import Agent
+
+_KEPT = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
+
+
+@dataclass(frozen=True)
+class LearningProgress:
+    """Where learning stands, yielded after every batch of experience.
+
+    Attributes:
+        frames: environment steps made, over all environments and resumed runs.
+        updates: gradient steps made.
+        seconds: spent, over all resumed runs; evaluation apart.
+        losses: means since the last progress.
+        evaluation: mean return of evaluation episodes, if there were any after this batch.
+    """
+
+    frames: int
+    updates: int
+    seconds: float
+    losses: dict[str, float]
+    evaluation: float | None = None
+
+
+@dataclass
+class LearningCurve:
+    """Returns of evaluation episodes, and the frames, updates and seconds that came before each."""
+
+    frames: list[float] = field(default_factory=list)
+    updates: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
+
+
+class OffPolicyTrainer:
+    """Collect experience, update from a replay buffer, evaluate; again and again.
+
+    (Paper, SM "Reinforcement learning agents".) Iterate over :meth:`run`. The losses' own rules about gradients hold;
+    one optimiser updates all of their weights, and target networks are copied after every ``target_interval`` updates.
+
+    Args:
+        agent: the networks, whose statistics take every new transition once.
+        losses: a loss with target networks first (``DDPGLoss``, :class:`~torchrl_gn.objectives.SVGLoss`), others after.
+        env: environments to learn in, ``[num_envs]``.
+        explore: policy to collect with.
+        evaluate: mean return of the policy as it is now.
+        optimizer: of all weights that the losses train.
+        frames: environment steps in all.
+        batch_size: transitions of an update.
+        frames_per_batch: environment steps between updates; a multiple of ``num_envs``.
+        updates_per_frame: gradient steps for every environment step.
+        random_frames: environment steps of random actions first, without updates.
+        evaluate_frames: environment steps between evaluations.
+        capacity: transitions that the replay buffer holds.
+        target_interval: updates between copies of the target networks (paper: 1000).
+        max_norm: norm that the gradient of all weights together is clipped to.
+        seed: of the replay buffer.
+
+    Raises:
+        ValueError: if a number of frames does not fit the environments.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        losses: Sequence[LossModule],
+        env: EnvBase,
+        explore: TensorDictModuleBase,
+        evaluate: Callable[[], float],
+        optimizer: torch.optim.Optimizer,
+        *,
+        frames: int,
+        batch_size: int = 256,
+        frames_per_batch: int = 200,
+        updates_per_frame: float = 0.1,
+        random_frames: int = 5000,
+        evaluate_frames: int = 10_000,
+        capacity: int = 1_000_000,
+        target_interval: int = 1000,
+        max_norm: float = 10.0,
+        seed: int = 0,
+    ) -> None:
+        if frames_per_batch % env.batch_size.numel() or frames_per_batch < 1:
+            raise ValueError(
+                f"frames_per_batch={frames_per_batch} must be a multiple of {env.batch_size.numel()} environments."
+            )
+        self.agent, self.losses, self.env, self.explore = agent, list(losses), env, explore
+        self.evaluate, self.optimizer = evaluate, optimizer
+        self.total, self.per_batch, self.random_frames = frames, frames_per_batch, random_frames
+        self.updates_per_frame, self.evaluate_frames, self.max_norm = updates_per_frame, evaluate_frames, max_norm
+        self.capacity = min(capacity, frames)
+        self.target = HardUpdate(losses[0], value_network_update_interval=target_interval)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(self.capacity, device=torch.device("cpu")),
+            batch_size=batch_size,
+            generator=self.generator,
+        )
+        self.frames, self.updates, self.seconds, self.owed = 0, 0, 0.0, 0.0
+        self.curve = LearningCurve()
+        self._weights = [p for group in optimizer.param_groups for p in group["params"]]
+
+    def run(self) -> Iterator[LearningProgress]:
+        """Learn until all frames are spent.
+
+        Raises:
+            FloatingPointError: if a loss or a gradient is not finite, before any weight is touched by it.
+        """
+        if self.frames == 0:
+            self._evaluate()
+        if self.frames >= self.total:
+            return
+        collector = Collector(
+            self.env,
+            self.explore,
+            frames_per_batch=self.per_batch,
+            total_frames=self.total - self.frames,
+            init_random_frames=max(0, self.random_frames - self.frames),
+            exploration_type=cast(Any, ExplorationType.RANDOM),
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
+        start = time.perf_counter()
+        for batch in collector:
+            self._remember(batch)
+            losses: dict[str, list[float]] = {}
+            while self.owed >= 1:
+                self.owed -= 1
+                for name, value in self._update().items():
+                    losses.setdefault(name, []).append(value)
+            now = time.perf_counter()
+            self.seconds += now - start
+            due = (
+                self.frames // self.evaluate_frames
+                > (self.curve.frames[-1] if self.curve.frames else 0) // self.evaluate_frames
+            )
+            evaluation = self._evaluate() if due or self.frames >= self.total else None
+            means = {name: sum(values) / len(values) for name, values in losses.items()}
+            yield LearningProgress(self.frames, self.updates, self.seconds, means, evaluation)
+            start = time.perf_counter()
+        collector.shutdown(close_env=False)
+
+    def _remember(self, batch: TensorDictBase) -> None:
+        steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1)
+        self.agent.update_normalizers(steps["observation"], steps["action"], steps["next", "observation"])
+        self.buffer.extend(steps)
+        self.frames += len(steps)
+        if self.frames > self.random_frames:
+            self.owed += self.updates_per_frame * len(steps)
+
+    def _update(self) -> dict[str, float]:
+        batch = self.buffer.sample()
+        values: dict[str, float] = {}
+        total = torch.zeros(())
+        for loss in self.losses:
+            out = loss(batch)
+            for name, value in out.items():
+                if str(name).startswith("loss_"):
+                    total = total + cast(torch.Tensor, value)
+                    values[str(name)] = float(cast(torch.Tensor, value).detach())
+        if not math.isfinite(sum(values.values())):
+            raise FloatingPointError(f"Losses are {values} at update {self.updates}; lower the learning rate.")
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        norm = float(torch.nn.utils.clip_grad_norm_(self._weights, self.max_norm))
+        if not math.isfinite(norm):
+            raise FloatingPointError(f"The gradient is not finite at update {self.updates}; lower the learning rate.")
+        self.optimizer.step()
+        self.target.step()
+        self.updates += 1
+        return values
+
+    def _evaluate(self) -> float:
+        value = self.evaluate()
+        for record, now in (
+            (self.curve.frames, self.frames),
+            (self.curve.updates, self.updates),
+            (self.curve.seconds, self.seconds),
+            (self.curve.returns, value),
+        ):
+            record.append(now)
+        return value
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on later, the agent apart; episodes that were going on begin anew."""
+        filled = self.buffer.storage[: len(self.buffer)] if len(self.buffer) else TensorDict()
+        oldest = int(self.buffer.writer.state_dict()["_cursor"]) % max(1, len(self.buffer))
+        return {
+            "losses": [dict(loss.state_dict()) for loss in self.losses],
+            "optimizer": self.optimizer.state_dict(),
+            "target_counter": self.target.counter,
+            "buffer": {".".join(key): value.roll(-oldest, 0) for key, value in _leaves(filled)},
+            "generators": {"buffer": self.generator.get_state(), "global": torch.get_rng_state()},
+            "curve": vars(self.curve),
+            "progress": {name: getattr(self, name) for name in ("frames", "updates", "seconds", "owed")},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what :meth:`state_dict` gave."""
+        for loss, saved in zip(self.losses, state["losses"], strict=True):
+            loss.load_state_dict(saved)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.target.counter = state["target_counter"]
+        if state["buffer"]:
+            flat = TensorDict(state["buffer"])
+            flat.auto_batch_size_(1)
+            self.buffer.extend(flat.unflatten_keys(".")[-self.capacity :])
+        self.generator.set_state(state["generators"]["buffer"])
+        torch.set_rng_state(state["generators"]["global"])
+        self.curve = LearningCurve(**{name: list(values) for name, values in state["curve"].items()})
+        for name, value in state["progress"].items():
+            setattr(self, name, value)
+
+
+def _leaves(tensordict: TensorDictBase) -> Iterator[tuple[tuple[str, ...], torch.Tensor]]:
+    for key, value in tensordict.items(include_nested=True, leaves_only=True):
+        yield ((key,) if isinstance(key, str) else key), cast(torch.Tensor, value)
+
+
+@torch.no_grad()
+def mean_return(env: EnvBase, policy: TensorDictModuleBase, steps: int, *, seed: int = 0) -> float:
+    """Mean return of one episode in each environment ``[num_envs]``, without exploration.
+
+    Args:
+        env: environments whose episodes take ``steps`` steps, or less if they end by themselves.
+        policy: the policy.
+        steps: control steps of an episode.
+        seed: of the episodes; the same ones every time, so that policies compare.
+    """
+    env.set_seed(seed)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rollout = env.rollout(steps, policy, break_when_any_done=False, break_when_all_done=True)
+    reward, done = rollout["next", "reward"], rollout["next", "done"]
+    # Steps after an episode's end are another's.
+    going = torch.cat((torch.ones_like(done[:, :1]), (~done[:, :-1]).cumprod(1).bool()), dim=1)
+    return float((reward * going).sum(1).mean())
