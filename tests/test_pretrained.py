@@ -6,8 +6,8 @@ import warnings
 
 import pytest
 
-from torchrl_gn.data import collect_trajectories
-from torchrl_gn.evaluation import evaluate_errors
+from torchrl_gn.evaluation import fresh_errors
+from torchrl_gn.modules import Agent
 from torchrl_gn.pretrained import WEIGHTS, load_pretrained, pretrained_names
 from torchrl_gn.scenes import load_scene
 
@@ -15,19 +15,18 @@ from torchrl_gn.scenes import load_scene
 @pytest.mark.parametrize("name", pretrained_names())
 def test_a_shipped_model_has_the_errors_that_it_states(name):
     loaded = load_pretrained(name)
-    stated = dict(loaded.metrics)
+    trained, stated = loaded.trained, dict(loaded.metrics)
+    assert not isinstance(trained, Agent)
     how = stated.pop("evaluation")
     scene = loaded.scenes()[0]
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # it is at home in its own scene
-        bound = loaded.model.bind(scene)
-    test = collect_trajectories(scene, how["sequences"], how["length"], how["seed"], split=3)
-    errors = evaluate_errors(bound, test)
+        errors = fresh_errors(trained, scene, **how)
     for key, value in stated[scene.name].items():
         assert errors[key].total == pytest.approx(value, rel=0.05), key
         assert value < 1
     for other in stated.keys() - {scene.name}:
-        loaded.model.bind(load_scene(other))
+        trained.bind(load_scene(other))
 
 
 def test_there_are_some_and_they_are_small():

@@ -23,7 +23,7 @@ def load_pretrained(name: str) -> Checkpoint:
     single precision.
 
     Args:
-        name: one of :func:`pretrained_names`, the system that it was trained on.
+        name: one of :func:`pretrained_names`: the system that it was trained on, or what else it is for.
 
     Returns:
         The checkpoint: model, scenes it was trained on, and its errors in ``metrics``.
@@ -44,5 +44,5 @@ def load_pretrained(name: str) -> Checkpoint:
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"There is no trained model {name!r}; use one of {names}.{hint}")
     checkpoint = load_checkpoint(WEIGHTS / f"{name}.safetensors")
-    checkpoint.model.float()
+    checkpoint.trained.float()
     return checkpoint
