@@ -51,7 +51,8 @@ def make_update(cfg: DictConfig, graph: ObservationGraph, batch: TensorDictBase,
 
     def update() -> None:
         found = [each(batch) for each in losses]
-        total = sum(value for out in found for name, value in out.items() if str(name).startswith("loss_"))
+        values = [value for out in found for name, value in out.items() if str(name).startswith("loss_")]
+        total = torch.stack(values).sum()
         optimizer.zero_grad()
         total.backward()
         optimizer.step()

@@ -6,6 +6,7 @@ from torchrl_gn.modules.bound_forward_model import BoundForwardModel as BoundFor
 from torchrl_gn.modules.bound_forward_model import UnseenFeatureWarning as UnseenFeatureWarning
 from torchrl_gn.modules.bound_recurrent_model import BoundRecurrentModel as BoundRecurrentModel
 from torchrl_gn.modules.core import GNCore as GNCore
+from torchrl_gn.modules.export import export_step as export_step
 from torchrl_gn.modules.forward_model import FeatureSet as FeatureSet
 from torchrl_gn.modules.forward_model import ForwardModel as ForwardModel
 from torchrl_gn.modules.gn_block import GNBlock as GNBlock

@@ -55,9 +55,22 @@ class GNCore(nn.Module):
                 f" edge_hidden={edge_hidden}, node_hidden={node_hidden}, global_hidden={global_hidden}."
             )
         between = GraphSize(latent, latent, latent)
-        hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
-        self.first = GNBlock(in_size, between, activation=activation, pool=pool, **hidden)
-        self.second = GNBlock(in_size + between, GraphSize(out_nodes, latent, 0), activation=activation, **hidden)
+        self.first = GNBlock(
+            in_size,
+            between,
+            edge_hidden=edge_hidden,
+            node_hidden=node_hidden,
+            global_hidden=global_hidden,
+            activation=activation,
+            pool=pool,
+        )
+        self.second = GNBlock(
+            in_size + between,
+            GraphSize(out_nodes, latent, 0),
+            edge_hidden=edge_hidden,
+            node_hidden=node_hidden,
+            activation=activation,
+        )
 
     def forward(self, graph: Graph) -> Graph:
         """Graph with ``in_size`` features in, graph with ``out_nodes`` node features out."""

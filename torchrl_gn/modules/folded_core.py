@@ -20,6 +20,7 @@ products with small incidence matrices, and everything is matrix multiplication.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -351,7 +352,8 @@ def _rows(index: Tensor) -> Rows:
 
 def _items(features: Tensor) -> Tensor:
     """``[*B, I, F]`` as ``[I, 1 or B, F]``."""
-    return features.reshape(features.shape[:-2].numel(), *features.shape[-2:]).transpose(0, 1)
+    # math.prod, not numel(): an exported program is for any batch.
+    return features.reshape(math.prod(features.shape[:-2]), *features.shape[-2:]).transpose(0, 1)
 
 
 def _broadcast(parts) -> list[Tensor]:
