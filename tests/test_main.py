@@ -1,0 +1,91 @@
+"""The command line says what is there, draws it, and refuses bad names in one message."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from PIL import Image
+
+from torchrl_gn.__main__ import main
+from torchrl_gn.pretrained import load_pretrained, pretrained_names
+from torchrl_gn.scenes import SYSTEMS, load_scene
+
+
+@pytest.mark.parametrize("arguments", [[], ["list"]], ids=["nothing", "list"])
+def test_list_names_every_system_and_model(arguments, capsys):
+    assert main(arguments) == 0
+    systems, models = capsys.readouterr().out.split("\n\n")
+    rows = {line.split()[0]: line.split()[1:] for line in systems.splitlines()}
+    assert set(SYSTEMS) <= rows.keys()
+    assert rows["cheetah"] == ["8", "9", "6", "10", "ms", "yes"]  # nine joints: three of the root, six of the legs
+    assert rows["walker2d"] == ["8", "9", "6", "2.5", "ms", "no"]
+    assert {line.split()[0] for line in models.splitlines()} >= set(pretrained_names())
+
+
+def test_list_states_the_errors_of_the_checkpoints(capsys):
+    main(["list"])
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    stated = load_pretrained("swimmer6").metrics["swimmer6"]
+    (row,) = [row for row in rows if row[:2] == ["swimmer6", "swimmer6"]]
+    assert row[2] == "yes"
+    assert [float(cell) for cell in row[3:]] == pytest.approx(
+        [stated[key] for key in ("one_step_error", "rollout_error_20", "rollout_error_100")], rel=0.06
+    )
+    trained = {row[1]: row[2] for row in rows if row[:1] == ["swimmerN"] and len(row) == 6}
+    assert (trained["swimmer6"], trained["swimmer7"]) == ("yes", "no")
+
+
+def test_show_prints_the_scene(capsys):
+    assert main(["show", "swimmer4"]) == 0
+    assert capsys.readouterr().out == f"{load_scene('swimmer4')}\n"
+
+
+def test_show_draws_a_file_of_ones_own(tmp_path, capsys):
+    arm = '<joint axis="0 1 0" name="hinge"/><geom type="capsule" fromto="0 0 0 0 0 -1" size=".05"/>'
+    motor = '<motor joint="hinge" ctrlrange="-1 1"/>'
+    file, image = tmp_path / "arm.xml", tmp_path / "new" / "arm.png"
+    file.write_text(f"<mujoco><worldbody><body>{arm}</body></worldbody><actuator>{motor}</actuator></mujoco>")
+    assert main(["show", str(file), "--image", str(image)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(image)
+    with Image.open(image) as picture:
+        assert min(picture.size) > 400
+        panel = picture.convert("RGB").crop((20, 70, 460, 510))
+        assert len(panel.getcolors(1 << 20)) > 20, "nothing is drawn"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["show", "pendulm"], "Unknown scene 'pendulm'. Did you mean 'pendulum'?"),
+        (["show", "missing.xml"], "MJCF file not found: missing.xml"),
+        (["show", "pendulum", "--image", "{tmp}/pendulum.movie"], "unknown file extension: .movie"),
+        (["shew"], "invalid choice: 'shew'"),
+    ],
+)
+def test_what_cannot_be_done_is_one_message_and_exit_code_2(arguments, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([argument.format(tmp=tmp_path) for argument in arguments])
+    said = capsys.readouterr()
+    assert ended.value.code == 2 and message in said.err and said.out == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys\nfrom torchrl_gn.__main__ import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit as ended:\n    assert ended.code == 0\n"
+        "print(sorted({'torch', 'mujoco', 'numpy', 'PIL'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stderr == "" and "show" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_it_runs_as_a_module():
+    done = subprocess.run(
+        [sys.executable, "-m", "torchrl_gn", "show", "nothing_like_it"], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert done.stderr.startswith("torchrl-gn: Unknown scene 'nothing_like_it'.")

@@ -1,0 +1,105 @@
+"""Command line: what systems and trained models there are, and what a scene looks like as a graph.
+
+    torchrl-gn [list]
+    torchrl-gn show NAME_OR_MJCF [--image FILE]
+
+The same as ``python -m torchrl_gn``. Everything that takes long to import is imported when it is needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+_SIZE = 480  # pixels of a picture's width and height
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: what stands behind the program's name; by default those of this process.
+
+    Returns:
+        Exit code 0. What cannot be done is one message on standard error and, as argparse has it, exit code 2.
+    """
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        text = _show(options.scene, options.image) if options.command == "show" else f"{_systems()}\n\n{_models()}"
+    except (ValueError, OSError, ImportError) as error:
+        parser.exit(2, f"{parser.prog}: {error}\n")
+    print(text)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("torchrl-gn", description="Graph-network physics models of articulated bodies.")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands.add_parser("list", help="the built-in systems and the trained models that come with the package (default)")
+    show = commands.add_parser("show", help="one scene as a graph: nodes, joints, motors, what moves")
+    show.add_argument("scene", metavar="NAME_OR_MJCF", help="a built-in system, or the path of an MJCF file")
+    show.add_argument("--image", metavar="FILE", help="also draw its start state into this file (.png, .jpg, ...)")
+    return parser
+
+
+def _systems() -> str:
+    """Table of the built-in systems."""
+    from torchrl_gn.scenes import SYSTEMS, has_variants, load_scene
+
+    rows: list[tuple[str, ...]] = [("system", "nodes", "joints", "actions", "control step", "random variants")]
+    for name in SYSTEMS:
+        scene = load_scene(name)
+        sizes = (scene.num_nodes, len(scene.joint_names), scene.num_actions)
+        step = f"{1e3 * scene.timestep:g} ms"
+        rows.append((name, *map(str, sizes), step, "yes" if has_variants(scene) else "no"))
+    return _table(rows) + "\nswimmerN exists for every N from 3; any MJCF file will do as well."
+
+
+def _models() -> str:
+    """Table of the trained models that come with the package, with the errors that they state."""
+    from torchrl_gn.pretrained import load_pretrained, pretrained_names
+
+    keys = ("one_step_error", "rollout_error_20", "rollout_error_100")
+    rows: list[tuple[str, ...]] = [
+        ("model", "system", "trained on", *(key.replace("_error", "").replace("_", " ") for key in keys))
+    ]
+    for name in pretrained_names():
+        loaded = load_pretrained(name)
+        trained = [description["name"] for description in loaded.scene_descriptions]
+        stated: Mapping[str, Any] = {key: value for key, value in loaded.metrics.items() if key != "evaluation"}
+        for system in sorted(stated, key=lambda system: (system.rstrip("0123456789"), len(system), system)):
+            errors = (f"{stated[system][key]:.1e}" if key in stated[system] else "-" for key in keys)
+            rows.append((name, system, "yes" if system in trained else "no", *errors))
+    return _table(rows) + "\nSquared errors relative to the prediction that nothing moves (1)."
+
+
+def _show(source: str, image: str | None) -> str:
+    """A scene's summary, and the path of its picture if there is to be one."""
+    from torchrl_gn.scenes import load_scene
+
+    scene = load_scene(source)
+    if image is None:
+        return str(scene)
+    from torchrl_gn.atomic import atomic_path
+    from torchrl_gn.data import Simulator, sample_start_states
+    from torchrl_gn.evaluation import rollout_frames
+
+    start = Simulator(scene).observe(sample_start_states(scene, 1, 0))
+    picture = next(rollout_frames(scene, start, size=_SIZE, labels=("start state", "")))
+    with atomic_path(image) as temporary:
+        picture.save(temporary)
+    return f"{scene}\n{image}"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as lines, columns aligned, a rule under the first row."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
