@@ -62,3 +62,11 @@ def test_readme_has_two_setup_commands_and_ci_runs_its_test_command():
     assert len(commands) == 2
     assert "recipes/forward_model.py" in commands[0] and "-m pytest" in commands[1]
     assert "README.md" in (ROOT / ".ci" / "run").read_text()
+
+
+def test_every_page_is_in_the_menu_of_the_site():
+    menu = (ROOT / "mkdocs.yml").read_text()
+    pages = [str(page.relative_to(ROOT / "docs")) for page in PAGES if ROOT / "docs" in page.parents]
+    parts = [folder.parent.name for folder in (ROOT / "torchrl_gn").glob("*/__init__.py")]
+    for page in [*pages, *(f"reference/{part}.md" for part in parts)]:
+        assert f": {page}\n" in menu, f"mkdocs.yml does not lead to {page}"

@@ -79,6 +79,39 @@ def test_importing_everything_is_silent_and_leaves_the_recipes_libraries_alone()
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
+def exported(part: str) -> list[str]:
+    """Public names of a folder, or of the module ``pretrained``."""
+    if part == "pretrained":
+        return [node.name for node in tree(part).body if isinstance(node, ast.FunctionDef)]
+    imported = [node for node in tree(part).body if isinstance(node, ast.ImportFrom)]
+    return [alias.asname or alias.name for node in imported for alias in node.names]
+
+
+def tree(module: str) -> ast.Module:
+    path = PACKAGE / module.replace(".", "/")
+    return ast.parse((path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text())
+
+
+def described(module: str, name: str) -> bool:
+    """Whether a class or function has a docstring where it is defined, or a string stands behind a constant."""
+    body = tree(module).body
+    for node, behind in zip(body, [*body[1:], ast.Pass()], strict=True):
+        if isinstance(node, ast.ImportFrom) and name in [alias.asname or alias.name for alias in node.names]:
+            return described((node.module or "").removeprefix("torchrl_gn."), name)
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name == name:
+            return bool(ast.get_docstring(node))
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+            return isinstance(behind, ast.Expr) and isinstance(behind.value, ast.Constant)
+    raise LookupError(f"{module} has no {name}")
+
+
+@pytest.mark.parametrize("part", [*ALLOWED, "pretrained"])
+def test_every_public_name_is_described(part):
+    names = exported(part)
+    assert names and not [name for name in names if not described(part, name)]
+
+
 def test_package_itself_is_light():
     done = run("import sys, torchrl_gn; print(torchrl_gn.__version__, 'torch' in sys.modules)")
     assert (done.stdout, done.stderr) == (f"{torchrl_gn.__version__} False\n", "")

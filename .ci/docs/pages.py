@@ -1,0 +1,98 @@
+"""Hooks of the documentation site: pages of the reference, and links to files that are no pages.
+
+What the reference lacks is a warning, which fails a strict build.
+
+A link from ``docs`` to another file of the repository works on a code host. In the site it leads to the code host if
+``repo_url`` names one, and is the file's name otherwise.
+"""
+
+from __future__ import annotations
+
+import ast
+import logging
+import posixpath
+import re
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+PACKAGE = Path(__file__).parents[2] / "torchrl_gn"
+
+PARTS = {
+    "scenes": "scenes.md",
+    "data": "data.md",
+    "modules": "modules.md",
+    "rewards": "envs.md#rewards",
+    "objectives": "objectives.md",
+    "envs": "envs.md",
+    "planners": "planning.md",
+    "evaluation": "evaluation.md",
+    "training": "training.md",
+    "pretrained": "training.md#trained-models-that-come-with-the-package",
+}
+"""Public parts of the package, and the page that explains each."""
+
+LOG = logging.getLogger("mkdocs.hooks.pages")
+LINK = re.compile(r"\[([^\]]+)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
+
+
+def exported(part: str) -> list[str]:
+    """Public names of a part: what a package imports, or a module defines."""
+    folder = PACKAGE / part
+    body = ast.parse((folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")).read_text()).body
+    if folder.is_dir():
+        imports = (node for node in body if isinstance(node, ast.ImportFrom) and node.module != "__future__")
+        names = [alias.asname or alias.name for node in imports for alias in node.names]
+    else:
+        names = [node.name for node in body if isinstance(node, (ast.ClassDef, ast.FunctionDef))]
+    return sorted(name for name in names if not name.startswith("_"))
+
+
+def hidden(part: str, name: str) -> bool:
+    """Whether a public name is that of the module that defines it, which static analysis sees in its place."""
+    return (PACKAGE / part / f"{name}.py").exists()
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add a page of the reference for every part."""
+    for part, page in PARTS.items():
+        names = [name for name in exported(part) if not hidden(part, name)]
+        text = f"# torchrl_gn.{part}\n\n[What it is and how to use it](../{page}).\n\n"
+        text += f"::: torchrl_gn.{part}\n    options: {{members: {names}}}\n"
+        for name in exported(part):
+            if hidden(part, name):
+                text += f"\n::: torchrl_gn.{part}.{name}.{name}\n"
+                text += (
+                    "    options: {show_root_heading: true, show_root_toc_entry: true, show_root_full_path: false}\n"
+                )
+        files.append(File.generated(config, f"reference/{part}.md", content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Turn links out of ``docs`` into links to the code host, or names of files."""
+    folder = posixpath.join("docs", posixpath.dirname(page.file.src_uri))
+
+    def replaced(match: re.Match[str]) -> str:
+        path = posixpath.normpath(posixpath.join(folder, match[2]))
+        if path.startswith("docs/"):
+            return match[0]
+        if config.repo_url:
+            return f"[{match[1]}]({config.repo_url.rstrip('/')}/blob/HEAD/{path}{match[3] or ''})"
+        return match[1] if match[1].strip("`") == path else f"{match[1]} (`{path}`)"
+
+    return LINK.sub(replaced, markdown)
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Look whether a page of the reference shows every public name, and no markup that is not Markdown."""
+    folder, _, part = page.file.src_uri.removesuffix(".md").rpartition("/")
+    if folder == "reference":
+        for name in exported(part):
+            if f'id="torchrl_gn.{part}.{name}{f".{name}" * hidden(part, name)}"' not in html:
+                LOG.warning(f"{page.file.src_uri} does not show torchrl_gn.{part}.{name}.")
+        for role in re.findall(r":(?:func|class|meth|attr|data|mod|math):|\.\. \w+::", html):
+            LOG.warning(f"{page.file.src_uri} shows {role!r}.")
+    return html
