@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_gn.finite import require_finite
@@ -94,8 +94,7 @@ class BoundForwardModel(TensorDictModuleBase):
         self.in_keys: list[NestedKey] = [state_key, action_key]
         if static_key is not None:
             self.in_keys.append(static_key)
-        next_key = ("next", state_key) if isinstance(state_key, str) else ("next", *state_key)
-        self.out_keys: list[NestedKey] = [next_key]
+        self.out_keys: list[NestedKey] = [unravel_key(("next", state_key))]
         items = model.options["items"]
         if items is not None and tuple(items) != (scene.num_nodes, scene.num_edges):
             raise ValueError(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any, cast
 
 import torch
 from tensordict.nn import NormalParamExtractor
 from torch import Tensor, nn
 
-from torchrl_gn.modules.observation_network import ObservationNetwork
+from torchrl_gn.modules.observation_network import ObservationNetwork, sharing_weights
 from torchrl_gn.scenes import ObservationGraph
 
 
@@ -36,20 +35,13 @@ class GraphPolicy(nn.Module):
             raise ValueError(f"Graph {graph.name!r} has no actions for a policy to choose.")
         self.network = ObservationNetwork(graph, 2 * graph.node_actions.shape[1], actions=False, **options)
         self.extract = NormalParamExtractor(scale_lb=cast(Any, min_scale))
-        self._read_actions(graph)
-
-    def _read_actions(self, graph: ObservationGraph) -> None:
-        places = torch.as_tensor(graph.node_actions).flatten()
-        take = torch.empty(graph.num_actions, dtype=torch.long)
-        take[places[places >= 0]] = (places >= 0).nonzero().flatten()
-        self.register_buffer("take", take.to(self.network.places.slots.device), persistent=False)
+        self.register_buffer("take", torch.as_tensor(graph.action_at), persistent=False)
 
     def for_graph(self, graph: ObservationGraph) -> GraphPolicy:
         """The same weights for another graph, see :meth:`ObservationNetwork.for_graph`."""
-        policy = copy.copy(self)
-        policy._modules, policy._buffers = dict(self._modules), dict(self._buffers)
+        policy = sharing_weights(self)
         policy.network = self.network.for_graph(graph)
-        policy._read_actions(graph)
+        policy.take = torch.as_tensor(graph.action_at).to(self.take.device)
         return policy
 
     def update_normalizers(self, observation: Tensor) -> None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_gn.modules.normalizer import Normalizer
-from torchrl_gn.modules.observation_network import ObservationNetwork
+from torchrl_gn.modules.observation_network import ObservationNetwork, sharing_weights
 from torchrl_gn.scenes import ObservationGraph
 
 
@@ -45,21 +44,12 @@ class ObservationModel(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys: list[NestedKey] = [observation_key, action_key]
-        key = (observation_key,) if isinstance(observation_key, str) else observation_key
-        self.out_keys: list[NestedKey] = [("next", *key)]
+        self.out_keys: list[NestedKey] = [unravel_key(("next", observation_key))]
         slots, globals_ = graph.node_entries.shape[1], len(graph.global_entries)
         self.network = ObservationNetwork(graph, slots + globals_, actions=True, **options)
         self.change_normalizer = Normalizer(slots, floor=1e-6)
         self.global_change_normalizer = Normalizer(globals_, floor=1e-6)
-        self._read_changes(graph)
-
-    def _read_changes(self, graph: ObservationGraph) -> None:
-        """Where each number of the observation is read in the flattened node outputs, and behind them the globals."""
-        slots = torch.as_tensor(graph.node_entries).flatten()
-        entries = torch.cat((slots, torch.as_tensor(graph.global_entries)))
-        take = torch.empty(graph.num_observations, dtype=torch.long)
-        take[entries[entries >= 0]] = (entries >= 0).nonzero().flatten()
-        self.register_buffer("take", take.to(self.network.places.slots.device), persistent=False)
+        self.register_buffer("take", torch.as_tensor(graph.observation_at), persistent=False)
 
     @property
     def graph(self) -> ObservationGraph:
@@ -68,10 +58,9 @@ class ObservationModel(TensorDictModuleBase):
 
     def for_graph(self, graph: ObservationGraph) -> ObservationModel:
         """The same weights for another graph, see :meth:`ObservationNetwork.for_graph`."""
-        model = copy.copy(self)
-        model._modules, model._buffers = dict(self._modules), dict(self._buffers)
+        model = sharing_weights(self)
         model.network = self.network.for_graph(graph)
-        model._read_changes(graph)
+        model.take = torch.as_tensor(graph.observation_at).to(self.take.device)
         return model
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,8 @@ from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
 from torchrl_gn.modules.mlp_core import MLPCore
 from torchrl_gn.modules.normalizer import Normalizer
 from torchrl_gn.scenes import ObservationGraph
+
+M = TypeVar("M", bound=nn.Module)
 
 # Spreads below this are rounding noise of float32 observations.
 _FLOOR = 1e-6
@@ -94,8 +96,7 @@ class ObservationNetwork(nn.Module):
                 f"The network is tied to graphs of {sizes[0][0]} nodes and {sizes[0][1]} joints, {graph.name!r} has"
                 f" {sizes[1][0]} and {sizes[1][1]}. Use core='gn' and a graph without identity."
             )
-        network = copy.copy(self)
-        network._modules = dict(self._modules)
+        network = sharing_weights(self)
         network.graph, network.places = graph, _Places(graph).to(self.places.slots.device)
         return network
 
@@ -164,6 +165,13 @@ class ObservationNetwork(nn.Module):
         if self.plain:
             return self.core(graph_concat(dynamic, static)).nodes
         return self.core.fold(self.size, self.places.every_node, static).predict(dynamic)
+
+
+def sharing_weights(module: M) -> M:
+    """Copy of a module that shares its weights and statistics, and whose parts can be exchanged."""
+    twin = copy.copy(module)
+    twin._modules, twin._buffers = dict(module._modules), dict(module._buffers)
+    return twin
 
 
 def _widths(graph: ObservationGraph) -> tuple[int, int, int, int]:

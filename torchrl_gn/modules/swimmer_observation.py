@@ -53,9 +53,9 @@ class SwimmerObservation(TensorDictModuleBase):
         between = quaternion.product(quaternion.conjugate(before), after)
         angles = 2 * torch.atan2(between[..., 3], between[..., 0])
         angles = torch.remainder(angles + torch.pi, 2 * torch.pi) - torch.pi
-        frames = quaternion.to_matrix(turned).unflatten(-1, (3, 3)).mT
-        nose = links[..., 0, :3] + (frames[..., 0, :, :].mT @ state.new_tensor(_NOSE))
-        way = (frames[..., 0, :, :] @ (target.to(state.dtype) - nose).unsqueeze(-1)).squeeze(-1)[..., :2]
-        linear, angular = ((frames @ part.unsqueeze(-1)).squeeze(-1) for part in links[..., 7:].split(3, dim=-1))
+        back = quaternion.conjugate(turned)
+        nose = links[..., 0, :3] + quaternion.rotate(turned[..., 0, :], state.new_tensor(_NOSE))
+        way = quaternion.rotate(back[..., 0, :], target.to(state.dtype) - nose)[..., :2]
+        linear, angular = (quaternion.rotate(back, part) for part in links[..., 7:].split(3, dim=-1))
         velocities = torch.cat((linear[..., :2], angular[..., 2:]), dim=-1).flatten(-2)
         return torch.cat((angles, way, velocities), dim=-1).float()

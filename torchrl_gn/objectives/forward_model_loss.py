@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 
@@ -111,7 +111,7 @@ class ForwardModelLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """Keys that the loss reads."""
         state, action, static = self.tensor_keys.state, self.tensor_keys.action, self.model.static_key
-        return [state, action, _next(state), *([] if static is None else [static])]
+        return [state, action, unravel_key(("next", state)), *([] if static is None else [static])]
 
     @property
     def out_keys(self) -> list[str]:
@@ -243,7 +243,3 @@ class ForwardModelLoss(LossModule):
             count = (weight > 0).sum().clamp(min=1) * delta.shape[0]
             errors.append((difference * weight).square().sum() / count)
         return torch.stack(errors)
-
-
-def _next(key: NestedKey) -> NestedKey:
-    return ("next", key) if isinstance(key, str) else ("next", *key)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives import LossModule
 
 from torchrl_gn.finite import require_finite
@@ -57,9 +57,8 @@ class ObservationModelLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys that the loss reads."""
-        reward = self.tensor_keys.reward
-        next_reward = ("next", reward) if isinstance(reward, str) else ("next", *reward)
-        return [*self.model.in_keys, *self.model.out_keys, *([] if self.reward is None else [next_reward])]
+        reward = [] if self.reward is None else [unravel_key(("next", self.tensor_keys.reward))]
+        return [*self.model.in_keys, *self.model.out_keys, *reward]
 
     @property
     def out_keys(self) -> list[str]:

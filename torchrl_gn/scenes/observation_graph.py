@@ -188,6 +188,16 @@ class ObservationGraph:
             acting[node] = list(self.actions.get(joint, ()))
         return _table(acting)
 
+    @cached_property
+    def observation_at(self) -> np.ndarray:
+        """``[O]`` where each number of the observation stands in flattened ``node_entries``, globals behind them."""
+        return _listed_at(np.concatenate((self.node_entries.ravel(), self.global_entries)))
+
+    @cached_property
+    def action_at(self) -> np.ndarray:
+        """``[A]`` where each action stands in flattened ``node_actions``."""
+        return _listed_at(self.node_actions.ravel())
+
     def _find(self, entries: tuple[str, ...]) -> list[int]:
         starts = dict(zip(self.observation, np.cumsum([0, *self.observation.values()]).tolist(), strict=False))
         found = []
@@ -249,6 +259,12 @@ class ObservationGraph:
             acting = ", ".join(map(str, self.actions.get(joint, ()))) or "-"
             lines.append(f"  joint {joint[0]} - {joint[1]}: {', '.join(entries) or '-'}; actions {acting}")
         return "\n".join([*lines, f"  globals: {', '.join(self.globals_) or '-'}"])
+
+
+def _listed_at(entries: np.ndarray) -> np.ndarray:
+    """Where 0, 1, ... stand among entries, of which those that are -1 are none."""
+    (there,) = np.nonzero(entries >= 0)
+    return there[np.argsort(entries[there])]
 
 
 def _table(rows: list[list[int]]) -> np.ndarray:
