@@ -84,8 +84,8 @@ def peak_memory(run: Callable[[], object]) -> float:
 
 
 def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
-    """What ``run`` gives, and the seconds it takes, with oneDNN's products if ``fast``."""
-    with fast_matmul() if fast else contextlib.nullcontext():
+    """What ``run`` gives, and the seconds it takes, with products that may round if ``fast``."""
+    with fast_matmul(rounding=True) if fast else contextlib.nullcontext():
         start = time.perf_counter()
         result = run()
         return result, time.perf_counter() - start

@@ -41,7 +41,9 @@ from torchrl_gn.training import (
     RunFolder,
     Tracker,
     Trainer,
+    Workers,
     clean_exit,
+    join_workers,
     load_checkpoint,
     make_optimizer,
 )
@@ -127,11 +129,11 @@ def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
     return ForwardModel(FeatureSet.of(scenes[0]), items=items, **options(cfg.model))
 
 
-def make_buffer(cfg: DictConfig, tasks: list[Task], batch_size: int, window: int, seed: int) -> ReplayBuffer:
+def make_buffer(tasks: list[Task], batch_size: int, window: int, seed: int, workers: Workers) -> ReplayBuffer:
     """Transitions of one system, or equal shares of several."""
     share = max(1, batch_size // len(tasks))
     buffers = [
-        trajectory_buffer(task.train, batch_size=share, window=window, seed=seed + 1000 * index)
+        trajectory_buffer(task.train, batch_size=share, window=window, seed=seed + 1000 * index, shard=workers.shard)
         for index, task in enumerate(tasks)
     ]
     if len(buffers) == 1:
@@ -139,15 +141,15 @@ def make_buffer(cfg: DictConfig, tasks: list[Task], batch_size: int, window: int
     return ReplayBufferEnsemble(*buffers, batch_size=share * len(tasks), sample_from_all=True)
 
 
-def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task]) -> Trainer:
+def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], workers: Workers) -> Trainer:
     """Wire data, loss and optimiser together."""
     losses = []
     for index, task in enumerate(tasks):
-        noise = torch.Generator().manual_seed(cfg.seed + 1000 * index)
+        noise = torch.Generator().manual_seed(cfg.seed + 1000 * index + 1_000_000 * workers.rank)
         losses.append(ForwardModelLoss(task.bind(model), noise=cfg.noise, generator=noise))
     unroll = None
     if cfg.unroll_fraction > 0:
-        unroll = make_buffer(cfg, tasks, cfg.unroll_batch_size, cfg.unroll_steps, cfg.seed + 1)
+        unroll = make_buffer(tasks, cfg.unroll_batch_size, cfg.unroll_steps, cfg.seed + 1, workers)
 
     def validate() -> float:
         """Geometric mean over the systems, so that each counts by its own scale."""
@@ -159,13 +161,14 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task]) -> Tra
 
     return Trainer(
         losses[0] if len(losses) == 1 else SeveralScenesLoss(losses),
-        make_buffer(cfg, tasks, cfg.batch_size, 1, cfg.seed),
+        make_buffer(tasks, cfg.batch_size, 1, cfg.seed, workers),
         make_optimizer(model.core, cfg.optimizer, lr=cfg.lr),
         Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
         unroll_fraction=cfg.unroll_fraction,
         validate=validate,
         patience=cfg.patience,
+        workers=workers,
     )
 
 
@@ -199,27 +202,31 @@ def evaluate(
     return tables, list(dict.fromkeys(files))
 
 
-@hydra.main(version_base=None, config_path="config", config_name="forward_model")
-@clean_exit
-def main(cfg: DictConfig) -> None:
+def run_recipe(cfg: DictConfig, workers: Workers) -> None:
+    """Collect, train, evaluate; the first of the workers alone evaluates and writes."""
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
     scenes, unseen = load_scenes(cfg.system, cfg.timestep), load_scenes(cfg.zero_shot, cfg.timestep)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)  # refuse a bad budget before anything is written
-    run = RunFolder(cfg.run_dir, "forward_model")
+    run = workers.agree(lambda: RunFolder(cfg.run_dir, "forward_model"))
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
         run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
     model = begun.model if begun else make_model(cfg, scenes)
-    run.write_config(OmegaConf.to_yaml(cfg))
+    if workers.first:
+        run.write_config(OmegaConf.to_yaml(cfg))
     names = "-".join(scene.name for scene in scenes)
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"forward_model-{names}", config=options(cfg))
+    logger = cfg.logger if workers.first else "none"
+    tracker = Tracker(logger, run.path / "log", name=f"forward_model-{names}", config=options(cfg))
 
-    tasks = make_tasks(cfg, scenes, Path(cfg.data.folder) if cfg.data.folder else run.data)
-    trainer = make_trainer(cfg, model, tasks)
+    with workers.first_goes_first():
+        tasks = make_tasks(cfg, scenes, Path(cfg.data.folder) if cfg.data.folder else run.data)
+    trainer = make_trainer(cfg, model, tasks, workers)
     if not begun:
         fit_normalizers(cfg, trainer, tasks)
     curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scenes, config=options(cfg))
+    if not workers.first:
+        return
 
     tables, files = evaluate(cfg, model, tasks, unseen, run.path)
     if curves["seconds"]:
@@ -244,6 +251,13 @@ def main(cfg: DictConfig) -> None:
     print(tables[scenes[0].name] if len(tables) == 1 else summary(tables))
     for path in [*files, run.path / "metrics.json", run.checkpoint]:
         print(path)
+
+
+@hydra.main(version_base=None, config_path="config", config_name="forward_model")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    with join_workers() as workers:
+        run_recipe(cfg, workers)
 
 
 if __name__ == "__main__":

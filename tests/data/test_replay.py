@@ -139,3 +139,16 @@ def test_what_cannot_be_sampled_is_refused() -> None:
         trajectory_buffer(data, batch_size=2, capacity=2)
     with pytest.raises(ValueError, match="batch_size and window"):
         trajectory_buffer(data, batch_size=0)
+
+
+def test_shards_are_the_parts_of_one_draw() -> None:
+    whole = trajectory_buffer(_counting(5, 8), batch_size=12, window=3, seed=0)
+    parts = [trajectory_buffer(_counting(5, 8), batch_size=12, window=3, seed=0, shard=(rank, 3)) for rank in range(3)]
+    for _ in range(2):
+        drawn = [part.sample() for part in parts]
+        assert [len(part) for part in drawn] == [4, 4, 4]
+        torch.testing.assert_close(torch.cat([part["action"] for part in drawn]), whole.sample()["action"])
+    with pytest.raises(ValueError, match="batch_size=10 cannot be split evenly among 4 processes"):
+        trajectory_buffer(_counting(5, 8), batch_size=10, shard=(0, 4))
+    with pytest.raises(ValueError, match=r"shard must be a rank and a size above it, got \(2, 2\)"):
+        trajectory_buffer(_counting(5, 8), batch_size=10, shard=(2, 2))

@@ -181,10 +181,19 @@ def test_a_loss_that_is_not_finite_stops_before_any_weight_changes(make_trainer)
 def test_fast_products_last_as_long_as_their_block():
     cpu, cuda = torch.backends.mkldnn.matmul, torch.backends.cuda.matmul
     before = cpu.fp32_precision, cuda.fp32_precision
-    with pytest.raises(RuntimeError), fast_matmul():
+    with pytest.raises(RuntimeError), fast_matmul(rounding=True):
         assert (cpu.fp32_precision, cuda.fp32_precision) == ("bf16", "tf32")
         raise RuntimeError
     assert (cpu.fp32_precision, cuda.fp32_precision) == before
+
+
+def test_fast_products_keep_their_digits_unless_rounding_is_asked_for():
+    factor, cuda = torch.randn(300, 300), torch.backends.cuda.matmul.fp32_precision
+    exact = factor.double() @ factor.double()
+    with fast_matmul():
+        product = factor @ factor
+        assert torch.backends.cuda.matmul.fp32_precision == cuda
+    assert (product - exact).norm() < 1e-6 * exact.norm()
 
 
 def test_callers_see_their_own_precision_between_steps(make_trainer):

@@ -23,6 +23,7 @@ def trajectory_buffer(
     seed: int | None = None,
     capacity: int | None = None,
     elsewhere: tuple[int, int] | None = None,
+    shard: tuple[int, int] = (0, 1),
 ) -> TensorDictReplayBuffer:
     """Replay buffer that draws transitions, or windows of them, from trajectories.
 
@@ -49,6 +50,8 @@ def trajectory_buffer(
         elsewhere: ``(count, length)``: every draw also has so many windows of that length from other
             times of its trajectory (paper, SM "End-to-end training algorithm for System ID"); they follow the
             first along the second dimension, ``[batch_size, window + count * length]``.
+        shard: ``(rank, size)``: of every draw of ``batch_size`` this buffer gives one part of ``size`` equal ones, the
+            ``rank``-th; buffers of one seed and the other ranks give the others (training in several processes).
 
     Raises:
         KeyError: ``state`` or ``action`` is missing.
@@ -67,6 +70,10 @@ def trajectory_buffer(
         raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
     if elsewhere is not None and min(elsewhere) < 1:
         raise ValueError(f"elsewhere must be a count and a length of at least 1, got {elsewhere}")
+    if not 0 <= shard[0] < shard[1]:
+        raise ValueError(f"shard must be a rank and a size above it, got {shard}")
+    if batch_size % shard[1]:
+        raise ValueError(f"batch_size={batch_size} cannot be split evenly among {shard[1]} processes; use a multiple")
     trajectories = _checked(trajectories, max(window, elsewhere[1] if elsewhere else 1))
     count = len(trajectories)
     if capacity is None:
@@ -76,7 +83,7 @@ def trajectory_buffer(
     else:
         room = trajectories.apply(lambda x: x.new_zeros(capacity, *x.shape[1:]), batch_size=[capacity])
         storage, writer = TrajectoryStorage(room, writable=True), TensorDictRoundRobinWriter()
-    sampler = WindowSampler(window, seed, elsewhere=elsewhere)
+    sampler = WindowSampler(window, seed, elsewhere=elsewhere, shard=shard)
     buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, writer=writer, batch_size=batch_size)
     if capacity is not None:
         buffer.extend(trajectories.copy())
@@ -153,18 +160,26 @@ class WindowSampler(Sampler):
         window: consecutive transitions in one draw.
         seed: seed of the draws. Default: drawn from torch's global generator.
         elsewhere: number and length of further windows of the same trajectory in one draw.
+        shard: rank and size; all ranks draw the same and each keeps its part.
     """
 
-    def __init__(self, window: int = 1, seed: int | None = None, *, elsewhere: tuple[int, int] | None = None):
-        self.window, self.elsewhere = window, elsewhere
+    def __init__(
+        self,
+        window: int = 1,
+        seed: int | None = None,
+        *,
+        elsewhere: tuple[int, int] | None = None,
+        shard: tuple[int, int] = (0, 1),
+    ):
+        self.window, self.elsewhere, self.shard = window, elsewhere, shard
         self._generator = torch.Generator()
         self._generator.manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
     def sample(self, storage: TrajectoryStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
-        """Draw ``batch_size`` windows.
+        """Draw ``batch_size`` windows and keep this shard's.
 
         Returns:
-            Trajectory and time, ``[batch_size]`` or ``[batch_size, window]`` each, and no metadata.
+            Trajectory and time, ``[batch_size / size]`` or ``[batch_size / size, window]`` each, and no metadata.
         """
         starts = storage.steps - self.window + 1
         if not len(storage):
@@ -177,7 +192,9 @@ class WindowSampler(Sampler):
             if self.elsewhere:
                 time = torch.cat((time, self._others(time[:, 0], storage.steps)), dim=1)
             trajectory = trajectory[:, None].expand_as(time)
-        return (trajectory, time), {}
+        rank, size = self.shard
+        own = slice(rank * batch_size // size, (rank + 1) * batch_size // size)
+        return (trajectory[own], time[own]), {}
 
     def _others(self, start: Tensor, steps: int) -> Tensor:
         """Times ``[B, count * length]`` of windows that start anywhere but where the first does."""

@@ -17,3 +17,5 @@ from torchrl_gn.training.run_folder import RunFolder as RunFolder
 from torchrl_gn.training.tracking import Tracker as Tracker
 from torchrl_gn.training.trainer import Progress as Progress
 from torchrl_gn.training.trainer import Trainer as Trainer
+from torchrl_gn.training.workers import Workers as Workers
+from torchrl_gn.training.workers import join_workers as join_workers

@@ -63,6 +63,8 @@ def train_with_progress(
 ) -> dict[str, list]:
     """Train to the end with a progress bar, saving now and then, on Ctrl-C and at the end, with the best weights.
 
+    Of several workers the first shows, logs and saves, and the others train along.
+
     Args:
         trainer: what trains.
         path: the checkpoint to write.
@@ -78,6 +80,10 @@ def train_with_progress(
     if begun is not None:
         trainer.load_state_dict(begun.training)
         curves = begun.training["curves"]
+    if not trainer.workers.first:
+        for _ in trainer.run():
+            pass
+        return curves
 
     def save() -> None:
         state = {**trainer.state_dict(), "curves": curves}

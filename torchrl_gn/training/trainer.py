@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
+from torch import nn
 from torchrl.data import ReplayBuffer
 
 from torchrl_gn.modules import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss, SeveralScenesLoss
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.optimizers import ScheduledOptimizer
+from torchrl_gn.training.workers import Workers
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,10 @@ class Trainer:
     Iterate over :meth:`run`; every step yields a :class:`Progress`, so the caller shows
     progress, logs and saves checkpoints where it likes, and may stop at any step.
 
+    With several ``workers`` every process runs a trainer of its own on its shard of every batch. Gradients are
+    averaged, the first worker's clock and validation count for all, and its checkpoint is everybody's. What comes out
+    is what one process would train, but for rounding (and for input noise, which each draws on its own).
+
     Args:
         loss: the loss, of one scene or several; its model is what is trained.
         buffer: replay buffer of transitions.
@@ -51,6 +57,7 @@ class Trainer:
             seen are kept (paper: 20-step rollouts of the validation set).
         validations: how often to validate over the whole budget.
         patience: stop after so many validations without a new best. Default: never.
+        workers: the processes that train together. Default: this one alone.
 
     Raises:
         ValueError: if ``unroll_fraction`` is no share.
@@ -68,12 +75,14 @@ class Trainer:
         validate: Callable[[], float] | None = None,
         validations: int = 20,
         patience: int | None = None,
+        workers: Workers | None = None,
     ) -> None:
         if not 0 <= unroll_fraction <= 1:
             raise ValueError(f"unroll_fraction={unroll_fraction} must be a share, 0 to 1.")
         self.loss, self.buffer, self.optimizer, self.budget = loss, buffer, optimizer, budget
         self.unroll, self.unroll_fraction = unroll, unroll_fraction
         self.validate, self.validations, self.patience = validate, validations, patience
+        self.workers = workers or Workers()
         self.model = loss.trained
         self.step, self.seconds = 0, 0.0
         self.best, self.since_best, self.validated = math.inf, 0, 0
@@ -93,42 +102,45 @@ class Trainer:
             FloatingPointError: if the loss or the gradient is not finite, before any
                 weight is touched by it.
         """
-        while self.fraction < 1 and not self._patience_is_over():
+        module, fraction = self.workers.wrap(self.loss), self.workers.agree(lambda: self.fraction)
+        while fraction < 1 and not self._patience_is_over():
             start = self.budget.now()
             with fast_matmul():
-                loss = self._update()
+                loss = self._update(module, fraction)
             self._add("", start)
-            validation = self._validation()
+            fraction = self.workers.agree(lambda: self.fraction)
+            validation = self._validation(fraction)
             start = self.budget.now()
-            yield Progress(self.step, self.seconds, self.fraction, loss, validation)
+            yield Progress(self.step, self.seconds, fraction, loss, validation)
             self._add("caller", start)
 
-    def _update(self) -> float:
-        fraction = self.fraction
+    def _update(self, module: nn.Module, fraction: float) -> float:
         clock = self.budget.now()
         buffer = self.buffer
         if self.unroll is not None and fraction >= 1 - self.unroll_fraction:
             buffer = self.unroll
         batch = buffer.sample()
         clock = self._lap("sampling", clock)
-        loss = self.loss(batch)["loss_forward_model"]
-        if not bool(torch.isfinite(loss)):
-            raise FloatingPointError(f"The loss is {loss.item()} at step {self.step}; lower the learning rate.")
+        loss = module(batch)["loss_forward_model"]
+        # Of all workers, so that all stop when one has to.
+        mean = self.workers.mean(loss.item())
+        if not math.isfinite(mean):
+            raise FloatingPointError(f"The loss is {mean} at step {self.step}; lower the learning rate.")
         self.optimizer.zero_grad()
         loss.backward()
         clock = self._lap("model", clock)
         self.optimizer.step(self.step, fraction)
         self._lap("optimizer", clock)
         self.step += 1
-        return loss.item()
+        return mean
 
-    def _validation(self) -> float | None:
-        due = math.floor(self.fraction * self.validations)
+    def _validation(self, fraction: float) -> float | None:
+        due = math.floor(fraction * self.validations)
         if self.validate is None or due <= self.validated:
             return None
         start = self.budget.now()
         with fast_matmul():
-            error = self.validate()
+            error = self.workers.agree(self.validate)
         self.validated = due
         self.since_best += 1
         if error < self.best:

@@ -1,0 +1,49 @@
+"""Several processes that train together train what one would."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_gn.training import Workers, join_workers
+
+from .train_together import train
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> list[dict[str, torch.Tensor]]:
+    """What each of two processes ended with."""
+    folder = tmp_path_factory.mktemp("together")
+    script = Path(__file__).with_name("train_together.py")
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", script, folder]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
+
+
+def test_all_end_with_the_same_weights_and_statistics(results):
+    first, second = results
+    for name in first:
+        assert torch.equal(first[name], second[name]), name
+
+
+def test_one_process_trains_the_same_but_for_rounding(results):
+    alone = train(Workers())
+    assert len(alone["losses"]) == 24  # patience ended it: at 80 % of 30 steps, five validations after the best
+    assert alone["best"] == 1.0
+    for name, value in alone.items():
+        torch.testing.assert_close(results[0][name], value, rtol=1e-5, atol=1e-6, msg=name)
+
+
+def test_a_process_alone_needs_no_others():
+    with join_workers() as workers:
+        assert workers == Workers(rank=0, size=1)
+        assert workers.agree(lambda: "mine") == "mine" and workers.mean(2.0) == 2.0
+        module = torch.nn.Linear(1, 1)
+        assert workers.wrap(module) is module
+        with workers.first_goes_first():
+            workers.wait()

@@ -1,0 +1,50 @@
+"""A small training, run by torchrun from test_workers.py: writes what each process ended with to a folder."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+
+import torch
+
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.modules import FeatureSet, ForwardModel
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import Trainer, Workers, join_workers, make_optimizer
+from torchrl_gn.training.budget import Budget
+
+
+def train(workers: Workers, *, steps: int = 30) -> dict[str, torch.Tensor]:
+    """Weights and statistics after steps on transitions and windows; what each brings of its own must not show."""
+    scene = load_scene("pendulum")
+    trajectories = collect_trajectories(scene, num=20, steps=20)
+    torch.manual_seed(workers.rank)  # the first one's weights are everybody's
+    small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+    model = ForwardModel(FeatureSet.of(scene), **small)
+    loss = ForwardModelLoss(model.bind(scene))
+    # ... and so are its statistics.
+    loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=500 + workers.rank, seed=workers.rank).sample())
+    falling = itertools.chain([3.0, 2.0, 1.0], itertools.repeat(4.0))
+    validate = (lambda: next(falling)) if workers.first else (lambda: -1.0)
+    trainer = Trainer(
+        loss,
+        trajectory_buffer(trajectories, batch_size=16, seed=0, shard=workers.shard),
+        make_optimizer(model.core, "muon"),
+        Budget(steps=steps),
+        unroll=trajectory_buffer(trajectories, batch_size=8, window=3, seed=1, shard=workers.shard),
+        unroll_fraction=0.5,
+        validate=validate,
+        validations=10,
+        patience=5,
+        workers=workers,
+    )
+    losses = [progress.loss for progress in trainer.run()]
+    numbers = {"losses": torch.tensor(losses), "best": torch.tensor(trainer.best)}
+    return {**model.state_dict(), **numbers}
+
+
+if __name__ == "__main__":
+    with join_workers() as workers:
+        torch.save(train(workers), Path(sys.argv[1]) / f"{workers.rank}.pt")

@@ -1,0 +1,96 @@
+"""Processes that train one model together, as `torchrun` starts them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import TypeVar, cast
+
+import torch
+import torch.distributed as dist
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+
+T = TypeVar("T")
+
+# The others wait while the first collects data or evaluates.
+_PATIENCE = timedelta(hours=12)
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The processes that train together, of which this is one; by default it is alone.
+
+    Attributes:
+        rank: which one this is, from 0.
+        size: how many there are.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the one that writes files, shows progress and validates."""
+        return self.rank == 0
+
+    @property
+    def shard(self) -> tuple[int, int]:
+        """Rank and size, as :func:`~torchrl_gn.data.trajectory_buffer` takes them."""
+        return self.rank, self.size
+
+    def agree(self, make: Callable[[], T]) -> T:
+        """What ``make`` gives the first one, for all; the others do not call it."""
+        if self.size == 1:
+            return make()
+        shared = [make() if self.first else None]
+        dist.broadcast_object_list(shared, 0)
+        return cast(T, shared[0])
+
+    def mean(self, number: float) -> float:
+        """Mean of everybody's number; not finite if any is not."""
+        if self.size == 1:
+            return number
+        shared = torch.tensor(number, dtype=torch.float64)
+        dist.all_reduce(shared)
+        return float(shared) / self.size
+
+    def wait(self) -> None:
+        """Go on when all have come this far."""
+        if self.size > 1:
+            dist.barrier()
+
+    @contextmanager
+    def first_goes_first(self) -> Iterator[None]:
+        """The first one runs the block alone, then the others do: it makes what they find."""
+        if not self.first:
+            self.wait()
+        yield
+        if self.first:
+            self.wait()
+
+    def wrap(self, module: nn.Module) -> nn.Module:
+        """The module with gradients averaged over all, its weights and statistics set to the first one's."""
+        if self.size == 1:
+            return module
+        return DistributedDataParallel(module, forward_sync_buffers=False)
+
+
+@contextmanager
+def join_workers() -> Iterator[Workers]:
+    """Join the others that `torchrun` started, if it did; leave them in the end.
+
+    Yields:
+        Who trains together: with ``torchrun --nproc-per-node 2 recipes/forward_model.py`` two, without it one.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield Workers()
+        return
+    dist.init_process_group("gloo", timeout=_PATIENCE)
+    try:
+        yield Workers(dist.get_rank(), dist.get_world_size())
+    finally:
+        dist.destroy_process_group()
