@@ -246,7 +246,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     tracker.log(metrics, trainer.step)
     for name, table in tables.items():
         tracker.log_table(f"errors of {name}", table.rows())
-    tracker.log_files(files)
+    tracker.log_files([*files, run.checkpoint])
     tracker.close()
     print(tables[scenes[0].name] if len(tables) == 1 else summary(tables))
     for path in [*files, run.path / "metrics.json", run.checkpoint]:

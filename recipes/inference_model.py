@@ -235,7 +235,7 @@ def main(cfg: DictConfig) -> None:
     metrics |= {f"read from the inferred graph/{name}": value for name, value in readable.items()}
     metrics |= {"validation_error": trainer.best, "steps": trainer.step, "training_seconds": trainer.seconds}
     tracker.log(run.write_metrics(metrics, seed=cfg.seed), trainer.step)
-    tracker.log_files(files)
+    tracker.log_files([*files, run.checkpoint])
     tracker.close()
     print(summary(tables))
     print("\nShare of each parameter's variance that a linear map reads from the inferred graph:")

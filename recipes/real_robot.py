@@ -171,7 +171,7 @@ def main(cfg: DictConfig) -> None:
         plot_errors(tables, run.path / "errors.png"),
     ]
     tracker.log(run.write_metrics(metrics, seed=cfg.seed), 0)
-    tracker.log_files(pictures)
+    tracker.log_files([*pictures, *files])
     tracker.close()
     print(summary(tables))
     for name, table in tables.items():

@@ -6,6 +6,9 @@ import struct
 import time
 
 import pytest
+import torch
+from PIL import Image
+from safetensors.torch import save_file
 
 from torchrl_gn.training import Tracker, package_versions
 
@@ -32,7 +35,7 @@ def wandb_records(path):
 
 
 def read_wandb(folder):
-    """Configuration, history and media of the finished offline run in a folder."""
+    """Configuration, history, media and names of the artifacts' files of the finished offline run in a folder."""
     from wandb.proto import wandb_internal_pb2
 
     (path,) = folder.glob("wandb/offline-run-*/*.wandb")
@@ -45,7 +48,7 @@ def read_wandb(folder):
         # wandb's own process may still be writing when finish() has returned.
         assert time.monotonic() < deadline, f"{path} has no end: {kinds}"
         time.sleep(0.1)
-    config, history = {}, []
+    config, history, artifacts = {}, [], []
     for kind, record in zip(kinds, records, strict=True):
         if kind in ("run", "config"):
             update = record.run.config.update if kind == "run" else record.config.update
@@ -53,35 +56,46 @@ def read_wandb(folder):
         elif kind == "history":
             items = record.history.item
             history.append({".".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items})
-    return config, history, {file.name.split("_")[0] for file in path.parent.glob("files/media/*/*")}
+        elif kind == "request" and record.request.HasField("log_artifact"):
+            artifacts.append([entry.path for entry in record.request.log_artifact.artifact.manifest.contents])
+        elif kind == "artifact":
+            artifacts.append([entry.path for entry in record.artifact.manifest.contents])
+    return config, history, {file.name.split("_")[0] for file in path.parent.glob("files/media/*/*")}, artifacts
 
 
 @pytest.fixture
 def picture(tmp_path):
-    from PIL import Image
-
     path = tmp_path / "prediction.png"
     Image.new("RGB", (8, 8)).save(path)
     return path
 
 
-def test_offline_wandb_run_holds_everything(tmp_path, monkeypatch, picture):
+@pytest.fixture
+def video(tmp_path):
+    path = tmp_path / "rollout.gif"
+    frames = [Image.new("RGB", (8, 8), color) for color in ("red", "blue")]
+    frames[0].save(path, save_all=True, append_images=frames[1:])
+    return path
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    save_file({"weight": torch.ones(2)}, path)
+    return path
+
+
+def test_offline_wandb_run_holds_everything(tmp_path, monkeypatch, picture, video, checkpoint):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
-    from PIL import Image
-
-    video = tmp_path / "rollout.gif"
-    frames = [Image.new("RGB", (8, 8), color) for color in ("red", "blue")]
-    frames[0].save(video, save_all=True, append_images=frames[1:])
-
     tracker = Tracker("wandb", tmp_path / "log", name="run", config={"seed": 3, "model": {"latent": 128}})
     tracker.log({"train/loss": 0.5, "version/torch": "no number"}, step=1)
     tracker.log({"train/loss": 0.25}, step=2)
     tracker.log_table("errors", [["error", "one step"], ["total", "0.1"]])
-    tracker.log_files([picture, video])
+    tracker.log_files([picture, video, checkpoint])
     tracker.close()
 
-    config, history, media = read_wandb(tmp_path / "log")
+    config, history, media, artifacts = read_wandb(tmp_path / "log")
     assert config["seed"] == 3
     assert config["model"] == {"latent": 128}
     assert config["versions"] == package_versions()
@@ -89,6 +103,7 @@ def test_offline_wandb_run_holds_everything(tmp_path, monkeypatch, picture):
     assert losses == [0.5, 0.25]
     assert not any("version/torch" in row for row in history)
     assert {"errors", "prediction", "rollout"} <= media
+    assert ["checkpoint.safetensors"] in artifacts
 
 
 def test_csv_run_holds_the_numbers(tmp_path):
@@ -101,6 +116,26 @@ def test_csv_run_holds_the_numbers(tmp_path):
         assert [(int(step), float(value)) for step, value in csv.reader(file)] == [(1, 0.5), (2, 0.25)]
 
 
+def test_tensorboard_run_holds_everything(tmp_path, picture, video):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    tracker = Tracker("tensorboard", tmp_path / "log", name="run", config={"seed": 3, "model": {"latent": 128}})
+    for step, value in ((1, 0.5), (2, 0.25)):
+        tracker.log({"train/loss": value, "version/torch": "no number"}, step)
+    tracker.log_table("errors", [["error", "one step"], ["total", 0.1]])
+    tracker.log_files([picture, video])
+    tracker.close()
+
+    events = EventAccumulator(str(tmp_path / "log" / "run")).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("train/loss")] == [(1, 0.5), (2, 0.25)]
+    assert set(events.Tags()["images"]) == {"prediction", "rollout"}
+    assert events.Images("rollout")[0].encoded_image_string == video.read_bytes()
+    texts = {tag: events.Tensors(tag)[0].tensor_proto.string_val[0].decode() for tag in events.Tags()["tensors"]}
+    assert '"latent": 128' in texts["config/text_summary"]
+    assert texts["errors/text_summary"] == "| error | one step |\n| --- | --- |\n| total | 0.1 |"
+
+
 def test_none_writes_nothing(tmp_path, picture):
     tracker = Tracker("none", tmp_path / "log", name="run", config={})
     tracker.log({"loss": 1.0}, 1)
@@ -111,5 +146,5 @@ def test_none_writes_nothing(tmp_path, picture):
 
 
 def test_unknown_logger_is_named(tmp_path):
-    with pytest.raises(ValueError, match="tensorbored.*none.*csv.*wandb"):
+    with pytest.raises(ValueError, match="tensorbored.*none.*csv.*tensorboard.*wandb"):
         Tracker("tensorbored", tmp_path, name="run", config={})

@@ -80,7 +80,7 @@ def report_learning(trainer: OffPolicyTrainer, run: RunFolder, tracker: Tracker,
         "frames_per_second": trainer.frames / max(trainer.seconds, 1e-9),
     }
     run.write_metrics(numbers, seed=seed)
-    tracker.log_files(run.written)
+    tracker.log_files([*run.written, run.checkpoint])
     tracker.close()
     width = max(map(len, numbers))
     for name, value in numbers.items():

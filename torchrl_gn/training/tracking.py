@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,14 +11,14 @@ from typing import Any, Literal, get_args
 
 from torchrl_gn.training.checkpoint import package_versions
 
-LoggerKind = Literal["none", "csv", "wandb"]
+LoggerKind = Literal["none", "csv", "tensorboard", "wandb"]
 
 
 class Tracker:
     """Numbers, figures, videos and configuration of a run, sent to a TorchRL logger.
 
     Args:
-        kind: ``"none"``, ``"csv"`` files or ``"wandb"``. Without an account (no API key and no
+        kind: ``"none"``, ``"csv"`` files, ``"tensorboard"`` or ``"wandb"``. Without an account (no API key and no
             login), wandb runs offline; ``wandb sync`` uploads such a run later.
         folder: where the logger writes.
         name: name of the run.
@@ -25,7 +26,7 @@ class Tracker:
 
     Raises:
         ValueError: if the kind is unknown.
-        ImportError: if wandb is asked for but not installed.
+        ImportError: if wandb or tensorboard is asked for but not installed.
     """
 
     def __init__(self, kind: LoggerKind, folder: Path, *, name: str, config: Mapping[str, Any]) -> None:
@@ -52,6 +53,9 @@ class Tracker:
         self._logger = get_logger(kind, logger_name=str(folder), experiment_name=name, **options)
         if kind == "wandb":
             self._logger.experiment.config.update({"versions": package_versions()})
+        elif kind == "tensorboard":
+            text = json.dumps({**config, "versions": package_versions()}, indent=2)
+            self._logger.experiment.add_text("config", f"```json\n{text}\n```")
         else:
             self._logger.log_hparams({**config, "versions": package_versions()})
 
@@ -63,32 +67,55 @@ class Tracker:
             if isinstance(value, (int, float)):
                 self._logger.log_scalar(name, float(value), step=step)
 
-    def log_files(self, paths: list[Path]) -> None:
-        """Log figures and videos; only wandb takes them, the csv logger's lie in the run folder."""
-        if self.kind != "wandb" or self._logger is None:
+    def log_files(self, paths: Sequence[Path]) -> None:
+        """Log figures, videos and checkpoints, as far as the logger takes them; they lie in the run folder anyway.
+
+        wandb takes all of them, checkpoints as artifacts; tensorboard pictures and GIFs; csv none.
+        """
+        if self._logger is None:
             return
+        for path in paths:
+            if self.kind == "wandb":
+                self._log_to_wandb(path)
+            elif self.kind == "tensorboard" and path.suffix in (".png", ".gif"):
+                from tensorboard.compat.proto import summary_pb2
+
+                # As the file has it: the writer's own way decodes pictures, and needs moviepy for moving ones.
+                made: Any = summary_pb2  # its classes are made at import
+                image = made.Summary.Image(encoded_image_string=path.read_bytes())
+                summary = made.Summary(value=[made.Summary.Value(tag=path.stem, image=image)])
+                self._logger.experiment._get_file_writer().add_summary(summary)
+
+    def _log_to_wandb(self, path: Path) -> None:
         import wandb
 
-        for path in paths:
-            if path.suffix == ".png":
-                self._logger.experiment.log({path.stem: wandb.Image(str(path))})
-            elif path.suffix in (".gif", ".mp4"):
-                video = wandb.Video(str(path), format="gif" if path.suffix == ".gif" else "mp4")
-                self._logger.experiment.log({path.stem: video})
+        run = self._logger.experiment
+        if path.suffix == ".png":
+            run.log({path.stem: wandb.Image(str(path))})
+        elif path.suffix in (".gif", ".mp4"):
+            run.log({path.stem: wandb.Video(str(path), format="gif" if path.suffix == ".gif" else "mp4")})
+        elif path.suffix == ".safetensors":
+            artifact = wandb.Artifact(f"{run.id}-{path.parent.name}", type="model")
+            artifact.add_file(str(path))
+            run.log_artifact(artifact)
 
     def log_table(self, name: str, rows: Sequence[Sequence[Any]]) -> None:
-        """Log a table whose first row holds the titles; only wandb takes it."""
-        if self.kind != "wandb" or self._logger is None:
-            return
-        import wandb
-
+        """Log a table whose first row holds the titles; csv takes none."""
         titles, *data = rows
-        self._logger.experiment.log({name: wandb.Table(columns=list(titles), data=[list(row) for row in data])})
+        if self.kind == "wandb":
+            import wandb
+
+            self._logger.experiment.log({name: wandb.Table(columns=list(titles), data=[list(row) for row in data])})
+        elif self.kind == "tensorboard":
+            lines = [titles, ["---"] * len(titles), *data]
+            self._logger.experiment.add_text(name, "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines))
 
     def close(self) -> None:
         """Finish the run."""
-        if self.kind == "wandb" and self._logger is not None:
+        if self.kind == "wandb":
             self._logger.experiment.finish()
+        elif self.kind == "tensorboard":
+            self._logger.experiment.close()
 
 
 def _has_account() -> bool:
