@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -30,13 +34,16 @@ def make_run(tmp_path):
     return make
 
 
-def test_each_runs_once_and_failures_do_not_stop_the_others(make_run, capsys):
+@pytest.mark.parametrize("jobs", [2, "local"])
+def test_each_runs_once_and_failures_do_not_stop_the_others(make_run, capsys, jobs):
+    if jobs == "local":
+        pytest.importorskip("ray")
     runs = [make_run(value) for value in ("3", "oops", "1", "null", "2", "3")]
-    assert run_all(runs, jobs=2) == [runs[1]]
+    assert run_all(runs, jobs) == [runs[1]]
     assert "failed: value oops; see" in capsys.readouterr().out
     assert "JSONDecodeError" in (runs[1].folder / "log.txt").read_text()
     assert runs[1].metrics is None and runs[2].metrics == {"error": 1}
-    run_all(runs, jobs=2)
+    assert run_all([runs[0], *runs[2:]], jobs) == []
     assert (runs[0].folder / "times").read_text() == "x"
     assert [run.name for run in best(runs, "error", 3)] == ["value 1", "value 2", "value 3"]
     assert best(runs, "error", 9)[-1] == runs[3]  # without a number: it diverged
@@ -45,3 +52,34 @@ def test_each_runs_once_and_failures_do_not_stop_the_others(make_run, capsys):
 def test_folder_names_are_safe():
     assert folder_name("noise 0.3 %, [a,b]") == "noise_0.3_%_a_b"
     assert json.dumps(folder_name("x")) and Path(folder_name("no skip")).name == "no_skip"
+
+
+SLEEPER = """
+import pathlib, signal, sys, time
+def ended(*_):
+    (folder / "ended").touch()
+    sys.exit(143)
+signal.signal(signal.SIGTERM, ended)
+folder = pathlib.Path(sys.argv[1].split("=", 1)[1])
+(folder / "begun").touch()
+time.sleep(300)
+"""
+
+
+@pytest.mark.parametrize("jobs", [2, "local"])
+def test_an_interrupt_ends_the_runs(tmp_path, jobs):
+    if jobs == "local":
+        pytest.importorskip("ray")
+    recipe = tmp_path / "sleeper.py"
+    recipe.write_text(SLEEPER)
+    run = Run(recipe, tmp_path / "run", (), "asleep")
+
+    def interrupt() -> None:
+        while not (run.folder / "begun").exists():
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        run_all([run], jobs)
+    assert (run.folder / "ended").exists()

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.evaluation import plot_bars
+from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.run_folder import RunFolder
 
 
@@ -49,23 +50,26 @@ def folder_name(text: str) -> str:
     return re.sub(r"[^\w.%-]+", "_", text).strip("_")
 
 
-def run_all(runs: Iterable[Run], jobs: int, *, desc: str = "training") -> list[Run]:
-    """Run those that are not done yet, ``jobs`` at a time, with a progress bar.
+def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> list[Run]:
+    """Run those that are not done yet, several at a time, with a progress bar.
 
     Runs that fail are told and the others go on; what they print is in ``log.txt`` of their
     folder. Ctrl-C tells all of them to end, and they save what they have.
 
     Args:
         runs: the runs; equal ones run once.
-        jobs: how many at a time.
+        jobs: how many at a time, or the address of a Ray cluster that takes as many as it has cores (``"local"`` for
+            one of this machine); its machines see the same files.
         desc: what they do.
 
     Returns:
         Those that failed.
     """
-    runs, processes, failed = list(dict.fromkeys(runs)), _Processes(), []
-    with tqdm(total=len(runs), desc=desc, unit="run", leave=False) as bar, ThreadPoolExecutor(jobs) as pool:
-        futures = {pool.submit(processes.run, run): run for run in runs}
+    runs, failed = list(dict.fromkeys(runs)), []
+    pool = _Threads(jobs) if isinstance(jobs, int) else _OnRay(jobs)
+    with tqdm(total=len(runs), desc=desc, unit="run", leave=False) as bar, pool:
+        futures = {pool.submit(run): run for run in runs if run.metrics is None}
+        bar.update(len(runs) - len(futures))
         try:
             for future in as_completed(futures):
                 run = futures[future]
@@ -74,7 +78,7 @@ def run_all(runs: Iterable[Run], jobs: int, *, desc: str = "training") -> list[R
                     tqdm.write(f"failed: {run.name}; see {run.folder / 'log.txt'}")
                 bar.update()
         except KeyboardInterrupt:
-            processes.stop()
+            pool.stop()
             raise
     return failed
 
@@ -113,30 +117,44 @@ def report_sweep(
         raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
 
 
-class _Processes:
-    """Starts processes, and ends them with this one."""
+def _start(run: Run, folder: Path) -> subprocess.Popen:
+    """Start a run's process in a working folder; what it prints goes to its log."""
+    place = folder / run.folder
+    place.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]
+    with (place / "log.txt").open("a") as log:
+        log.write(f"$ {shlex.join(command)}\n")
+        log.flush()
+        # In a session of its own, so that Ctrl-C reaches it once, from here.
+        return subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
 
-    def __init__(self) -> None:
+
+class _Threads:
+    """Processes of this machine, each watched by a thread."""
+
+    def __init__(self, jobs: int) -> None:
+        self.pool = ThreadPoolExecutor(jobs)
         self.running: set[subprocess.Popen] = set()
         self.stopped = False
 
-    def run(self, run: Run) -> int:
-        if run.metrics is not None:
-            return 0
+    def __enter__(self) -> None:
+        self.pool.__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self.pool.__exit__(*error)
+
+    def submit(self, run: Run) -> Future[int]:
+        return self.pool.submit(self._run, run)
+
+    def _run(self, run: Run) -> int:
         if self.stopped:
             return 130
-        run.folder.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]
-        with (run.folder / "log.txt").open("a") as log:
-            log.write(f"$ {shlex.join(command)}\n")
-            log.flush()
-            # In a session of its own, so that Ctrl-C reaches it once, from here.
-            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-            self.running.add(process)
-            try:
-                return process.wait()
-            finally:
-                self.running.discard(process)
+        process = _start(run, Path.cwd())
+        self.running.add(process)
+        try:
+            return process.wait()
+        finally:
+            self.running.discard(process)
 
     def stop(self) -> None:
         self.stopped = True
@@ -144,6 +162,38 @@ class _Processes:
             process.terminate()
         while self.running:
             time.sleep(0.1)
+
+
+class _OnRay:
+    """Processes of the machines of a Ray cluster."""
+
+    def __init__(self, address: str) -> None:
+        self.cluster = RayCluster(address)
+
+    def __enter__(self) -> None:
+        self.cluster.__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self.cluster.__exit__(*error)
+
+    def submit(self, run: Run) -> Future[int]:
+        return self.cluster.submit(_run_and_wait, run, Path.cwd())
+
+    def stop(self) -> None:
+        self.cluster.stop()
+
+
+def _run_and_wait(run: Run, folder: Path) -> int:
+    process = _start(run, folder)
+    try:
+        while True:
+            try:
+                return process.wait(timeout=1)
+            except subprocess.TimeoutExpired:
+                pass  # an interrupt of the cluster comes between waits only
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def best(runs: Sequence[Run], metric: str, count: int = 1) -> list[Run]:
