@@ -60,6 +60,7 @@ MAY_CHANGE = (
     "checkpoint_seconds",
     "patience",
     "zero_shot",
+    "data.ray",
 )
 
 

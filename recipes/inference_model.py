@@ -64,7 +64,18 @@ from torchrl_gn.training.sweep import Run, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 # A run may go on with these changed, and nothing else.
-MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds", "baselines", "test")
+MAY_CHANGE = (
+    "minutes",
+    "steps",
+    "clock",
+    "threads",
+    "logger",
+    "run_dir",
+    "checkpoint_seconds",
+    "baselines",
+    "test",
+    "data.ray",
+)
 
 
 def options(cfg: DictConfig) -> dict[str, Any]:

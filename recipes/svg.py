@@ -13,6 +13,7 @@ recipes/config/svg.yaml.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, cast
 
@@ -28,6 +29,7 @@ from torchrl_gn.rewards import TargetDistance
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training import (
     OffPolicyTrainer,
+    RayCluster,
     RunFolder,
     Tracker,
     clean_exit,
@@ -37,7 +39,15 @@ from torchrl_gn.training import (
     report_learning,
 )
 
-MAY_CHANGE = ("trainer.frames", "threads", "logger", "run_dir", "checkpoint_seconds")  # when a run goes on
+MAY_CHANGE = (
+    "trainer.frames",
+    "threads",
+    "logger",
+    "run_dir",
+    "checkpoint_seconds",
+    "ray",
+    "collectors",
+)  # when a run goes on
 
 
 def options(cfg: DictConfig) -> dict[str, Any]:
@@ -66,6 +76,8 @@ def make_optimizer(cfg: DictConfig, losses: list[LossModule]) -> torch.optim.Opt
 def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
+    if cfg.ray is None and cfg.collectors != 1:
+        raise ValueError(f"collectors={cfg.collectors} needs a Ray cluster; give ray=local, or ray=auto to join one.")
     run = RunFolder(cfg.run_dir, "svg")
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
@@ -83,17 +95,19 @@ def main(cfg: DictConfig) -> None:
     make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)
     judged = make_env(num_envs=cfg.evaluate_episodes)
     losses = make_losses(cfg, agent)
-    trainer = OffPolicyTrainer(
-        agent,
-        losses,
-        make_env(num_envs=cfg.num_envs, seed=cfg.seed),
-        agent.policy,
-        lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
-        make_optimizer(cfg, losses),
-        seed=cfg.seed,
-        **options(cfg.trainer),
-    )
-    learn_with_progress(trainer, run.checkpoint, begun, tracker, config=options(cfg))
+    makers = [partial(make_env, num_envs=cfg.num_envs, seed=cfg.seed + 1000 * index) for index in range(cfg.collectors)]
+    with nullcontext() if cfg.ray is None else RayCluster(cfg.ray):
+        trainer = OffPolicyTrainer(
+            agent,
+            losses,
+            makers[0]() if cfg.ray is None else makers,
+            agent.policy,
+            lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
+            make_optimizer(cfg, losses),
+            seed=cfg.seed,
+            **options(cfg.trainer),
+        )
+        learn_with_progress(trainer, run.checkpoint, begun, tracker, config=options(cfg))
     report_learning(trainer, run, tracker, label=f"SVG({cfg.horizon})", seed=cfg.seed)
 
 

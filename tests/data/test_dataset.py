@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,12 @@ def _equal(first: TensorDictBase, second: TensorDictBase) -> bool:
     return all(torch.equal(first[key], second[key]) for key in first.keys())
 
 
+def _leaves(first: TensorDictBase, second: TensorDictBase):
+    keys = list(first.keys(include_nested=True, leaves_only=True))
+    assert keys == list(second.keys(include_nested=True, leaves_only=True))
+    return [(first[key], second[key]) for key in keys]
+
+
 def _digest(folder: Path) -> dict[str, str]:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
@@ -72,6 +79,22 @@ def test_on_disk_as_in_memory(tmp_path: Path, pendulum: Scene) -> None:
     loaded.train["state"].zero_()
     assert _equal(create_dataset(tmp_path / "d", pendulum, **SIZES).train, made.train)
     assert _digest(tmp_path) == before
+
+
+def test_chunks_made_elsewhere_are_the_same(tmp_path: Path, pendulum: Scene) -> None:
+    def elsewhere(function, items):
+        """As a pool of processes has them: copies, made anew for every piece of work."""
+        for item in items:
+            there, job = pickle.loads(pickle.dumps((function, item)))
+            yield pickle.loads(pickle.dumps(there(job)))
+
+    for name, variants in (("same", None), ("variants", 3)):
+        here = create_dataset(tmp_path / name, pendulum, **SIZES, variants=variants)
+        made = create_dataset(
+            tmp_path / f"{name} elsewhere", pendulum, **SIZES, variants=variants, map_chunks=elsewhere
+        )
+        for split in ("train", "validation", "test"):
+            assert all(torch.equal(a, b) for a, b in _leaves(getattr(here, split), getattr(made, split)))
 
 
 @pytest.mark.parametrize("after", [1, 3, 5])

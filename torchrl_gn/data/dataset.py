@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from operator import index
 from pathlib import Path
@@ -78,6 +79,7 @@ def create_dataset(
     knot_interval: float = 10.0,
     num_threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
+    map_chunks: Callable[[Callable, Iterable], Iterable] = map,
 ) -> TrajectoryDataset:
     """Simulate a data set onto disk, or finish or load the one that is there.
 
@@ -101,6 +103,8 @@ def create_dataset(
         knot_interval: control steps between the knots of the random actions.
         num_threads: threads of the simulation. Default: the cores this process may use.
         progress: called with sequences done and wanted, after every chunk.
+        map_chunks: what does the work on the chunks, like the built-in ``map`` and in its order: ``imap`` of a pool of
+            processes or of a :class:`~torchrl_gn.training.RayCluster`. The data are the same.
 
     Raises:
         ValueError: a size, ``steps`` or ``variants`` is below one, ``seed`` below zero or ``knot_interval`` not
@@ -153,7 +157,7 @@ def create_dataset(
             }
             files.create(manifest)
         if not files.is_complete(manifest):
-            _collect_missing(files, manifest, scene, num_threads, progress)
+            _collect_missing(files, manifest, scene, num_threads, progress, map_chunks)
     return _open(files, manifest, scene)
 
 
@@ -200,6 +204,7 @@ def _collect_missing(
     scene: Scene,
     num_threads: int | None,
     progress: Callable[[int, int], None] | None,
+    map_chunks: Callable[[Callable, Iterable], Iterable],
 ) -> None:
     request, versions = manifest["request"], package_versions()
     if manifest["versions"] != versions:
@@ -207,39 +212,73 @@ def _collect_missing(
             f"{files.manifest_path}: the data set was begun with {manifest['versions']} and would go on "
             f"differently with {versions}. Finish it with those versions, or use another folder."
         )
-    simulator = Simulator(scene, num_threads)
     total = sum(request["sizes"].values())
     done = sum(min(len(manifest["chunks"][split]) * CHUNK, size) for split, size in request["sizes"].items())
+    chunks = list(_missing_chunks(manifest, scene))
+    collector = _ChunkCollector(scene, request["steps"], request["seed"], request["knot_interval"], num_threads)
+    for chunk, (data, rejected) in zip(chunks, map_chunks(collector, chunks), strict=True):
+        arrays = {name: data.get(tuple(name.split("/"))).numpy() for name in manifest["entries"]}
+        files.append(manifest, SPLITS[chunk.key[0]], arrays, rejected)
+        done += chunk.count
+        if progress is not None:
+            progress(done, total)
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Sequences that are made together: seed key, number, and the parameters of each if they are of variants."""
+
+    key: tuple[int, int]
+    count: int
+    parameters: np.ndarray | None
+
+
+def _missing_chunks(manifest: dict, scene: Scene) -> Iterator[_Chunk]:
+    request = manifest["request"]
     for number, (split, size) in enumerate(request["sizes"].items()):
         parameters = None
         if request["variants"] is not None:
             rng = np.random.default_rng(np.random.SeedSequence(request["seed"], spawn_key=(number,)))
             parameters = sample_parameters(_system(scene), min(request["variants"], size), rng)
         for first in range(len(manifest["chunks"][split]) * CHUNK, size, CHUNK):
-            count, own = min(CHUNK, size - first), None
-            variant = np.zeros(count, dtype=np.int64)
-            if parameters is not None:
-                own = parameters[np.arange(first, first + count) % len(parameters)]
-                # Built chunk by chunk: thousands of models at once would take gigabytes.
-                distinct, variant = np.unique(own, axis=0, return_inverse=True)
-                variant = variant.reshape(-1)  # some versions of NumPy keep the axis
-                simulator = Simulator(_variants(scene, distinct), num_threads)
-            chunk, rejected = collect_chunk(
-                simulator,
-                variant,
-                request["steps"],
-                request["seed"],
-                (number, first // CHUNK),
-                knot_interval=request["knot_interval"],
-            )
-            if own is not None:
-                chunk["static"] = static_values(simulator.scenes, variant)
-                chunk["parameters"] = torch.from_numpy(own)
-            arrays = {name: chunk.get(tuple(name.split("/"))).numpy() for name in manifest["entries"]}
-            files.append(manifest, split, arrays, rejected)
-            done += count
-            if progress is not None:
-                progress(done, total)
+            rows = np.arange(first, min(first + CHUNK, size))
+            own = None if parameters is None else parameters[rows % len(parameters)]
+            yield _Chunk((number, first // CHUNK), len(rows), own)
+
+
+@dataclass
+class _ChunkCollector:
+    """Makes chunks, here or in another process."""
+
+    scene: Scene
+    steps: int
+    seed: int
+    knot_interval: float
+    num_threads: int | None
+
+    def __call__(self, chunk: _Chunk) -> tuple[TensorDict, int]:
+        if chunk.parameters is None:
+            simulator, variant = self.simulator, np.zeros(chunk.count, dtype=np.int64)
+        else:
+            # Built chunk by chunk: thousands of models at once would take gigabytes.
+            distinct, variant = np.unique(chunk.parameters, axis=0, return_inverse=True)
+            variant = variant.reshape(-1)  # some versions of NumPy keep the axis
+            simulator = Simulator(_variants(self.scene, distinct), self.num_threads)
+        data, rejected = collect_chunk(
+            simulator, variant, self.steps, self.seed, chunk.key, knot_interval=self.knot_interval
+        )
+        if chunk.parameters is not None:
+            data["static"] = static_values(simulator.scenes, variant)
+            data["parameters"] = torch.from_numpy(chunk.parameters)
+        return data, rejected
+
+    @functools.cached_property
+    def simulator(self) -> Simulator:
+        return Simulator(self.scene, self.num_threads)
+
+    def __getstate__(self) -> dict:
+        """Without the simulator, whose threads stay in their process."""
+        return {name: value for name, value in vars(self).items() if name != "simulator"}
 
 
 def _system(scene: Scene) -> str:

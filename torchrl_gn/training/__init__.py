@@ -13,6 +13,7 @@ from torchrl_gn.training.off_policy import OffPolicyTrainer as OffPolicyTrainer
 from torchrl_gn.training.off_policy import mean_return as mean_return
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer
 from torchrl_gn.training.optimizers import make_optimizer as make_optimizer
+from torchrl_gn.training.ray_cluster import RayCluster as RayCluster
 from torchrl_gn.training.run_folder import RunFolder as RunFolder
 from torchrl_gn.training.tracking import Tracker as Tracker
 from torchrl_gn.training.trainer import Progress as Progress

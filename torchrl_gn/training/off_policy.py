@@ -11,7 +11,7 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -60,7 +60,8 @@ class OffPolicyTrainer:
     Args:
         agent: the networks, whose statistics take every new transition once.
         losses: a loss with target networks first (``DDPGLoss``, :class:`~torchrl_gn.objectives.SVGLoss`), others after.
-        env: environments to learn in, ``[num_envs]``.
+        env: environments to learn in, ``[num_envs]``; or functions that make some, each for a collector of its own on a
+            Ray cluster (join one first: :class:`~torchrl_gn.training.RayCluster`), which has the last update's policy.
         explore: policy to collect with.
         evaluate: mean return of the policy as it is now.
         optimizer: of all weights that the losses train.
@@ -83,7 +84,7 @@ class OffPolicyTrainer:
         self,
         agent: Agent,
         losses: Sequence[LossModule],
-        env: EnvBase,
+        env: EnvBase | Sequence[Callable[[], EnvBase]],
         explore: TensorDictModuleBase,
         evaluate: Callable[[], float],
         optimizer: torch.optim.Optimizer,
@@ -99,7 +100,7 @@ class OffPolicyTrainer:
         max_norm: float = 10.0,
         seed: int = 0,
     ) -> None:
-        if frames_per_batch % env.batch_size.numel() or frames_per_batch < 1:
+        if isinstance(env, EnvBase) and (frames_per_batch % env.batch_size.numel() or frames_per_batch < 1):
             raise ValueError(
                 f"frames_per_batch={frames_per_batch} must be a multiple of {env.batch_size.numel()} environments."
             )
@@ -129,16 +130,7 @@ class OffPolicyTrainer:
             self._evaluate()
         if self.frames >= self.total:
             return
-        collector = Collector(
-            self.env,
-            self.explore,
-            frames_per_batch=self.per_batch,
-            total_frames=self.total - self.frames,
-            init_random_frames=max(0, self.random_frames - self.frames),
-            exploration_type=cast(Any, ExplorationType.RANDOM),
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-        )
+        collector = self._collector()
         start = time.perf_counter()
         for batch in collector:
             self._remember(batch)
@@ -147,6 +139,8 @@ class OffPolicyTrainer:
                 self.owed -= 1
                 for name, value in self._update().items():
                     losses.setdefault(name, []).append(value)
+            if not isinstance(self.env, EnvBase):
+                collector.update_policy_weights_(self.explore)
             now = time.perf_counter()
             self.seconds += now - start
             due = (
@@ -157,7 +151,29 @@ class OffPolicyTrainer:
             means = {name: sum(values) / len(values) for name, values in losses.items()}
             yield LearningProgress(self.frames, self.updates, self.seconds, means, evaluation)
             start = time.perf_counter()
-        collector.shutdown(close_env=False)
+        collector.shutdown(**({"close_env": False} if isinstance(self.env, EnvBase) else {}))
+
+    def _collector(self) -> BaseCollector:
+        common: dict[str, Any] = {
+            "frames_per_batch": self.per_batch,
+            "total_frames": self.total - self.frames,
+            "init_random_frames": max(0, self.random_frames - self.frames),
+            "exploration_type": ExplorationType.RANDOM,
+        }
+        options: dict[str, Any] = {"track_traj_ids": False, "auto_register_policy_transforms": False}
+        if isinstance(self.env, EnvBase):
+            return Collector(self.env, self.explore, **common, **options)
+        resources = {"num_cpus": 1, "num_gpus": 0}
+        collector = Collector(
+            list(self.env),
+            self.explore,
+            backend="ray",
+            sync=True,
+            backend_options={"collector_kwargs": options, "remote_configs": resources},
+            **common,
+        )
+        collector.update_policy_weights_(self.explore)
+        return collector
 
     def _remember(self, batch: TensorDictBase) -> None:
         steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1)

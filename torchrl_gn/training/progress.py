@@ -12,6 +12,7 @@ from tqdm import tqdm
 from torchrl_gn.data import TrajectoryDataset, create_dataset
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
+from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
 
@@ -41,15 +42,20 @@ def dataset_with_progress(
         folder: holds the data sets, each in a folder of its own: ``<name>``, of variants ``<name>_variants``.
         scene: the scene.
         data: configuration of the data: trajectories to ``train``, for ``validation`` and to ``test``, their ``length``
-            in control steps, and their ``seed``.
+            in control steps, and their ``seed``; if it has ``ray``, the address of a Ray cluster to simulate on.
         variants: number of random variants in each split. Default: all trajectories are of the scene itself.
     """
     name = scene.name if variants is None else f"{scene.name}_variants"
     sizes = {split: data[split] for split in ("train", "validation", "test")}
+    options: dict[str, Any] = {"steps": data["length"], "seed": data["seed"], "variants": variants}
+    address = data.get("ray")
     with collecting(f"data of {scene.name}") as show:
-        return create_dataset(
-            folder / name, scene, **sizes, steps=data["length"], seed=data["seed"], variants=variants, progress=show
-        )
+        if address is None:
+            return create_dataset(folder / name, scene, **sizes, **options, progress=show)
+        with RayCluster(address) as cluster:
+            # Every core has a chunk of its own.
+            options |= {"map_chunks": cluster.imap, "num_threads": 1}
+            return create_dataset(folder / name, scene, **sizes, **options, progress=show)
 
 
 def train_with_progress(

@@ -66,7 +66,7 @@ class RayCluster:
 
     def submit(self, function: Callable[..., R], *arguments: Any) -> Future[R]:
         """Begin ``function(*arguments)`` somewhere; once, whatever happens."""
-        started = self._ray.remote(num_cpus=self.cpus, max_retries=0)(function).remote(*arguments)
+        started = self._ray.remote(num_cpus=self.cpus, max_retries=0)(_call).remote(function, *arguments)
         self._started.append(started)
         return started.future()
 
@@ -78,5 +78,6 @@ class RayCluster:
         self._started.clear()
 
 
-def _call(function: Callable[[T], R], item: T) -> R:
-    return function(item)
+def _call(function: Callable[..., R], *arguments: Any) -> R:
+    """Ray takes only what is written as a function or class."""
+    return function(*arguments)
