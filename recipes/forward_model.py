@@ -55,6 +55,7 @@ MAY_CHANGE = (
     "steps",
     "clock",
     "threads",
+    "device",
     "logger",
     "run_dir",
     "checkpoint_seconds",
@@ -147,7 +148,8 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
     losses = []
     for index, task in enumerate(tasks):
         noise = torch.Generator().manual_seed(cfg.seed + 1000 * index + 1_000_000 * workers.rank)
-        losses.append(ForwardModelLoss(task.bind(model), noise=cfg.noise, generator=noise))
+        loss = ForwardModelLoss(task.bind(model), noise=cfg.noise, generator=noise)
+        losses.append(loss.to(next(model.parameters()).device))
     unroll = None
     if cfg.unroll_fraction > 0:
         unroll = make_buffer(tasks, cfg.unroll_batch_size, cfg.unroll_steps, cfg.seed + 1, workers)
@@ -155,7 +157,9 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
     def validate() -> float:
         """Geometric mean over the systems, so that each counts by its own scale."""
         errors = [
-            evaluate_errors(loss.model, task.dataset.validation, horizons=(20,), one_step=False)["rollout_error_20"]
+            evaluate_errors(
+                loss.model, task.dataset.validation, horizons=(20,), one_step=False, device=loss.noise_scale.device
+            )["rollout_error_20"]
             for loss, task in zip(losses, tasks, strict=True)
         ]
         return math.exp(sum(math.log(max(error.total, 1e-300)) for error in errors) / len(errors))
@@ -175,7 +179,8 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
 
 def fit_normalizers(cfg: DictConfig, trainer: Trainer, tasks: list[Task]) -> None:
     """Take samples of every system into the statistics."""
-    samples = [trajectory_buffer(task.train, batch_size=20_000, seed=cfg.seed).sample() for task in tasks]
+    buffers = [trajectory_buffer(task.train, batch_size=20_000, seed=cfg.seed) for task in tasks]
+    samples = [buffer.sample().to(trainer.device) for buffer in buffers]
     if isinstance(trainer.loss, SeveralScenesLoss):
         trainer.loss.fit_normalizers(samples)
     else:
@@ -213,7 +218,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
         run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
-    model = begun.model if begun else make_model(cfg, scenes)
+    model = (begun.model if begun else make_model(cfg, scenes)).to(workers.device(cfg.device))
     if workers.first:
         run.write_config(OmegaConf.to_yaml(cfg))
     names = "-".join(scene.name for scene in scenes)
@@ -229,6 +234,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     if not workers.first:
         return
 
+    model.cpu()  # figures and videos are drawn there
     tables, files = evaluate(cfg, model, tasks, unseen, run.path)
     if curves["seconds"]:
         curve = {"loss": (curves["seconds"], curves["loss"])}

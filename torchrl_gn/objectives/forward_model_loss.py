@@ -151,7 +151,8 @@ class ForwardModelLoss(LossModule):
     def load_training_state(self, state: dict) -> None:
         """Go on from what :meth:`training_state` gave."""
         self.noise_scale.copy_(state["noise_scale"])
-        self.error_weight = state["error_weight"]
+        weight = state["error_weight"]
+        self.error_weight = None if weight is None else weight.to(self.noise_scale.device)
         if self.generator is not None and state["generator"] is not None:
             self.generator.set_state(state["generator"])
 

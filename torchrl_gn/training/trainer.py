@@ -84,6 +84,7 @@ class Trainer:
         self.validate, self.validations, self.patience = validate, validations, patience
         self.workers = workers or Workers()
         self.model = loss.trained
+        self.device = next(self.model.parameters()).device
         self.step, self.seconds = 0, 0.0
         self.best, self.since_best, self.validated = math.inf, 0, 0
         self.best_weights: dict[str, torch.Tensor] = {}
@@ -119,7 +120,7 @@ class Trainer:
         buffer = self.buffer
         if self.unroll is not None and fraction >= 1 - self.unroll_fraction:
             buffer = self.unroll
-        batch = buffer.sample()
+        batch = buffer.sample().to(self.device)
         clock = self._lap("sampling", clock)
         loss = module(batch)["loss_forward_model"]
         # Of all workers, so that all stop when one has to.

@@ -58,6 +58,24 @@ class Workers:
         dist.all_reduce(shared)
         return float(shared) / self.size
 
+    def device(self, name: str) -> torch.device:
+        """Where this one computes: of several on one machine, each on a GPU of its own.
+
+        Raises:
+            ValueError: if there is no such device.
+        """
+        try:
+            device = torch.device(name)
+        except RuntimeError as error:
+            raise ValueError(f"device={name} is not known; use cpu or cuda.") from error
+        if device.type == "cuda":
+            if not torch.cuda.is_available():
+                raise ValueError(f"device={name} needs a GPU and a torch built for it; use device=cpu.")
+            local = int(os.environ.get("LOCAL_RANK", "0")) if device.index is None else device.index
+            device = torch.device("cuda", local)
+            torch.cuda.set_device(device)
+        return device
+
     def wait(self) -> None:
         """Go on when all have come this far."""
         if self.size > 1:
@@ -89,7 +107,7 @@ def join_workers() -> Iterator[Workers]:
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Workers()
         return
-    dist.init_process_group("gloo", timeout=_PATIENCE)
+    dist.init_process_group(timeout=_PATIENCE)  # gloo, and NCCL for what is on GPUs
     try:
         yield Workers(dist.get_rank(), dist.get_world_size())
     finally:
