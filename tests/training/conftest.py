@@ -52,13 +52,14 @@ def make_trainer(scene, trajectories, make_model) -> Callable[..., Trainer]:
         preset="muon",
         noise: float = 0.01,
         unroll=0.0,
+        device="cpu",
         **options,
     ) -> Trainer:
         fresh = model is None
-        model = make_model() if model is None else model
-        loss = ForwardModelLoss(model.bind(scene), noise=noise, generator=torch.Generator().manual_seed(0))
+        model = (make_model() if model is None else model).to(device)
+        loss = ForwardModelLoss(model.bind(scene), noise=noise, generator=torch.Generator().manual_seed(0)).to(device)
         if fresh:
-            loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=500, seed=1).sample())
+            loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=500, seed=1).sample().to(device))
         if unroll:
             options |= {"unroll": trajectory_buffer(trajectories, batch_size=8, window=3, seed=2)}
             options |= {"unroll_fraction": unroll}

@@ -32,6 +32,20 @@ def test_the_loss_falls(make_trainer, preset):
     assert sum(losses[-20:]) < (0.3 if preset == "muon" else 0.7) * sum(losses[:20])
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_trains_the_same_and_its_checkpoint_goes_on_anywhere(make_trainer, tmp_path):
+    losses = {}
+    for device in ("cpu", "cuda"):
+        trainer = make_trainer(Budget(steps=10), preset="adam", unroll=0.5, device=device)
+        losses[device] = [progress.loss for progress in trainer.run()]
+    torch.testing.assert_close(losses["cuda"], losses["cpu"], rtol=1e-3, atol=0)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", trainer.model, training=trainer.state_dict())
+    saved = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    again = make_trainer(Budget(steps=12), saved.model, preset="adam", unroll=0.5)
+    again.load_state_dict(saved.training)
+    assert len(list(again.run())) == 2
+
+
 def test_progress_counts_steps_seconds_and_the_budget(make_trainer):
     progress = list(make_trainer(Budget(steps=8)).run())
     assert [p.step for p in progress] == list(range(1, 9))
