@@ -133,7 +133,7 @@ def step_once(model: BoundForwardModel, state: Tensor, action: Tensor) -> Tensor
 def pull(model: BoundForwardModel, state: Tensor, actions: Tensor) -> Tensor:
     """Gradient of a rollout to its actions."""
     leaf = actions.clone().requires_grad_()
-    model.rollout(state, leaf)[..., :3].square().sum().backward()
+    model.rollout(state, leaf)[..., 7:].square().sum().backward()
     assert leaf.grad is not None
     return leaf.grad
 
