@@ -1,0 +1,105 @@
+"""How much faster several processes train a forward model than one.
+
+    python recipes/benchmark_scaling.py [processes=[1,2]] [batches=[200,2000]] [key=value ...]
+
+Times training steps of one process, of two and so on, in turn, for every batch size; the batch is split among them
+(torchrun, DistributedDataParallel). Prints milliseconds a step and the speed-up, and of one process what the parts of a
+step take: what is split, what every process repeats (the optimiser), and so what more processes can gain.
+What came out: docs/scaling.md. Writes config.yaml and metrics.json to its run folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.modules import FeatureSet, ForwardModel
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import RunFolder, Trainer, Workers, clean_exit, join_workers, make_optimizer
+from torchrl_gn.training.budget import Budget
+
+PART = "TORCHRL_GN_BENCHMARK"  # set in the processes that are timed: where they leave their times
+
+
+def measure(cfg: DictConfig, batch: int, workers: Workers) -> dict[str, float]:
+    """Median milliseconds of a step and its parts."""
+    torch.manual_seed(cfg.seed)
+    torch.set_num_threads(cfg.threads)
+    scene = load_scene(cfg.system)
+    trajectories = collect_trajectories(scene, cfg.trajectories, seed=cfg.seed)
+    model = ForwardModel(FeatureSet.of(scene), activation="silu")
+    loss = ForwardModelLoss(model.bind(scene))
+    loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=2000, seed=cfg.seed).sample())
+    buffer = trajectory_buffer(trajectories, batch_size=batch, seed=cfg.seed, shard=workers.shard)
+    optimizer = make_optimizer(model.core, cfg.optimizer)
+    trainer = Trainer(loss, buffer, optimizer, Budget(steps=cfg.steps + cfg.warm_up), workers=workers)
+    seconds: list[float] = []
+    before: dict[str, float] = {}
+    for progress in trainer.run():
+        if progress.step == cfg.warm_up:
+            before = dict(trainer.spent)
+        seconds.append(progress.seconds)
+    steps = [after - start for start, after in zip(seconds[cfg.warm_up :], seconds[cfg.warm_up + 1 :], strict=False)]
+    parts = {part: 1e3 * (spent - before[part]) / cfg.steps for part, spent in trainer.spent.items()}
+    return {"step": 1e3 * median(steps), **{part: parts[part] for part in ("sampling", "model", "optimizer")}}
+
+
+def start(cfg: DictConfig, batch: int, processes: int) -> dict[str, float]:
+    """The same, of several processes started by torchrun."""
+    with TemporaryDirectory() as folder:
+        place = Path(folder) / "times.json"
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
+        options = [f"{name}={cfg[name]}" for name in ("system", "steps", "warm_up", "trajectories", "threads", "seed")]
+        options += [f"batches=[{batch}]", f"optimizer={cfg.optimizer}"]
+        environment = os.environ | {PART: str(place), "OMP_NUM_THREADS": str(cfg.threads)}
+        done = subprocess.run([*command, __file__, *options], env=environment, capture_output=True, text=True)
+        if done.returncode:
+            raise ValueError(f"{processes} processes failed:\n{done.stderr}")
+        return json.loads(place.read_text())
+
+
+@hydra.main(version_base=None, config_path="config", config_name="benchmark_scaling")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    if PART in os.environ:
+        with join_workers() as workers:
+            times = measure(cfg, cfg.batches[0], workers)
+            if workers.first:
+                Path(os.environ[PART]).write_text(json.dumps(times))
+        return
+    run = RunFolder(cfg.run_dir, "benchmark_scaling")
+    run.write_config(OmegaConf.to_yaml(cfg))
+    every = [(batch, processes) for batch in cfg.batches for processes in cfg.processes] * cfg.repeats
+    found: dict[tuple[int, int], list[dict[str, float]]] = {}
+    for batch, processes in tqdm(every, desc="measuring", leave=False):
+        found.setdefault((batch, processes), []).append(start(cfg, batch, processes))
+    metrics: dict[str, float] = {}
+    print(
+        f"{'batch':>8}{'processes':>11}{'ms a step':>11}{'speed-up':>10}{'sampling':>10}{'model':>10}{'optimizer':>11}"
+    )
+    for (batch, processes), times in found.items():
+        middle = {part: median(each[part] for each in times) for part in times[0]}
+        speedup = median(each["step"] for each in found[batch, cfg.processes[0]]) / middle["step"]
+        metrics |= {f"batch {batch}/{processes} processes/{part}": value for part, value in middle.items()}
+        metrics[f"batch {batch}/{processes} processes/speedup"] = speedup
+        parts = f"{middle['sampling']:>10.1f}{middle['model']:>10.1f}{middle['optimizer']:>11.1f}"
+        print(f"{batch:>8}{processes:>11}{middle['step']:>11.1f}{speedup:>9.2f}x{parts}")
+    run.write_metrics(metrics, seed=cfg.seed)
+    for path in run.written:
+        print(path)
+
+
+if __name__ == "__main__":
+    main()
