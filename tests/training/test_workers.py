@@ -47,3 +47,12 @@ def test_a_process_alone_needs_no_others():
         assert workers.wrap(module) is module
         with workers.first_goes_first():
             workers.wait()
+
+
+def test_a_device_that_is_not_there_is_named():
+    assert Workers().device("cpu") == torch.device("cpu")
+    with pytest.raises(ValueError, match="device=gpu is not known; use cpu or cuda"):
+        Workers().device("gpu")
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="device=cuda needs a GPU and a torch built for it; use device=cpu"):
+            Workers().device("cuda")
