@@ -7,7 +7,8 @@ Plays episodes in MuJoCo, all from the same start states for every planner: gn p
 model (paper, SM "MPC planner with learned models"), cem and mppi are TorchRL's own planners on that model, ilqg (paper,
 SM "Baseline Mujoco-based planner"), cem_true and mppi_true plan on MuJoCo itself, random plays random controls. A
 checkpoint of an inference model first identifies the system from random controls; `variants=true` plays a random
-variant of the system in every episode, with a checkpoint that was trained on such. Finished episodes are kept: the same
+variant of the system in every episode, with a checkpoint that was trained on such (one of pendulums that identifies
+comes with the package). Finished episodes are kept: the same
 `run_dir` goes on, with more steps or planners too.
 
 Leaves config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
@@ -153,10 +154,13 @@ def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
 
 def load_model(cfg: DictConfig, scene: Scene):
     """The trained model, bound to the scene, and the inference model if it has one."""
-    fitting = (cfg.system, re.sub(r"^swimmer\d+$", "swimmerN", cfg.system))
+    fitting = [cfg.system, re.sub(r"^swimmer\d+$", "swimmerN", cfg.system)]
+    if cfg.variants:
+        fitting = [f"identified_{cfg.system}"]
     names = [name for name in fitting if name in pretrained_names()]
     if cfg.checkpoint is None and not names:
-        raise ValueError(f"No trained model of {cfg.system!r} comes with the package; give checkpoint=PATH.")
+        what = f"variants of {cfg.system!r}" if cfg.variants else repr(cfg.system)
+        raise ValueError(f"No trained model of {what} comes with the package; give checkpoint=PATH.")
     checkpoint = load_pretrained(names[0]) if cfg.checkpoint is None else load_checkpoint(cfg.checkpoint)
     if isinstance(checkpoint.trained, IdentifyingModel):
         bound, inference = checkpoint.trained.bind(scene)
