@@ -74,12 +74,18 @@ def test_an_interrupt_ends_the_runs(tmp_path, jobs):
     recipe.write_text(SLEEPER)
     run = Run(recipe, tmp_path / "run", (), "asleep")
 
+    # Where pytest runs in the background, as in CI, its shell may have had it ignore Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
     def interrupt() -> None:
         while not (run.folder / "begun").exists():
             time.sleep(0.1)
         os.kill(os.getpid(), signal.SIGINT)
 
     Thread(target=interrupt, daemon=True).start()
-    with pytest.raises(KeyboardInterrupt):
-        run_all([run], jobs)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_all([run], jobs)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert (run.folder / "ended").exists()
