@@ -49,7 +49,7 @@ def _run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
 
 
 @pytest.fixture
-def call(capfd) -> Callable[..., tuple[int, str, str]]:
+def call(capfd, monkeypatch) -> Callable[..., tuple[int, str, str]]:
     """As ``run``, in this process and without Hydra's command line: for runs shorter than the recipe's imports."""
     hydra = pytest.importorskip("hydra")
 
@@ -57,6 +57,7 @@ def call(capfd) -> Callable[..., tuple[int, str, str]]:
         spec = importlib.util.spec_from_file_location(f"recipe_{recipe}", ROOT / "recipes" / f"{recipe}.py")
         assert spec is not None and spec.loader is not None
         module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, spec.name, module)  # where dataclasses look for it
         spec.loader.exec_module(module)
         with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
             config = hydra.compose(recipe, overrides=list(options))

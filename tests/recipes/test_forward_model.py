@@ -46,22 +46,22 @@ def test_an_interrupted_run_goes_on_to_its_end(interrupted, run):
     assert list(interrupted.glob("log/wandb/offline-run-*/files/media/images/prediction*.png"))
 
 
-def test_bad_options_end_in_one_line_and_touch_nothing(interrupted, run):
+def test_bad_options_end_in_one_line_and_touch_nothing(interrupted, call):
     before = {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()}
     for options, message in (
         (("noise=0.5", "minutes=9"), "other options: noise=0.5"),
         (("minutes=null",), "either steps or minutes"),
     ):
-        code, _, errors = run(*SMALL, *options, f"run_dir={interrupted}")
+        code, _, errors = call(*SMALL, *options, f"run_dir={interrupted}", recipe="forward_model")
         assert code == 1
         assert message in errors
         assert "Traceback" not in errors
     assert {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()} == before
 
 
-def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_path, run):
+def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_path, call):
     options = (*SMALL, "parametrized=true", "minutes=null", "steps=5", f"run_dir={tmp_path}")
-    code, output, errors = run(*options)
+    code, output, errors = call(*options, recipe="forward_model")
     assert code == 0, errors
     assert "warning" not in errors.lower() and "standard pendulum" in output
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -70,9 +70,10 @@ def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_pa
     assert request["variants"] == 20 and list(request["parameters"]) == ["length", "mass"]
 
 
-def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path, run):
+def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path, call):
     small = (*SMALL[1:], "system=[swimmer3,pendulum]", "zero_shot=[swimmer4]", "minutes=null")
-    code, output, errors = run(*small, "steps=5", "parametrized=true", f"run_dir={tmp_path}")
+    options = (*small, "steps=5", "parametrized=true", f"run_dir={tmp_path}")
+    code, output, errors = call(*options, recipe="forward_model")
     assert code == 0, errors
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     systems = ["swimmer3", "pendulum", "standard swimmer3", "standard pendulum", "swimmer4 (zero-shot)"]
@@ -84,22 +85,22 @@ def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path, r
     assert [scene.name for scene in saved.scenes()] == ["swimmer3", "pendulum"]
 
 
-def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path, run):
+def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path, run, call):
     options = (f"checkpoint={interrupted}", "sequences=5", f"run_dir={tmp_path}")
     code, output, errors = run(*options, "system=cartpole", recipe="evaluate")
     assert code == 0, errors
     assert "UnseenFeatureWarning" in errors  # what training never saw is named
     assert "one_step_error" in json.loads((tmp_path / "metrics.json").read_text())
-    code, _, errors = run(*options, "system=cartpole", "strict=true", recipe="evaluate")
+    code, _, errors = call(*options, "system=cartpole", "strict=true", recipe="evaluate")
     assert code == 1
     assert "never saw" in errors
 
 
-def test_comparing_goes_on_past_a_failed_run_and_keeps_finished_ones(tmp_path, run):
+def test_comparing_goes_on_past_a_failed_run_and_keeps_finished_ones(tmp_path, call):
     small = ["data.train=20", "data.validation=5", "data.test=5"]
     options = ["systems=[pendulum]", "minutes=0.01", f"run_dir={tmp_path}", f"overrides={small}"]
     bad = "+variants.bad=['model.latent=zero']"
-    code, output, errors = run(*options, bad, "only=[default,bad]", recipe="compare")
+    code, output, errors = call(*options, bad, "only=[default,bad]", recipe="compare")
     assert code == 1 and "1 runs failed" in errors
     rows = {line.split("|")[1].strip(): line for line in output.splitlines() if line.startswith("|")}
     assert rows["bad"].endswith("| - |") and "| 1.00 |" in output
@@ -108,10 +109,10 @@ def test_comparing_goes_on_past_a_failed_run_and_keeps_finished_ones(tmp_path, r
 
     finished = tmp_path / "pendulum" / "default" / "seed0" / "metrics.json"
     before = finished.stat().st_mtime_ns
-    code, output, errors = run(*options, "only=[default]", recipe="compare")
+    code, output, errors = call(*options, "only=[default]", recipe="compare")
     assert code == 0, errors
     assert finished.stat().st_mtime_ns == before
     assert (tmp_path / "table.md").read_text().splitlines()[-1] in output
 
-    code, _, errors = run(*options, "only=[defualt]", recipe="compare")
+    code, _, errors = call(*options, "only=[defualt]", recipe="compare")
     assert code == 1 and "['defualt'] are not known; use some of ['default'" in errors

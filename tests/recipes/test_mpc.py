@@ -32,10 +32,10 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run):
     assert code == 1 and "other options: horizon=5 (was 4)" in errors and "Traceback" not in errors
 
 
-def test_bad_options_are_named(tmp_path, run):
+def test_bad_options_are_named(tmp_path, call):
     for option, message in (
         ("planner=gradient", "There is no planner 'gradient'"),
         ("system=two_poles", "'two_poles' is no system of the paper: say which reward it gets"),
     ):
-        code, _, errors = run(*SMALL[:1], option, f"run_dir={tmp_path / option.split(chr(61))[0]}", recipe="mpc")
+        code, _, errors = call(*SMALL[:1], option, f"run_dir={tmp_path / option.split(chr(61))[0]}", recipe="mpc")
         assert code == 1 and message in errors and "Traceback" not in errors, errors
