@@ -74,7 +74,8 @@ class RayCluster:
         """Interrupt what was submitted, as Ctrl-C would, and wait until it has ended."""
         for started in self._started:
             self._ray.cancel(started)
-        self._ray.wait(self._started, num_returns=len(self._started)) if self._started else None
+        if self._started:
+            self._ray.wait(self._started, num_returns=len(self._started))
         self._started.clear()
 
 

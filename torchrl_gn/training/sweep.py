@@ -68,7 +68,7 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
     runs, failed = list(dict.fromkeys(runs)), []
     pool = _Threads(jobs) if isinstance(jobs, int) else _OnRay(jobs)
     with tqdm(total=len(runs), desc=desc, unit="run", leave=False) as bar, pool:
-        futures = {pool.submit(run): run for run in runs if run.metrics is None}
+        futures = {pool.start(run): run for run in runs if run.metrics is None}
         bar.update(len(runs) - len(futures))
         try:
             for future in as_completed(futures):
@@ -129,22 +129,16 @@ def _start(run: Run, folder: Path) -> subprocess.Popen:
         return subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
 
 
-class _Threads:
+class _Threads(ThreadPoolExecutor):
     """Processes of this machine, each watched by a thread."""
 
     def __init__(self, jobs: int) -> None:
-        self.pool = ThreadPoolExecutor(jobs)
+        super().__init__(jobs)
         self.running: set[subprocess.Popen] = set()
         self.stopped = False
 
-    def __enter__(self) -> None:
-        self.pool.__enter__()
-
-    def __exit__(self, *error: Any) -> None:
-        self.pool.__exit__(*error)
-
-    def submit(self, run: Run) -> Future[int]:
-        return self.pool.submit(self._run, run)
+    def start(self, run: Run) -> Future[int]:
+        return self.submit(self._run, run)
 
     def _run(self, run: Run) -> int:
         if self.stopped:
@@ -164,23 +158,11 @@ class _Threads:
             time.sleep(0.1)
 
 
-class _OnRay:
+class _OnRay(RayCluster):
     """Processes of the machines of a Ray cluster."""
 
-    def __init__(self, address: str) -> None:
-        self.cluster = RayCluster(address)
-
-    def __enter__(self) -> None:
-        self.cluster.__enter__()
-
-    def __exit__(self, *error: Any) -> None:
-        self.cluster.__exit__(*error)
-
-    def submit(self, run: Run) -> Future[int]:
-        return self.cluster.submit(_run_and_wait, run, Path.cwd())
-
-    def stop(self) -> None:
-        self.cluster.stop()
+    def start(self, run: Run) -> Future[int]:
+        return self.submit(_run_and_wait, run, Path.cwd())
 
 
 def _run_and_wait(run: Run, folder: Path) -> int:
