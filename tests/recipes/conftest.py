@@ -14,6 +14,17 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 
+SHORT_LEARNING = (
+    "num_envs=2",
+    "evaluate_episodes=1",
+    "task.steps=20",
+    "trainer.frames_per_batch=20",
+    "trainer.random_frames=40",
+    "trainer.evaluate_frames=40",
+    "trainer.batch_size=16",
+)
+"""Options of the recipes that learn policies, with which they take seconds."""
+
 
 @pytest.fixture(scope="session")
 def start() -> Callable[..., subprocess.Popen]:

@@ -9,15 +9,11 @@ from tensordict import TensorDict
 
 from torchrl_gn.training import load_checkpoint
 
+from .conftest import SHORT_LEARNING
+
 SMALL = (
     "task.name=swimmer3",
-    "num_envs=2",
-    "evaluate_episodes=1",
-    "task.steps=20",
-    "trainer.frames_per_batch=20",
-    "trainer.random_frames=40",
-    "trainer.evaluate_frames=40",
-    "trainer.batch_size=16",
+    *SHORT_LEARNING,
     "hidden=[8]",
 )
 

@@ -10,14 +10,10 @@ import torch
 
 from torchrl_gn.training import load_checkpoint
 
+from .conftest import SHORT_LEARNING
+
 SMALL = (
-    "num_envs=2",
-    "evaluate_episodes=1",
-    "task.steps=20",
-    "trainer.frames_per_batch=20",
-    "trainer.random_frames=40",
-    "trainer.evaluate_frames=40",
-    "trainer.batch_size=16",
+    *SHORT_LEARNING,
     "agent.hidden=[8]",
     "agent.model_options={latent:4,hidden:[8],mlp_hidden:[8]}",
     "agent.policy_options={latent:4,hidden:[8]}",
