@@ -1,11 +1,11 @@
 """Stress-test the numerics of a trained forward model, in float32, float64 and bfloat16.
 
-    python recipes/stability.py checkpoint=runs/forward_model/... [steps=10000]
+    python recipes/stability.py checkpoint=swimmer6 [steps=10000]
     python recipes/stability.py system=swimmer6 minutes=2
 
-Without a checkpoint a model is trained first. Every check gives one figure for each dtype of the network (states are
-float64) and has a limit that it can fail; the recipe ends with exit code 1 if one does (limits=false: with 0).
-Takes about three minutes; results: docs/performance.md.
+`checkpoint` is a run's folder or a model that comes with the package; without one a model is trained first. Every
+check gives one figure for each dtype of the network (states are float64) and has a limit that it can fail; the recipe
+ends with exit code 1 if one does (limits=false: with 0). Takes about three minutes; results: docs/performance.md.
 
 Writes config.yaml, metrics.json and, if it trains one, the model to its run folder.
 """
@@ -19,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import cast
 
 import hydra
 import numpy as np
@@ -41,20 +42,13 @@ from torchrl_gn.modules import (
     specialize,
 )
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.pretrained import load_pretrained, pretrained_names
+from torchrl_gn.scenes import Scene, has_variants, load_scene, make_variants, parameter_ranges
 from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
 
 RECIPES = Path(__file__).parent
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
 
-# Factors on each body's own, and angles in radians (paper, SM "Description of the simulated environments").
-RANGES = {
-    "pendulum": {"length": (0.2, 1.0), "mass": (0.5, 3.0)},
-    "cartpole": {"length": (0.3, 1.0), "mass": (0.2, 2.0), "thickness": (0.4, 2.2)},
-    "swimmer": {"length": (0.3, 2.0), "thickness": (0.5, 5.0)},  # of any other scene too
-    "cheetah": {"length": (0.5, 2.0), "thickness": (0.5, 2.0), "angle": (-0.1, 0.1)},
-    "jaco": {"mass": (0.5, 1.5), "gear": (0.5, 1.5)},
-}
 # One body with a motor, without, and afloat in the wind: there is no smaller scene, as something must move.
 BOB = '<body><joint name="j" axis="0 1 0"/><geom size=".1" pos="0 0 -.3"/></body>'
 BOX = '<body><freejoint/><geom type="box" size=".1 .2 .3" fluidshape="ellipsoid"/></body>'
@@ -175,33 +169,14 @@ def saturated(factor: float) -> Callable[[Setting], float]:
 
 
 @cache
-def body_corners(s: Setting) -> tuple[float, float]:
-    """Largest change, and error against float64, with every body at a random corner of the paper's ranges."""
-    scene, names, count, nodes = s.scene, s.exact.model.features, len(s.state), s.scene.num_nodes
-    ranges = RANGES.get(scene.name.rstrip("0123456789"), RANGES["swimmer"])
-    models = s.bind(s.model.model, scene, static_key="static"), s.exact.model.bind(scene, static_key="static")
-    static, generator = models[1].static_of(scene).expand(count).clone(), torch.Generator().manual_seed(0)
-
-    def draw(what: str, size: int, usual: float = 1.0) -> Tensor:
-        low, high = ranges.get(what, (usual, usual))
-        return low + (high - low) * torch.randint(2, (count, size, 1), generator=generator).double()
-
-    def columns(part: str, feature: str) -> list[int]:
-        return [index for index, name in enumerate(getattr(names, part)) if name.split("[")[0] == feature]
-
-    length, thickness = draw("length", nodes), draw("thickness", nodes)
-    above = length[:, np.maximum(scene.parent, 0)]  # a body begins where its parent ends
-    mass = draw("mass", nodes) * length * thickness**2  # equal density
-    inertia, gear = mass * torch.maximum(length, thickness) ** 2, draw("gear", scene.num_edges // 2)
-    for feature, factor in (("pos", above), ("ipos", length), ("mass", mass), ("inertia", inertia)):
-        static["nodes"][..., columns("nodes", feature)] *= factor
-    static["edges"][..., columns("edges", "actuator_gear")] *= gear.repeat_interleave(2, 1)
-    for part, factor in (("parent_arm", above), ("arm", length), ("contact_radius", thickness)):
-        static[part] = static[part] * factor
-    static["contact_offset"] = static["contact_offset"] * length.unsqueeze(-1)
-    if quat := columns("nodes", "quat"):
-        turn = quaternion.exp(draw("angle", nodes, 0.0) * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
-        static["nodes"][..., quat] = quaternion.product(static["nodes"][..., quat], turn)
+def variants_at_corners(s: Setting) -> tuple[float, float]:
+    """Largest change, and error against float64, of variants that are at the ends of the paper's random ranges."""
+    system = s.scene.origin["system"]
+    ends = np.array([(one.low, one.high) for one in parameter_ranges(system).values()])
+    chosen = np.random.default_rng(s.cfg.seed).integers(2, size=(len(s.state), len(ends)))
+    variants = make_variants(system, ends[np.arange(len(ends)), chosen], timestep=s.scene.timestep)
+    models = s.bind(s.model.model, s.scene, static_key="static"), s.exact.model.bind(s.scene, static_key="static")
+    static = cast(TensorDictBase, torch.stack([models[1].static_of(variant) for variant in variants]))
     delta, exact = (model.delta(s.state, s.action, model.fold(static)) for model in models)
     return s.size(delta), s.error(delta, exact)
 
@@ -337,8 +312,8 @@ def many_samples(s: Setting) -> float:
     return s.error(total.std, values.std(correction=0))
 
 
-def all_checks(steps: int) -> list[Check]:
-    """The suite."""
+def all_checks(scene: Scene, steps: int) -> list[Check]:
+    """The suite; of a scene that has no random variants, without those."""
 
     def same(limit: float) -> dict[str, float]:
         return dict.fromkeys(DTYPES, limit)
@@ -346,6 +321,10 @@ def all_checks(steps: int) -> list[Check]:
     def graded(*limits: float) -> dict[str, float]:
         return dict(zip(DTYPES, limits, strict=False))
 
+    variants = (
+        Check("variants at corners: change over largest", lambda s: variants_at_corners(s)[0], same(1e5)),
+        Check("variants at corners against float64", lambda s: variants_at_corners(s)[1], graded(1e-4, 1e-12, 1.0)),
+    )
     return [
         Check(f"{steps:,} steps: quaternions off unit length", lambda s: long_rollout(s)[0], same(1e-6)),
         Check(f"{steps:,} steps: kinetic energy over MuJoCo's", lambda s: long_rollout(s)[1], same(2.0)),
@@ -358,8 +337,7 @@ def all_checks(steps: int) -> list[Check]:
         Check("speeds and actions times 1e6: largest change", wild_inputs, same(1e12)),
         Check("actions at their limits: change over largest", saturated(1), same(10)),
         Check("actions at 1000 limits: change over largest", saturated(1e3), same(1e4)),
-        Check("bodies at corners: change over largest", lambda s: body_corners(s)[0], same(1e5)),
-        Check("bodies at corners against float64", lambda s: body_corners(s)[1], graded(1e-4, 1e-12, 1.0)),
+        *(variants if has_variants(scene) else ()),
         Check("one body, no actions, no globals: error", small_scenes, graded(1e-5, 1e-12, 5e-2)),
         Check("unstable model: share of steps predicted", unstable_model, same(0.1)),
         Check("gradient through 200 steps against float64", long_gradient, graded(1e-2, 1e-9)),
@@ -372,9 +350,9 @@ def all_checks(steps: int) -> list[Check]:
     ]
 
 
-def settings(cfg: DictConfig, checkpoint: Path) -> dict[str, Setting]:
+def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
     """The model in every dtype, and states to try."""
-    loaded = load_checkpoint(checkpoint)
+    loaded = load_pretrained(str(checkpoint)) if checkpoint in pretrained_names() else load_checkpoint(checkpoint)
     scene = loaded.scene()
     rng = np.random.default_rng(cfg.seed)
     physics = torch.as_tensor(sample_start_states(scene, 64, rng))
@@ -396,7 +374,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     run = RunFolder(cfg.run_dir, "stability")
     run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    checkpoint = Path(cfg.checkpoint) if cfg.checkpoint else run.path / "model"
+    checkpoint = cfg.checkpoint or run.path / "model"
     if not cfg.checkpoint:
         options = [f"system={cfg.system}", f"minutes={cfg.minutes}", f"run_dir={checkpoint}"]
         subprocess.run([sys.executable, RECIPES / "forward_model.py", *options], check=True, stdout=subprocess.DEVNULL)
@@ -404,7 +382,7 @@ def main(cfg: DictConfig) -> None:
 
     metrics: dict[str, float | int] = {}
     failed, lines = [], []
-    for check in tqdm(all_checks(cfg.steps), desc="checks", leave=False):
+    for check in tqdm(all_checks(prepared["float64"].scene, cfg.steps), desc="checks", leave=False):
         cells = ""
         for name, setting in prepared.items():
             if name not in check.limits:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -41,8 +42,13 @@ class CompiledStep:
         """Next state, differentiable once in state and action."""
         if torch.is_grad_enabled() and (state.requires_grad or action.requires_grad):
             return _Differentiable.apply(self, state, action)
+        return self._run(self._step, state, action)
+
+    @staticmethod
+    def _run(function: Callable, *inputs: Tensor) -> Any:
+        # torch.compile compiles anew for inputs with other strides, or of which a gradient is wanted.
         with torch.no_grad():
-            return self._step(state, action)
+            return function(*(tensor.detach().contiguous() for tensor in inputs))
 
 
 class _Differentiable(torch.autograd.Function):
@@ -50,25 +56,35 @@ class _Differentiable(torch.autograd.Function):
     def forward(ctx, compiled: CompiledStep, state: Tensor, action: Tensor) -> Tensor:
         ctx.compiled, ctx.stamp = compiled, compiled.stamp()
         ctx.save_for_backward(state, action)
-        return compiled._step(state.detach(), action.detach())
+        return compiled._run(compiled._step, state, action)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         if ctx.stamp != ctx.compiled.stamp():
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
-        return None, *ctx.compiled._pull(*ctx.saved_tensors, gradient.contiguous())
+        return None, *ctx.compiled._run(ctx.compiled._pull, *ctx.saved_tensors, gradient)
 
 
 def _compile(function: Callable) -> Callable:
     # Small linear systems are solved through Python's fallback; the user need not know.
     logging.getLogger("torch._inductor.ir").addFilter(_is_news)
     options: dict[str, Any] = {"fullgraph": True, "dynamic": False, "recompile_limit": 1000, "isolate_recompiles": True}
+    options["options"] = {"guard_filter_fn": partial(_guards_of_inputs, inspect.signature(function).parameters)}
     if not torch.cuda.is_available():
         # The kernels of a small graph take less time than calling them from Python.
-        options["options"] = {"cpp_wrapper": True}
+        options["options"]["cpp_wrapper"] = True
     known = inspect.signature(torch.compile).parameters  # two of them are newer than torch 2.11
     return torch.compile(function, **{name: value for name, value in options.items() if name in known})
+
+
+def _guards_of_inputs(inputs: Collection[str], guards: Sequence[Any]) -> list[bool]:
+    """Which of what was true when compiling is checked at each call: shapes, dtypes and devices of the inputs.
+
+    All else that the function reads belongs to one model and one snapshot; to look through it takes longer than a
+    step of a small graph.
+    """
+    return [guard.guard_type == "TENSOR_MATCH" and guard.name in inputs for guard in guards]
 
 
 def _is_news(record: logging.LogRecord) -> bool:
