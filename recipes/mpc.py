@@ -120,8 +120,10 @@ class Episodes:
             return
         now = {f"now.{key}": value for key, value in self.now.flatten_keys(".").items()}
         values = {name: self[name] for name in self.records}
+        # Copies: a target is also the task, and safetensors refuses what shares memory.
+        apart = {key: value.clone(memory_format=torch.contiguous_format) for key, value in (now | values).items()}
         with atomic_path(self.path) as temporary:
-            save_file({key: value.contiguous() for key, value in (now | values).items()}, temporary)
+            save_file(apart, temporary)
 
 
 def options(cfg: DictConfig) -> dict[str, Any]:

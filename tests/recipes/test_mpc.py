@@ -32,6 +32,15 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run):
     assert code == 1 and "other options: horizon=5 (was 4)" in errors and "Traceback" not in errors
 
 
+def test_targets_that_are_poses(tmp_path, call):
+    options = ("system=jaco", "planner=nothing", "episodes=2", "video=false", f"run_dir={tmp_path}")
+    for steps in (1, 2):  # the second goes on from what the first saved
+        code, _, errors = call(*options, f"steps={steps}", recipe="mpc")
+        assert code == 0, errors
+        kept = load_file(tmp_path / "nothing.safetensors")
+        assert kept["now.target"].shape == (2, 10, 13) and kept["state"].shape[1] == steps + 1
+
+
 def test_bad_options_are_named(tmp_path, call):
     for option, message in (
         ("planner=gradient", "There is no planner 'gradient'"),
