@@ -3,7 +3,6 @@
 from torchrl_gn.modules.ablated_core import AblatedCore as AblatedCore
 from torchrl_gn.modules.agent import Agent as Agent
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel as BoundForwardModel
-from torchrl_gn.modules.bound_forward_model import UnseenFeatureWarning as UnseenFeatureWarning
 from torchrl_gn.modules.bound_recurrent_model import BoundRecurrentModel as BoundRecurrentModel
 from torchrl_gn.modules.core import GNCore as GNCore
 from torchrl_gn.modules.export import export_step as export_step
@@ -32,3 +31,4 @@ from torchrl_gn.modules.state_layout import Component as Component
 from torchrl_gn.modules.state_layout import StateLayout as StateLayout
 from torchrl_gn.modules.state_layout import joint_layout as joint_layout
 from torchrl_gn.modules.swimmer_observation import SwimmerObservation as SwimmerObservation
+from torchrl_gn.modules.unseen_features import UnseenFeatureWarning as UnseenFeatureWarning

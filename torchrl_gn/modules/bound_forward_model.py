@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.joint_linking import make_linking
 from torchrl_gn.modules.local_frame import LocalFrame, Seen
+from torchrl_gn.modules.unseen_features import check_seen
 from torchrl_gn.scenes.scene_values import SceneValues, topology
 
 if TYPE_CHECKING:
@@ -25,10 +25,6 @@ if TYPE_CHECKING:
     from torchrl_gn.modules.forward_model import ForwardModel
     from torchrl_gn.modules.mlp_core import FoldedMLP
     from torchrl_gn.scenes import Scene
-
-
-class UnseenFeatureWarning(UserWarning):
-    """A scene has a static value that the model never saw vary in training."""
 
 
 class Folded(NamedTuple):
@@ -115,7 +111,7 @@ class BoundForwardModel(TensorDictModuleBase):
         self.linking = make_linking(scene) if model.link and pinned and not hidden else None
         for name, value in model.values_of(scene)._asdict().items():
             self._register(f"static_{name}", value)
-        self._check_unseen(strict)
+        check_seen(self, strict)
 
     def _register(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
@@ -172,39 +168,6 @@ class BoundForwardModel(TensorDictModuleBase):
             if buffer is not None and applied is not None and applied.dtype != buffer.dtype:
                 self._buffers[name] = buffer.to(applied.device)
         return self
-
-    def _check_unseen(self, strict: bool) -> None:
-        unseen = []
-        for part, normalizer in self._static_normalizers() if self.model.static == "scene" else ():
-            values = getattr(self, f"static_{part}")
-            if values.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
-                continue
-            seen = normalizer.mean
-            # 1e-6: the same model compiled on another machine may differ in the last digits.
-            differs = ((values - seen).abs() > 1e-6 * seen.abs().clamp(min=1e-12)).reshape(-1, values.shape[-1]).any(0)
-            for index in (normalizer.constant & differs).nonzero().flatten().tolist():
-                unseen.append(getattr(self.model.features, part)[index])
-        residual = self.model.residual_normalizer
-        if bool((residual.count > 0).any()):
-            dead = (self.live & residual.constant).any(0).nonzero().flatten().tolist()
-            unseen += [f"state change {index}" for index in dead]
-        if not unseen:
-            return
-        message = (
-            f"Scene {self.scene.name!r} has values that the model never saw, in features that never varied in its"
-            f" training: {', '.join(unseen)}. They are ignored and predictions may be wrong."
-        )
-        if strict:
-            raise ValueError(message)
-        warnings.warn(message, UnseenFeatureWarning, stacklevel=4)
-
-    def _static_normalizers(self):
-        model = self.model
-        return (
-            ("nodes", model.static_node_normalizer),
-            ("edges", model.static_edge_normalizer),
-            ("globals_", model.static_global_normalizer),
-        )
 
     @property
     def network_dtype(self) -> torch.dtype:
@@ -380,9 +343,9 @@ class BoundForwardModel(TensorDictModuleBase):
         if self.model.static == "inferred":  # comes from a network already
             nodes, edges, globals_ = (part.to(dtype) for part in values[:3])
         else:
-            normalizers = self._static_normalizers()
+            normalizers = self.model.static_normalizers.values()
             nodes, edges, globals_ = (
-                normalizer(part, dtype) for part, (_, normalizer) in zip(values[:3], normalizers, strict=True)
+                normalizer(part, dtype) for part, normalizer in zip(values[:3], normalizers, strict=True)
             )
         return Graph(nodes, edges, globals_, self.edge_index)
 
@@ -412,8 +375,8 @@ class BoundForwardModel(TensorDictModuleBase):
         if static is not None:
             require_finite(static, "static")
         values = self._read(static)
-        for part, (_, normalizer) in zip(values, self._static_normalizers(), strict=False):
-            normalizer.update(part)
+        for part, normalizer in self.model.static_normalizers.items():
+            normalizer.update(getattr(values, part))
 
     def update_dynamic_normalizers(
         self, state: Tensor, action: Tensor, next_state: Tensor, static: TensorDictBase | None = None

@@ -226,6 +226,15 @@ class ForwardModel(nn.Module):
             ablation = "none" if core == "gn" else core
             self.core = AblatedCore(in_size, out, ablation=ablation, skip=skip, **sizes)
 
+    @property
+    def static_normalizers(self) -> dict[str, Normalizer]:
+        """Normalisers of static features, by the part of the graph that has them."""
+        return {
+            "nodes": self.static_node_normalizer,
+            "edges": self.static_edge_normalizer,
+            "globals_": self.static_global_normalizer,
+        }
+
     def values_of(self, scene: Scene) -> SceneValues:
         """What the model reads of a scene; zeros where it reads an inferred graph.
 

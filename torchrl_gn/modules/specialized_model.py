@@ -12,13 +12,14 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.modules.ablated_core import AblatedCore
-from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded, UnseenFeatureWarning
+from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded
 from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
 from torchrl_gn.modules.folded_core import FoldedCore, copy_into, snapshot
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.local_frame import Seen
 from torchrl_gn.modules.mlp_core import FoldedMLP
 from torchrl_gn.modules.recurrent_core import RecurrentCore
+from torchrl_gn.modules.unseen_features import UnseenFeatureWarning
 from torchrl_gn.scenes.scene_values import SceneValues
 
 

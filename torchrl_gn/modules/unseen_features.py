@@ -1,0 +1,43 @@
+"""Warn of scenes with values that a forward model never saw in its training."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torchrl_gn.modules.bound_forward_model import BoundForwardModel
+
+
+class UnseenFeatureWarning(UserWarning):
+    """A scene has a static value that the model never saw vary in training."""
+
+
+def check_seen(bound: BoundForwardModel, strict: bool) -> None:
+    """Warn, or raise if ``strict``, where a scene differs in what was the same in all of a model's training.
+
+    Raises:
+        ValueError: if it does and ``strict``; the message names the features.
+    """
+    model, unseen = bound.model, []
+    for part, normalizer in model.static_normalizers.items() if model.static == "scene" else ():
+        values, seen = getattr(bound.values, part), normalizer.mean
+        if values.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
+            continue
+        # 1e-6: the same model compiled on another machine may differ in the last digits.
+        differs = ((values - seen).abs() > 1e-6 * seen.abs().clamp(min=1e-12)).reshape(-1, values.shape[-1]).any(0)
+        for index in (normalizer.constant & differs).nonzero().flatten().tolist():
+            unseen.append(getattr(model.features, part)[index])
+    residual = model.residual_normalizer
+    if bool((residual.count > 0).any()):
+        dead = (bound.live & residual.constant).any(0).nonzero().flatten().tolist()
+        unseen += [f"state change {index}" for index in dead]
+    if not unseen:
+        return
+    message = (
+        f"Scene {bound.scene.name!r} has values that the model never saw, in features that never varied in its"
+        f" training: {', '.join(unseen)}. They are ignored and predictions may be wrong."
+    )
+    if strict:
+        raise ValueError(message)
+    warnings.warn(message, UnseenFeatureWarning, stacklevel=4)
