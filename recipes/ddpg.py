@@ -71,7 +71,7 @@ def main(cfg: DictConfig) -> None:
         env,
         TensorDictSequential([agent.policy, noise]),
         lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
-        torch.optim.Adam(loss.parameters(), lr=cfg.lr),
+        torch.optim.Adam(loss.parameters(), lr=cfg.lr, fused=True),
         seed=cfg.seed,
         **options(cfg.trainer),
     )

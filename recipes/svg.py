@@ -68,7 +68,7 @@ def make_optimizer(cfg: DictConfig, losses: list[LossModule]) -> torch.optim.Opt
     """One for all, the model with a rate of its own."""
     groups = [{"params": list(losses[0].parameters()), "lr": cfg.lr}]
     groups += [{"params": list(loss.parameters()), "lr": cfg.model_lr} for loss in losses[1:]]
-    return torch.optim.Adam(groups)
+    return torch.optim.Adam(groups, fused=True)
 
 
 @hydra.main(version_base=None, config_path="config", config_name="svg")

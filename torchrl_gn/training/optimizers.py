@@ -99,16 +99,16 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
         raise ValueError(f"lr={lr} must be positive and finite.")
     parameters = [parameter for parameter in module.parameters() if parameter.requires_grad and parameter.numel()]
     if preset == "paper":
-        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-4)], _paper_decay)
+        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-4, fused=True)], _paper_decay)
     if preset == "adam":
-        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-3)], _cosine)
+        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-3, fused=True)], _cosine)
     matrices = [parameter for parameter in parameters if parameter.ndim == 2]
     rest = [parameter for parameter in parameters if parameter.ndim != 2]
     optimizers: list[torch.optim.Optimizer] = []
     if matrices:
         optimizers.append(torch.optim.Muon(matrices, lr=lr or 1e-2, weight_decay=0.0))
     if rest:
-        optimizers.append(torch.optim.Adam(rest, lr=1e-3))
+        optimizers.append(torch.optim.Adam(rest, lr=1e-3, fused=True))
     return ScheduledOptimizer(optimizers, _cosine)
 
 
