@@ -2,9 +2,9 @@
 
     python recipes/benchmark_svg.py [repeats=30] [batch_size=256] [horizons=[0,1,3]]
 
-Times, in turn and several times, one update (losses of policy, value and model, gradients, optimiser) of SVG(N) with a
-graph network that is evaluated by message passing (plain), folded (what recipes/svg.py uses), and with an MLP in its
-place, beside a step of the environments. Results: docs/performance.md.
+Times, in turn and several times, one update (sampling, losses of policy, value and model, gradients, optimiser) of
+SVG(N) with a graph network that is evaluated by message passing (plain), folded (what recipes/svg.py uses), and with an
+MLP in its place, beside a step of the environments. Results: docs/performance.md.
 
 Writes config.yaml, metrics.json and the table as table.md to its run folder.
 """
@@ -19,7 +19,8 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
-from torchrl.objectives import HardUpdate, ValueEstimators
+from torchrl.envs import EnvBase
+from torchrl.objectives import ValueEstimators
 from tqdm import tqdm
 
 from torchrl_gn.atomic import atomic_path
@@ -28,37 +29,23 @@ from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
 from torchrl_gn.rewards import TargetDistance
 from torchrl_gn.scenes import ObservationGraph
-from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training import OffPolicyTrainer, RunFolder, clean_exit
 
 
-def make_update(cfg: DictConfig, graph: ObservationGraph, batch: TensorDictBase, horizon: int, way: str) -> Callable:
+def make_update(cfg: DictConfig, graph: ObservationGraph, env: EnvBase, data: TensorDictBase, horizon: int, way: str):
     """One update of an agent whose model is ``plain``, ``folded`` or an ``mlp``."""
     kind = None if horizon == 0 else ("mlp" if way == "mlp" else "gn")
     agent = Agent(graph, hidden=cfg.hidden, model=kind, model_options={**cfg.model_options, "plain": way == "plain"})
-    agent.update_normalizers(*(batch[key] for key in ("observation", "action", ("next", "observation"))))
-    loss = SVGLoss(
-        agent.policy,
-        agent.value,
-        agent.model,
-        TargetDistance(graph) if horizon else None,
-        steps=horizon,
-        delay_actor=True,
-    )
+    reward = TargetDistance(graph) if horizon else None
+    loss = SVGLoss(agent.policy, agent.value, agent.model, reward, steps=horizon, delay_actor=True)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.99)
-    targets = HardUpdate(loss)
     losses = [loss] if agent.model is None else [loss, ObservationModelLoss(agent.model)]
     optimizer = torch.optim.Adam([weight for each in losses for weight in each.parameters()], lr=1e-4, fused=True)
-
-    def update() -> None:
-        found = [each(batch) for each in losses]
-        values = [value for out in found for name, value in out.items() if str(name).startswith("loss_")]
-        total = torch.stack(values).sum()
-        optimizer.zero_grad()
-        total.backward()
-        optimizer.step()
-        targets.step()
-
-    return update
+    trainer = OffPolicyTrainer(
+        agent, losses, env, agent.policy, lambda: 0.0, optimizer, frames=data.numel(), batch_size=cfg.batch_size
+    )
+    trainer.remember(data)
+    return trainer.update
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="benchmark_svg")
@@ -70,13 +57,12 @@ def main(cfg: DictConfig) -> None:
     run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
     graph = ObservationGraph.of_task("swimmer", cfg.task)
     env = observation_env(graph, "swimmer", cfg.task, num_envs=cfg.num_envs, timestep=0.02, seed=cfg.seed)
-    steps = -(-cfg.batch_size // cfg.num_envs)
-    batch = env.rollout(steps, break_when_any_done=False).reshape(-1)[: cfg.batch_size]
+    data = env.rollout(-(-4 * cfg.batch_size // cfg.num_envs), break_when_any_done=False)
     policy, start = Agent(graph, hidden=cfg.hidden).policy, env.reset()
     ways: dict[str, Callable] = {f"{cfg.num_envs} environment steps": lambda: env.step(policy(start.copy()))}
     for horizon in cfg.horizons:
         for way in ("plain", "folded", "mlp") if horizon else ("no model",):
-            ways[f"SVG({horizon}), {way}"] = make_update(cfg, graph, batch, horizon, way)
+            ways[f"SVG({horizon}), {way}"] = make_update(cfg, graph, env, data, horizon, way)
 
     seconds = {name: [] for name in ways}
     for turn in tqdm(range(cfg.repeats + 3), desc="measuring", leave=False):

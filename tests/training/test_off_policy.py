@@ -58,7 +58,7 @@ def test_targets_are_copied_after_their_interval(make_learner):
     loss = trainer.losses[0]
     first = loss.target_value_network_params.clone()
     for updates in range(1, 11):
-        trainer._update()
+        trainer.update()
         copied = (loss.target_value_network_params == loss.value_network_params).all()
         assert bool(copied) == (updates in (5, 10))  # HardUpdate's interval of 4 are 4 updates in between
         assert bool((loss.target_value_network_params == first).all()) == (updates < 5)
@@ -104,9 +104,9 @@ def test_the_next_update_after_a_stop_is_the_one_that_would_have_been(make_learn
     again = make_learner(seed=1, frames=400)
     again.load_state_dict(state)
     torch.set_rng_state(state["generators"]["global"])
-    expected = [trainer._update() for _ in range(3)]
+    expected = [trainer.update() for _ in range(3)]
     torch.set_rng_state(state["generators"]["global"])
-    assert [again._update() for _ in range(3)] == expected
+    assert [again.update() for _ in range(3)] == expected
     assert same(trainer.agent.state_dict(), again.agent.state_dict())
 
 
@@ -147,7 +147,7 @@ def test_what_is_not_finite_stops_before_any_weight_is_touched(make_learner, bro
         object.__setattr__(trainer.losses[0], "reward", lambda x, u, after: (after * 0).sqrt())
         message = "The gradient is not finite at update 10"
     with pytest.raises(FloatingPointError, match=message):
-        trainer._update()
+        trainer.update()
     assert all(torch.equal(weight, before[name]) for name, weight in trainer.agent.named_parameters())
     after = [moment["exp_avg"] for moment in trainer.optimizer.state.values()]
     assert all(map(torch.equal, moments, after)) and trainer.updates == 10

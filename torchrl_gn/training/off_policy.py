@@ -133,11 +133,11 @@ class OffPolicyTrainer:
         collector = self._collector()
         start = time.perf_counter()
         for batch in collector:
-            self._remember(batch)
+            self.remember(batch)
             losses: dict[str, list[float]] = {}
             while self.owed >= 1:
                 self.owed -= 1
-                for name, value in self._update().items():
+                for name, value in self.update().items():
                     losses.setdefault(name, []).append(value)
             if not isinstance(self.env, EnvBase):
                 collector.update_policy_weights_(self.explore)
@@ -175,7 +175,12 @@ class OffPolicyTrainer:
         collector.update_policy_weights_(self.explore)
         return collector
 
-    def _remember(self, batch: TensorDictBase) -> None:
+    def remember(self, batch: TensorDictBase) -> None:
+        """Take new transitions ``[*B]`` into the replay buffer and the agent's statistics.
+
+        Raises:
+            ValueError: if a number is not finite.
+        """
         steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1)
         self.agent.update_normalizers(steps["observation"], steps["action"], steps["next", "observation"])
         self.buffer.extend(steps)
@@ -183,7 +188,12 @@ class OffPolicyTrainer:
         if self.frames > self.random_frames:
             self.owed += self.updates_per_frame * len(steps)
 
-    def _update(self) -> dict[str, float]:
+    def update(self) -> dict[str, float]:
+        """One gradient step on transitions from the replay buffer; the losses of it.
+
+        Raises:
+            FloatingPointError: if a loss or a gradient is not finite; no weight is changed.
+        """
         batch = self.buffer.sample()
         values: dict[str, float] = {}
         total = torch.zeros(())
