@@ -210,7 +210,7 @@ def specialize(
         dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster
             where the processor multiplies it; states keep their dtype.
         compile: compile ``step`` and ``rollout`` with ``torch.compile``, at their first call with
-            every new shape: seconds to a minute then, and much faster steps of small batches.
+            every new shape: half a minute then, minutes for a gradient, and much faster steps of small batches.
 
     Returns:
         A module with the same keys that shares the weights and folds them again when they change.
