@@ -32,7 +32,9 @@ from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training import OffPolicyTrainer, RunFolder, clean_exit
 
 
-def make_update(cfg: DictConfig, graph: ObservationGraph, env: EnvBase, data: TensorDictBase, horizon: int, way: str):
+def make_update(
+    cfg: DictConfig, graph: ObservationGraph, env: EnvBase, data: TensorDictBase, horizon: int, way: str
+) -> Callable[[], dict[str, float]]:
     """One update of an agent whose model is ``plain``, ``folded`` or an ``mlp``."""
     kind = None if horizon == 0 else ("mlp" if way == "mlp" else "gn")
     agent = Agent(graph, hidden=cfg.hidden, model=kind, model_options={**cfg.model_options, "plain": way == "plain"})

@@ -169,14 +169,20 @@ def saturated(factor: float) -> Callable[[Setting], float]:
 
 
 @cache
-def variants_at_corners(s: Setting) -> tuple[float, float]:
-    """Largest change, and error against float64, of variants that are at the ends of the paper's random ranges."""
-    system = s.scene.origin["system"]
+def corners(exact: BoundForwardModel, count: int, seed: int) -> TensorDictBase:
+    """Static values of variants whose parameters are each at an end of the paper's random range."""
+    system = exact.scene.origin["system"]
     ends = np.array([(one.low, one.high) for one in parameter_ranges(system).values()])
-    chosen = np.random.default_rng(s.cfg.seed).integers(2, size=(len(s.state), len(ends)))
-    variants = make_variants(system, ends[np.arange(len(ends)), chosen], timestep=s.scene.timestep)
+    chosen = np.random.default_rng(seed).integers(2, size=(count, len(ends)))
+    variants = make_variants(system, ends[np.arange(len(ends)), chosen], timestep=exact.scene.timestep)
+    return cast(TensorDictBase, torch.stack([exact.static_of(variant) for variant in variants]))
+
+
+@cache
+def variants_at_corners(s: Setting) -> tuple[float, float]:
+    """Largest change, and error against float64, of variants at the ends of the paper's random ranges."""
+    static = corners(s.exact, len(s.state), s.cfg.seed)
     models = s.bind(s.model.model, s.scene, static_key="static"), s.exact.model.bind(s.scene, static_key="static")
-    static = cast(TensorDictBase, torch.stack([models[1].static_of(variant) for variant in variants]))
     delta, exact = (model.delta(s.state, s.action, model.fold(static)) for model in models)
     return s.size(delta), s.error(delta, exact)
 

@@ -343,10 +343,8 @@ class BoundForwardModel(TensorDictModuleBase):
         if self.model.static == "inferred":  # comes from a network already
             nodes, edges, globals_ = (part.to(dtype) for part in values[:3])
         else:
-            normalizers = self.model.static_normalizers.values()
-            nodes, edges, globals_ = (
-                normalizer(part, dtype) for part, normalizer in zip(values[:3], normalizers, strict=True)
-            )
+            normalizers = self.model.static_normalizers.items()
+            nodes, edges, globals_ = (normalizer(getattr(values, part), dtype) for part, normalizer in normalizers)
         return Graph(nodes, edges, globals_, self.edge_index)
 
     def _check_shapes(self, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> None:

@@ -69,14 +69,12 @@ class _Differentiable(torch.autograd.Function):
 def _compile(function: Callable) -> Callable:
     # Small linear systems are solved through Python's fallback; the user need not know.
     logging.getLogger("torch._inductor.ir").addFilter(_is_news)
-    options: dict[str, Any] = {"fullgraph": True, "dynamic": False, "recompile_limit": 1000, "isolate_recompiles": True}
-    more: dict[str, Any] = {"guard_filter_fn": partial(_guards_of_inputs, inspect.signature(function).parameters)}
+    options: dict[str, Any] = {"guard_filter_fn": partial(_guards_of_inputs, inspect.signature(function).parameters)}
     if not torch.cuda.is_available():
         # The kernels of a small graph take less time than calling them from Python.
-        more["cpp_wrapper"] = True
-    options["options"] = more
-    known = inspect.signature(torch.compile).parameters  # two of them are newer than torch 2.11
-    return torch.compile(function, **{name: value for name, value in options.items() if name in known})
+        options["cpp_wrapper"] = True
+    limits: dict[str, Any] = {"recompile_limit": 1000, "isolate_recompiles": True}  # type checkers know no overload
+    return torch.compile(function, fullgraph=True, dynamic=False, options=options, **limits)
 
 
 def _guards_of_inputs(inputs: Collection[str], guards: Sequence[Any]) -> list[bool]:
