@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchrl_gn.modules import GNCore, Graph, GraphSize, folded_core, graph_concat
+from torchrl_gn.modules import GNCore, Graph, GraphSize, Incidence, folded_core, graph_concat
 from torchrl_gn.modules.folded_core import fold_core
 
 PARTS = ("nodes", "edges", "globals_")
@@ -51,7 +51,8 @@ def outputs_and_gradients(function, core: GNCore, dynamic: Graph, cotangent: Ten
 
 def folded(core: GNCore, dynamic: Graph, static: Graph, predicted: Tensor) -> Tensor:
     size = GraphSize(*(part.shape[-1] for part in (dynamic.nodes, dynamic.edges, dynamic.globals_)))
-    return fold_core(core, size, predicted, static).predict(dynamic)
+    incidence = Incidence(static.edge_index, static.nodes.shape[-2], predicted)
+    return fold_core(core, size, incidence, static).predict(dynamic)
 
 
 def compare(core: GNCore, dynamic: Graph, static: Graph, predicted: Tensor, tolerance: float, dtype=torch.float64):
@@ -181,7 +182,7 @@ def test_forward_models_compute_their_core(scenes, make_model, random_states, ra
         bound.dynamic_graph(random_states(scene, 5, seed=3), random_actions(scene, 5, seed=3)),
         bound.static_graph(),
     )
-    compare(model.core, dynamic, static, bound.predicted_nodes, 1e-10)
+    compare(model.core, dynamic, static, bound.incidence.predicted, 1e-10)
 
 
 @pytest.mark.parametrize("batch", [1, 5, 7])
@@ -189,7 +190,7 @@ def test_large_batches_in_parts_are_the_whole(random_graph, monkeypatch, batch):
     size, edge_index = GraphSize(3, 2, 1), torch.tensor([[0, 1, 2], [1, 2, 0]])
     core = make_core(size + GraphSize(2, 0, 0), 4, 5, depth=2)
     dynamic, static = random_graph(size, edge_index, 3, batch), random_graph(GraphSize(2, 0, 0), edge_index, 3)
-    ready = fold_core(core, size, torch.tensor([1, 2]), static)
+    ready = fold_core(core, size, Incidence(edge_index, 3, torch.tensor([1, 2])), static)
     whole = ready.predict(dynamic)  # with gradients: in one
     monkeypatch.setattr(folded_core, "_CACHED", 2 * 3 * 7)  # two samples of three edges with seven activations
     with torch.no_grad():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_gn.modules import FeatureSet, ForwardModel, GraphSize, MLPCore, graph_concat
+from torchrl_gn.modules import FeatureSet, ForwardModel, GraphSize, Incidence, MLPCore, graph_concat
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 
@@ -30,9 +30,9 @@ def test_folding_keeps_outputs_and_gradients(random_graph, globals_):
     edge_index = torch.tensor([[0, 1, 2, 0], [1, 2, 0, 0]])
     core = MLPCore(dynamic_size + static_size, 5, items=(3, 4), hidden=(7, 6)).double()
     dynamic, static = random_graph(dynamic_size, edge_index, 3, 2), random_graph(static_size, edge_index, 3, seed=1)
-    predicted = torch.tensor([2, 1])
+    incidence = Incidence(edge_index, 3, torch.tensor([2, 1]))
     plain = core(graph_concat(dynamic, static)).nodes
-    folded = core.fold(dynamic_size, predicted, static).predict(dynamic)
+    folded = core.fold(dynamic_size, incidence, static).predict(dynamic)
     assert (folded[:, 0] == 0).all()
     torch.testing.assert_close(folded[:, 1:], plain[:, 1:])
     gradients = [torch.autograd.grad(out[:, 1:].square().sum(), list(core.parameters())) for out in (plain, folded)]

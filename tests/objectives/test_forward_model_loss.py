@@ -210,7 +210,7 @@ def test_noise_has_the_size_of_each_channels_spread(make_loss, windows):
     assert (mean[live].abs() < 5 * expected[live] / 20000**0.5).all()
     # Radians for orientations; each state channel's own spread for the rest.
     assert torch.equal(loss.noise_scale[3:6], torch.ones(3).double())
-    moving = loss.model.frame.recentered(windows["swimmer6"]["state"])[..., loss.model.predicted_nodes, :]
+    moving = loss.model.frame.recentered(windows["swimmer6"]["state"])[..., loss.model.incidence.predicted, :]
     position = moving[..., :3].flatten(0, -2)
     torch.testing.assert_close(loss.noise_scale[:3], position.std(0, correction=0), rtol=1e-10, atol=1e-9)
 

@@ -14,6 +14,7 @@ from torchrl_gn.modules.graph import GraphSize as GraphSize
 from torchrl_gn.modules.graph import graph_concat as graph_concat
 from torchrl_gn.modules.graph import graph_split as graph_split
 from torchrl_gn.modules.graph_policy import GraphPolicy as GraphPolicy
+from torchrl_gn.modules.incidence import Incidence as Incidence
 from torchrl_gn.modules.inference_model import BoundInferenceModel as BoundInferenceModel
 from torchrl_gn.modules.inference_model import IdentifyingModel as IdentifyingModel
 from torchrl_gn.modules.inference_model import InferenceModel as InferenceModel

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torchrl_gn.modules.gn_block import GNBlock
 from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
+from torchrl_gn.modules.incidence import Incidence
 from torchrl_gn.modules.linear import ACTIVATIONS
 
 Ablation = Literal["none", "interaction_network", "no_edge_update", "no_node_update", "no_global_update"]
@@ -70,7 +71,7 @@ class AblatedCore(nn.Module):
         between = self.first(graph)
         return self.last(graph_concat(graph, between) if self.skip else between)
 
-    def fold(self, size: GraphSize, predicted: Tensor, static: Graph) -> UnfoldedCore:
+    def fold(self, size: GraphSize, incidence: Incidence, static: Graph) -> UnfoldedCore:
         """The core with its static graph; nothing is folded."""
         return UnfoldedCore(self, static)
 

@@ -9,11 +9,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import quaternion
 from torchrl_gn.modules.graph import Graph, graph_concat
+from torchrl_gn.modules.incidence import Incidence
 from torchrl_gn.modules.joint_linking import make_linking
 from torchrl_gn.modules.local_frame import LocalFrame, Seen
 from torchrl_gn.modules.unseen_features import check_seen
@@ -70,9 +71,7 @@ class BoundForwardModel(TensorDictModuleBase):
     """
 
     model: ForwardModel
-    edge_index: Tensor
     live: Tensor
-    predicted_nodes: Tensor
 
     def __init__(
         self,
@@ -101,9 +100,9 @@ class BoundForwardModel(TensorDictModuleBase):
         self.timestep, self.plain = float(scene.timestep), plain
 
         ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
-        self._register("edge_index", torch.stack(ends).long())
         self._register("live", torch.as_tensor(scene.live, dtype=torch.bool))
-        self._register("predicted_nodes", torch.as_tensor(scene.predicted).nonzero().flatten())
+        predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
+        self.incidence = Incidence(torch.stack(ends).long(), scene.num_nodes, predicted)
         self.frame = LocalFrame(scene, model)
         pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
         # Pins are where lengths say, which are hidden from a model of variants that does not read them.
@@ -172,7 +171,8 @@ class BoundForwardModel(TensorDictModuleBase):
     @property
     def network_dtype(self) -> torch.dtype:
         """Dtype that the network computes in."""
-        return next(self.model.core.parameters()).dtype
+        # Not of parameters(): under TorchRL's losses weights may be plain tensors.
+        return next(each.weight for each in self.model.core.modules() if isinstance(each, nn.Linear)).dtype
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -283,7 +283,7 @@ class BoundForwardModel(TensorDictModuleBase):
             static: static values of every sample, by default the scene's.
         """
         values = self._read(static)
-        core = None if self.plain else self.model.fold(self.static_graph(values), self.predicted_nodes)
+        core = None if self.plain else self.model.fold(self.static_graph(values), self.incidence)
         return Folded(core, values)
 
     def delta(self, state: Tensor, action: Tensor, folded: Folded | None = None) -> Tensor:
@@ -335,7 +335,7 @@ class BoundForwardModel(TensorDictModuleBase):
         encoded, controls = self.frame.features(seen, action, values)
         globals_ = encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype)
         nodes, edges = model.node_normalizer(encoded, dtype), model.edge_normalizer(controls, dtype)
-        return Graph(nodes, edges, globals_, self.edge_index)
+        return Graph(nodes, edges, globals_, self.incidence.edge_index)
 
     def static_graph(self, values: SceneValues | None = None, dtype: torch.dtype | None = None) -> Graph:
         """Normalised static graph, of the scene by default (no batch), in the network's dtype by default."""
@@ -345,7 +345,7 @@ class BoundForwardModel(TensorDictModuleBase):
         else:
             normalizers = self.model.static_normalizers.items()
             nodes, edges, globals_ = (normalizer(getattr(values, part), dtype) for part, normalizer in normalizers)
-        return Graph(nodes, edges, globals_, self.edge_index)
+        return Graph(nodes, edges, globals_, self.incidence.edge_index)
 
     def _check_shapes(self, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> None:
         item = (self.scene.num_nodes, self.layout.size)

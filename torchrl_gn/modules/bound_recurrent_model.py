@@ -68,7 +68,7 @@ class BoundRecurrentModel(BoundForwardModel):
         folded = folded or self.fold()
         seen = self.frame.see(state, folded.values)
         dynamic, static = self._dynamic_graph(seen, action, folded.values), self.static_graph(folded.values)
-        before = self.core.start(dynamic) if memory is None else _graph(memory, self.edge_index)
+        before = self.core.start(dynamic) if memory is None else _graph(memory, self.incidence.edge_index)
         after = self.core.remember(dynamic, static, before)
         dynamic = graph_concat(dynamic, after)
         if folded.core is not None:

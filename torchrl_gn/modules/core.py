@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torch import Tensor, nn
+from torch import nn
 
 from torchrl_gn.modules.folded_core import FoldedCore, fold_core
 from torchrl_gn.modules.gn_block import GNBlock, Pool
 from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
+from torchrl_gn.modules.incidence import Incidence
 from torchrl_gn.modules.linear import ACTIVATIONS
 
 
@@ -76,6 +77,6 @@ class GNCore(nn.Module):
         """Graph with ``in_size`` features in, graph with ``out_nodes`` node features out."""
         return self.second(graph_concat(graph, self.first(graph)))
 
-    def fold(self, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedCore:
+    def fold(self, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedCore:
         """The same function for graphs of one topology with all that is constant folded, see :func:`fold_core`."""
-        return fold_core(self, size, predicted, static)
+        return fold_core(self, size, incidence, static)

@@ -30,6 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_gn.modules.graph import Graph, GraphSize
+from torchrl_gn.modules.incidence import Incidence, Rows
 from torchrl_gn.modules.linear import linear, product
 
 if TYPE_CHECKING:
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 _CACHED = 2**20  # numbers
 
-Rows = Tensor | slice
 Columns = tuple[Tensor, Tensor]  # indices, and factors on what is there
 
 
@@ -62,11 +62,7 @@ class FoldedCore:
     """A core for one scene, ready to be multiplied; made by :func:`fold_core`.
 
     Attributes:
-        ends: ``[2 E, N]`` picks every edge's sender, then every edge's receiver.
-        reduce: ``[N + 1, E]`` sums edges at their receivers, and all of them in its last row.
-        gather: ``[E', 2 N + 1]`` adds, for every edge of the second block, its sender's row of the
-            first ``N``, its receiver's row of the next ``N`` and the graph's row.
-        reduce_last: ``[P, E']`` sums the second block's edges at the predicted nodes.
+        ends, reduce, gather, reduce_last: matrices of the :class:`~torchrl_gn.modules.incidence.Incidence`.
         kept: edges that lead to a predicted node.
         predicted: nodes that are predicted.
         first_edge: inputs: ends and edge, globals.
@@ -199,13 +195,13 @@ class FoldedCore:
         )
 
 
-def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedCore:
+def fold_core(core: GNCore, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedCore:
     """Fold a core for graphs of one topology.
 
     Args:
         core: the two GN blocks.
         size: features of the dynamic graphs; the rest of the core's input is static.
-        predicted: ``[P]`` indices of the nodes to predict, in any order.
+        incidence: of the graphs, and which of their nodes are predicted.
         static: normalised static graph; any part may have a leading batch, which is then that
             of the dynamic graphs.
 
@@ -213,21 +209,15 @@ def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -
         The folded core: differentiable in the core's weights and the static graph.
     """
     n, e, g = size.nodes, size.edges, size.globals_
-    edge_index = static.edge_index
     sn, se, sg = static.nodes.shape[-1], static.edges.shape[-1], static.globals_.shape[-1]
     first, second = core.first, core.second
-    num_nodes, num_edges = static.nodes.shape[-2], edge_index.shape[1]
+    num_nodes, num_edges = incidence.num_nodes, incidence.num_edges
+    kept, rows = incidence.kept_rows, incidence.predicted_rows
     dtype = _first_layer(first.edge_mlp)[0].dtype
-
-    sender, receiver = (F.one_hot(index, num_nodes).to(dtype) for index in edge_index)
-    ones = torch.ones(num_edges, 1, dtype=dtype, device=edge_index.device)
-    reduce = torch.cat((receiver, ones), 1).T.contiguous()
-    degree = receiver.sum(0)[:, None, None]
-    kept = _rows(torch.isin(edge_index[1], predicted).nonzero().flatten())
-    rows = _rows(predicted)
+    degree = incidence.degree.to(dtype)
 
     static_nodes, static_globals = _items(static.nodes), _items(static.globals_.unsqueeze(-2))
-    sides = (*(static_nodes[ends] for ends in edge_index), _items(static.edges))
+    sides = (*(static_nodes[ends] for ends in incidence.edge_index), _items(static.edges))
     static_edges = torch.cat(_broadcast(sides), dim=-1)
 
     # First block. Weight columns: globals, sender, receiver, edge; each dynamic then static.
@@ -272,10 +262,10 @@ def fold_core(core: GNCore, size: GraphSize, predicted: Tensor, static: Graph) -
     table = bias + F.linear(static_nodes, wsn) + F.linear(static_globals, wsg) + degree * (wa @ edge_bias)
     table = (table + wlg @ global_bias + wln @ node_bias)[rows]
     return FoldedCore(
-        ends=torch.cat((sender, receiver)),
-        reduce=reduce,
-        gather=torch.cat((sender, receiver, ones), 1)[kept],
-        reduce_last=reduce[rows][:, kept].contiguous(),
+        ends=incidence.ends.to(dtype),
+        reduce=incidence.reduce.to(dtype),
+        gather=incidence.gather.to(dtype),
+        reduce_last=incidence.reduce_last.to(dtype),
         kept=kept,
         predicted=rows,
         first_edge=first_edge,
@@ -343,13 +333,6 @@ def copy_into(old, new) -> bool:
     return True
 
 
-def _rows(index: Tensor) -> Rows:
-    """Indices in a row as a slice, which picks without a copy."""
-    first, count = int(index[0]) if len(index) else 0, len(index)
-    in_a_row = torch.arange(first, first + count, device=index.device)
-    return slice(first, first + count) if torch.equal(index, in_a_row) else index
-
-
 def _items(features: Tensor) -> Tensor:
     """``[*B, I, F]`` as ``[I, 1 or B, F]``."""
     # math.prod, not numel(): an exported program is for any batch.
@@ -358,7 +341,7 @@ def _items(features: Tensor) -> Tensor:
 
 def _broadcast(parts) -> list[Tensor]:
     """Give all parts ``[I, 1 or B, F]`` the larger batch."""
-    batch = max((part.shape[1] for part in parts), default=1)
+    (batch,) = torch.broadcast_shapes(*(part.shape[1:2] for part in parts))
     return [part.expand(-1, batch, -1) for part in parts]
 
 

@@ -15,6 +15,7 @@ from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.folded_core import FoldedCore
 from torchrl_gn.modules.gn_block import Pool
 from torchrl_gn.modules.graph import Graph, GraphSize
+from torchrl_gn.modules.incidence import Incidence
 from torchrl_gn.modules.mlp_core import FoldedMLP, MLPCore
 from torchrl_gn.modules.normalizer import Normalizer
 from torchrl_gn.modules.recurrent_core import RecurrentCore
@@ -272,14 +273,14 @@ class ForwardModel(nn.Module):
         kind = BoundRecurrentModel if isinstance(self.core, RecurrentCore) else BoundForwardModel
         return kind(self, scene, strict=strict, plain=plain, static_key=static_key)
 
-    def fold(self, static: Graph, predicted: Tensor) -> FoldedCore | FoldedMLP | UnfoldedCore:
+    def fold(self, static: Graph, incidence: Incidence) -> FoldedCore | FoldedMLP | UnfoldedCore:
         """The core for one scene, differentiable in the weights.
 
         Args:
             static: normalised static graph.
-            predicted: ``[P]`` indices of the nodes that move.
+            incidence: of the scene, and which of its nodes are predicted: those that move.
         """
-        return self.core.fold(self.dynamic_size, predicted, static)
+        return self.core.fold(self.dynamic_size, incidence, static)
 
     def forward(self, dynamic: Graph, folded: FoldedCore | FoldedMLP | UnfoldedCore) -> Tensor:
         """Predicted residual change, in SI units.

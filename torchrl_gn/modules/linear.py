@@ -6,11 +6,14 @@ the products: :class:`_Layer` accumulates them into one buffer.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
+_FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {"silu": F.silu, "gelu": F.gelu, "tanh": torch.tanh}
 
 
 def linear(pairs, table=None, matrix=None, items=None, activation: str | None = None) -> Tensor:
@@ -37,7 +40,7 @@ def linear(pairs, table=None, matrix=None, items=None, activation: str | None = 
     if relu or activation is None:
         return out
     in_place = activation == "silu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling() and bool(used)
-    return F.silu(out, inplace=True) if in_place else ACTIVATIONS[activation]()(out)
+    return F.silu(out, inplace=True) if in_place else _FUNCTIONS[activation](out)
 
 
 def product(matrix: Tensor, items: Tensor) -> Tensor:
@@ -52,6 +55,13 @@ class _Layer(torch.autograd.Function):
     ``[J, B, h]`` or None, then pairs ``x_k`` ``[I, B, F_k]`` and ``W_k`` ``[h, F_k]``.
     Output ``[I, B, h]``.
     """
+
+    @classmethod
+    def apply(cls, *inputs):  # pyright: ignore[reportIncompatibleMethodOverride]
+        """As torch's own, which looks up the signature of ``forward`` each time: longer than a small layer takes."""
+        if torch._C._are_functorch_transforms_active():
+            return super().apply(*inputs)
+        return super(torch.autograd.Function, cls).apply(*inputs)  # pyright: ignore[reportAttributeAccessIssue]
 
     @staticmethod
     def forward(relu, table, matrix, items, *pairs):

@@ -12,6 +12,7 @@ from torchrl.modules import MLP
 
 from torchrl_gn.modules.folded_core import Columns
 from torchrl_gn.modules.graph import Graph, GraphSize
+from torchrl_gn.modules.incidence import Incidence
 from torchrl_gn.modules.linear import ACTIVATIONS
 
 
@@ -56,7 +57,7 @@ class MLPCore(nn.Module):
         empty = out[..., :0]
         return Graph(out.unflatten(-1, (self.items[0], -1)), empty.unsqueeze(-2), empty, graph.edge_index)
 
-    def fold(self, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedMLP:
+    def fold(self, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedMLP:
         """Everything constant in a table; arguments as of :func:`~torchrl_gn.modules.folded_core.fold_core`."""
         first, *hidden, last = (layer for layer in self.mlp if isinstance(layer, nn.Linear))
         nodes, edges = self.items
@@ -72,6 +73,7 @@ class MLPCore(nn.Module):
         dynamic.append(columns[: size.globals_])
         constant.append(columns[size.globals_ :])
         table = F.linear(torch.cat(_broadcast(_flat(static)), -1), first.weight[:, torch.cat(constant)], first.bias)
+        predicted = incidence.predicted
         rows = (predicted[:, None] * self.out_nodes + torch.arange(self.out_nodes, device=device)).flatten()
         return FoldedMLP(
             weights=tuple(first.weight[:, index] for index in dynamic),

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.float64_buffers import Float64Buffers
 from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
+from torchrl_gn.modules.incidence import Incidence
 from torchrl_gn.modules.mlp_core import MLPCore
 from torchrl_gn.modules.normalizer import Normalizer
 from torchrl_gn.scenes import ObservationGraph
@@ -148,7 +149,7 @@ class ObservationNetwork(nn.Module):
             self.node_normalizer(nodes, dtype) * mask_nodes,
             self.edge_normalizer(edges, dtype) * mask_edges,
             self.global_normalizer(globals_, dtype),
-            self.places.edge_index,
+            self.places.incidence.edge_index,
         )
 
     def static_graph(self) -> Graph:
@@ -157,14 +158,14 @@ class ObservationNetwork(nn.Module):
         count = self.graph.num_nodes
         nodes = torch.eye(count).to(like) if self.graph.identity else like.new_zeros(count, 0)
         direction = like.new_tensor([1.0, -1.0]).repeat(self.graph.num_edges // 2).unsqueeze(-1)
-        return Graph(nodes, direction, like.new_zeros(0), self.places.edge_index)
+        return Graph(nodes, direction, like.new_zeros(0), self.places.incidence.edge_index)
 
     def forward(self, observation: Tensor, action: Tensor | None = None) -> Tensor:
         """Features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if they are seen, actions ``[*B, A]``."""
         dynamic, static = self.dynamic_graph(observation, action), self.static_graph()
         if self.plain:
             return self.core(graph_concat(dynamic, static)).nodes
-        return self.core.fold(self.size, self.places.every_node, static).predict(dynamic)
+        return self.core.fold(self.size, self.places.incidence, static).predict(dynamic)
 
 
 def sharing_weights(module: M) -> M:
@@ -183,14 +184,11 @@ class _Places(Float64Buffers):
     """Tables that arrange the numbers of one observation graph.
 
     Attributes:
-        edge_index: ``[2, E]``.
-        every_node: ``[N]``.
+        incidence: all nodes are predicted.
         slots: ``[N, F_n + F_j]`` index in the observation, its length where there is none.
         mask: bool like ``slots``, where there is one.
     """
 
-    edge_index: Tensor
-    every_node: Tensor
     slots: Tensor
     mask: Tensor
     actions: Tensor
@@ -204,10 +202,9 @@ class _Places(Float64Buffers):
         slots, actions, self.split = graph.node_entries, graph.node_actions, graph.num_node_features
         moved = graph.moved.repeat(2)
         there = slots >= 0
+        self.incidence = Incidence(torch.as_tensor(graph.edge_index), graph.num_nodes)
         self.constants(
             {
-                "edge_index": graph.edge_index,
-                "every_node": torch.arange(graph.num_nodes),
                 "slots": torch.as_tensor(slots) % (graph.num_observations + 1),
                 "mask": there,
                 "actions": torch.as_tensor(actions) % (graph.num_actions + 1),

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torchrl_gn.modules.core import GNCore
 from torchrl_gn.modules.folded_core import FoldedCore
 from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
+from torchrl_gn.modules.incidence import Incidence
 
 
 class RecurrentCore(nn.Module):
@@ -53,9 +54,9 @@ class RecurrentCore(nn.Module):
         """Dynamic, remembered and static features side by side in, ``out_nodes`` node features out."""
         return self.core(graph)
 
-    def fold(self, size: GraphSize, predicted: Tensor, static: Graph) -> FoldedCore:
+    def fold(self, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedCore:
         """The graph networks with all that is constant folded, of dynamic and remembered features."""
-        return self.core.fold(size + self.memory_size, predicted, static)
+        return self.core.fold(size + self.memory_size, incidence, static)
 
 
 def _each(cell: nn.GRUCell, features: Tensor, hidden: Tensor) -> Tensor:

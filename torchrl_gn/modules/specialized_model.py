@@ -131,7 +131,7 @@ class SpecializedForwardModel(BoundForwardModel):
         # In float64, so that folding loses nothing.
         core = copy.deepcopy(model.core).double()
         static = self.static_graph(values, torch.float64)
-        full = core.fold(model.dynamic_size, self.predicted_nodes, static)
+        full = core.fold(model.dynamic_size, self.incidence, static)
         assert isinstance(full, (FoldedCore, FoldedMLP))  # specialize() refuses others
         small = full.reduced(
             (self.node_columns, nodes.inverse_std[self.node_columns]),
@@ -149,7 +149,7 @@ class SpecializedForwardModel(BoundForwardModel):
         edges = _centered(controls, self.model.edge_normalizer.mean, self.edge_columns)
         dtype = core.out[0].dtype
         globals_ = nodes.new_zeros((*nodes.shape[:-2], 0), dtype=dtype)
-        dynamic = Graph(nodes.to(dtype), edges.to(dtype), globals_, self.edge_index)
+        dynamic = Graph(nodes.to(dtype), edges.to(dtype), globals_, self.incidence.edge_index)
         predicted = core.predict(dynamic).to(seen.state.dtype)
         # Channels that never varied are predicted as what they were.
         constant = self.model.residual_normalizer.mean.to(predicted.dtype).expand(*predicted.shape[:-1], -1)
@@ -166,7 +166,7 @@ class SpecializedForwardModel(BoundForwardModel):
             def empty(*shape: int) -> Tensor:
                 return torch.zeros(1, *shape, dtype=dtype, device=self.live.device)
 
-            return Graph(empty(nodes, nodes_), empty(edges, edges_), empty(0), self.edge_index)
+            return Graph(empty(nodes, nodes_), empty(edges, edges_), empty(0), self.incidence.edge_index)
 
         with FlopCounterMode(display=False) as plain, torch.no_grad():
             core(graph_concat(graph(size.nodes, size.edges, self.network_dtype), static))
@@ -180,7 +180,7 @@ class SpecializedForwardModel(BoundForwardModel):
             "node features": (first.nodes, len(self.node_columns)),
             "edge features": (first.edges, len(self.edge_columns)),
             "global features": (first.globals_, 0),
-            "nodes predicted": (nodes, len(self.predicted_nodes)),
+            "nodes predicted": (nodes, len(self.incidence.predicted)),
             "channels predicted": (self.layout.delta_size, len(self.rows)),
             **second,
             "kFLOP": (plain.get_total_flops() / 1e3, quick.get_total_flops() / 1e3),

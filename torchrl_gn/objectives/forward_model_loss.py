@@ -129,7 +129,7 @@ class ForwardModelLoss(LossModule):
         state, action, next_state = self._read(tensordict)
         static = self._read_static(tensordict) if model.model.static == "scene" else None
         clean = Normalizer(layout.size, floor=1e-9)
-        clean.update(self.model.frame.recentered(state)[..., model.predicted_nodes, :])
+        clean.update(self.model.frame.recentered(state)[..., model.incidence.predicted, :])
         scale = torch.ones(layout.delta_size, dtype=torch.float64)
         for component in layout.components:
             if component.kind == "add":
