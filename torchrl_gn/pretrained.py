@@ -19,8 +19,7 @@ def pretrained_names() -> list[str]:
 def load_pretrained(name: str) -> Checkpoint:
     """Load a trained model that comes with the package.
 
-    Weights are stored in half precision, which costs nothing that can be seen in their errors, and computed with in
-    single precision.
+    Weights are stored in half precision, which costs nothing that can be seen in their errors.
 
     Args:
         name: one of :func:`pretrained_names`: the system that it was trained on, or what else it is for.
@@ -43,6 +42,4 @@ def load_pretrained(name: str) -> Checkpoint:
         near = difflib.get_close_matches(name, names, 1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"There is no trained model {name!r}; use one of {names}.{hint}")
-    checkpoint = load_checkpoint(WEIGHTS / f"{name}.safetensors")
-    checkpoint.trained.float()
-    return checkpoint
+    return load_checkpoint(WEIGHTS / f"{name}.safetensors")

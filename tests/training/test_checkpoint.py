@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 
@@ -60,6 +61,14 @@ def test_everything_comes_back(saved, trained, scene):
     action = torch.ones(4, 1)
     predicted = loaded.model.bind(loaded.scene(), strict=True).step(state, action)
     assert torch.equal(predicted, trained.model.bind(scene).step(state, action))
+
+
+def test_weights_stored_in_half_precision_compute_in_single(tmp_path, trained):
+    halves = copy.deepcopy(trained.model).half()
+    save_checkpoint(tmp_path / "published.safetensors", halves)
+    loaded = load_checkpoint(tmp_path / "published.safetensors").model.state_dict()
+    assert {value.dtype for name, value in loaded.items() if name.endswith(".weight")} == {torch.float32}
+    assert all(torch.equal(loaded[name], value.to(loaded[name].dtype)) for name, value in halves.state_dict().items())
 
 
 def test_optimizers_keep_integer_keys_and_exact_rates(saved, trained, make_trainer):

@@ -169,6 +169,8 @@ def save_checkpoint(
 def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     """Read a checkpoint.
 
+    Weights that are stored in half precision, as published ones are, are computed with in single precision.
+
     Args:
         path: the file, or the run folder that holds it.
 
@@ -202,7 +204,8 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     description = json.loads(text)
     model = KINDS[description["kind"]].from_description(description["model"])
     weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
-    model.to(next(value.dtype for name, value in weights.items() if name.endswith(".weight")))
+    stored = next(value.dtype for name, value in weights.items() if name.endswith(".weight"))
+    model.to(torch.float32 if stored == torch.float16 else stored)
     model.load_state_dict(weights)
     return Checkpoint(
         trained=model,
