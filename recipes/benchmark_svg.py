@@ -3,8 +3,8 @@
     python recipes/benchmark_svg.py [repeats=30] [batch_size=256] [horizons=[0,1,3]]
 
 Times, in turn and several times, one update (sampling, losses of policy, value and model, gradients, optimiser) of
-SVG(N) with a graph network that is evaluated by message passing (plain), folded (what recipes/svg.py uses), and with an
-MLP in its place, beside a step of the environments. Results: docs/performance.md.
+SVG(N) with a graph network that is evaluated by message passing (plain), folded, folded and compiled (what
+recipes/svg.py uses), and with an MLP in its place, beside a step of the environments. Results: docs/performance.md.
 
 Writes config.yaml, metrics.json and the table as table.md to its run folder.
 """
@@ -35,17 +35,16 @@ from torchrl_gn.training import OffPolicyTrainer, RunFolder, clean_exit
 def make_update(
     cfg: DictConfig, graph: ObservationGraph, env: EnvBase, data: TensorDictBase, horizon: int, way: str
 ) -> Callable[[], dict[str, float]]:
-    """One update of an agent whose model is ``plain``, ``folded`` or an ``mlp``."""
-    kind = None if horizon == 0 else ("mlp" if way == "mlp" else "gn")
+    """One update of an agent whose model is ``plain``, ``folded`` or an ``mlp``, perhaps ``compiled``."""
+    kind = None if horizon == 0 else ("mlp" if "mlp" in way else "gn")
     agent = Agent(graph, hidden=cfg.hidden, model=kind, model_options={**cfg.model_options, "plain": way == "plain"})
     reward = TargetDistance(graph) if horizon else None
     loss = SVGLoss(agent.policy, agent.value, agent.model, reward, steps=horizon, delay_actor=True)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.99)
     losses = [loss] if agent.model is None else [loss, ObservationModelLoss(agent.model)]
     optimizer = torch.optim.Adam([weight for each in losses for weight in each.parameters()], lr=1e-4, fused=True)
-    trainer = OffPolicyTrainer(
-        agent, losses, env, agent.policy, lambda: 0.0, optimizer, frames=data.numel(), batch_size=cfg.batch_size
-    )
+    options = {"frames": data.numel(), "batch_size": cfg.batch_size, "compile": "compiled" in way}
+    trainer = OffPolicyTrainer(agent, losses, env, agent.policy, lambda: 0.0, optimizer, **options)
     trainer.remember(data)
     return trainer.update
 
@@ -63,7 +62,8 @@ def main(cfg: DictConfig) -> None:
     policy, start = Agent(graph, hidden=cfg.hidden).policy, env.reset()
     ways: dict[str, Callable] = {f"{cfg.num_envs} environment steps": lambda: env.step(policy(start.copy()))}
     for horizon in cfg.horizons:
-        for way in ("plain", "folded", "mlp") if horizon else ("no model",):
+        of = ("plain", "folded", "compiled", "mlp", "mlp compiled") if horizon else ("plain", "compiled")
+        for way in of if cfg.compile else (way for way in of if "compiled" not in way):
             ways[f"SVG({horizon}), {way}"] = make_update(cfg, graph, env, data, horizon, way)
 
     seconds = {name: [] for name in ways}

@@ -11,7 +11,8 @@ from torch import Tensor
 def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> None:
     """Raise where a number is NaN or infinite.
 
-    Waits for a GPU, so it stands where a user's numbers enter and never between steps.
+    Waits for a GPU, so it stands where a user's numbers enter and never between steps. ``torch.compile`` leaves it out:
+    a compiled function cannot stop halfway.
 
     Args:
         value: any shape; of a TensorDict every entry.
@@ -20,6 +21,8 @@ def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> No
     Raises:
         ValueError: naming what it is, the number and its index.
     """
+    if torch.compiler.is_compiling():
+        return
     if isinstance(value, TensorDictBase):
         for key, entry in value.items(include_nested=True, leaves_only=True):
             require_finite(entry, f"{what} {key!r}")

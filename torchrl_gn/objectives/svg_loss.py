@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, cast
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -103,9 +103,9 @@ class SVGLoss(DDPGLoss):
             for module, parameters in (
                 (self.actor_network, self.actor_network_params),
                 (self.value_network, self._cached_detached_value_params),
+                *((module, _frozen(module)) for module in (self.model, self.reward) if isinstance(module, nn.Module)),
             ):
                 stack.enter_context(_with_weights(module, parameters))
-            stack.enter_context(_frozen(self.model, self.reward))
             for _ in range(self.steps):
                 now = self.actor_network(now)
                 now, reward = self._imagine(now)
@@ -151,15 +151,6 @@ def _with_weights(module: nn.Module, weights: TensorDictBase) -> Iterator[None]:
         swapped.__exit__(None, None, None)
 
 
-@contextmanager
-def _frozen(*modules: object) -> Iterator[None]:
-    """Cut the weights of networks from gradients; what is no network has none."""
-    networks = [module for module in modules if isinstance(module, nn.Module)]
-    trained = [weight for network in networks for weight in network.parameters() if weight.requires_grad]
-    try:
-        for weight in trained:
-            weight.requires_grad_(False)
-        yield
-    finally:
-        for weight in trained:
-            weight.requires_grad_(True)
+def _frozen(module: nn.Module) -> TensorDictBase:
+    """The module's weights and buffers, cut from gradients."""
+    return cast(TensorDictBase, TensorDict.from_module(module)).data
