@@ -36,12 +36,22 @@ from torchrl_gn.training import (
     report_learning,
 )
 
-MAY_CHANGE = ("trainer.frames", "threads", "logger", "run_dir", "checkpoint_seconds")  # when a run goes on
+# When a run goes on.
+MAY_CHANGE = ("trainer.frames", "trainer.compile", "threads", "logger", "run_dir", "checkpoint_seconds")
 
 
 def options(cfg: DictConfig) -> dict[str, Any]:
     """Options as plain values."""
     return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+
+
+def make_optimizer(cfg: DictConfig, loss: DDPGLoss) -> torch.optim.Optimizer:
+    """One for both, each network with a rate of its own."""
+    groups = [
+        {"params": list(loss.actor_network_params.parameters()), "lr": cfg.policy_lr},
+        {"params": list(loss.value_network_params.parameters()), "lr": cfg.value_lr},
+    ]
+    return torch.optim.Adam(groups, fused=True)
 
 
 @hydra.main(version_base=None, config_path="config", config_name="ddpg")
@@ -71,7 +81,7 @@ def main(cfg: DictConfig) -> None:
         env,
         TensorDictSequential([agent.policy, noise]),
         lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
-        torch.optim.Adam(loss.parameters(), lr=cfg.lr, fused=True),
+        make_optimizer(cfg, loss),
         seed=cfg.seed,
         **options(cfg.trainer),
     )

@@ -39,15 +39,17 @@ from torchrl_gn.training import (
     report_learning,
 )
 
+# When a run goes on.
 MAY_CHANGE = (
     "trainer.frames",
+    "trainer.compile",
     "threads",
     "logger",
     "run_dir",
     "checkpoint_seconds",
     "ray",
     "collectors",
-)  # when a run goes on
+)
 
 
 def options(cfg: DictConfig) -> dict[str, Any]:
@@ -65,8 +67,12 @@ def make_losses(cfg: DictConfig, agent: Agent) -> list[LossModule]:
 
 
 def make_optimizer(cfg: DictConfig, losses: list[LossModule]) -> torch.optim.Optimizer:
-    """One for all, the model with a rate of its own."""
-    groups = [{"params": list(losses[0].parameters()), "lr": cfg.lr}]
+    """One for all, each network with a rate of its own."""
+    agent = cast("SVGLoss", losses[0])
+    groups = [
+        {"params": list(agent.actor_network_params.parameters()), "lr": cfg.policy_lr},
+        {"params": list(agent.value_network_params.parameters()), "lr": cfg.value_lr},
+    ]
     groups += [{"params": list(loss.parameters()), "lr": cfg.model_lr} for loss in losses[1:]]
     return torch.optim.Adam(groups, fused=True)
 

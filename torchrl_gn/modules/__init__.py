@@ -18,6 +18,7 @@ from torchrl_gn.modules.incidence import Incidence as Incidence
 from torchrl_gn.modules.inference_model import BoundInferenceModel as BoundInferenceModel
 from torchrl_gn.modules.inference_model import IdentifyingModel as IdentifyingModel
 from torchrl_gn.modules.inference_model import InferenceModel as InferenceModel
+from torchrl_gn.modules.layer_norm_mlp import LayerNormMLP as LayerNormMLP
 from torchrl_gn.modules.learned_reward import LearnedReward as LearnedReward
 from torchrl_gn.modules.mlp_core import MLPCore as MLPCore
 from torchrl_gn.modules.normalizer import Normalizer as Normalizer

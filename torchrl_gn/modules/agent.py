@@ -8,9 +8,10 @@ from typing import Any, Literal, cast
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.modules import MLP, ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
+from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
 
 from torchrl_gn.modules.graph_policy import GraphPolicy
+from torchrl_gn.modules.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.modules.learned_reward import LearnedReward
 from torchrl_gn.modules.observation_model import ObservationModel
 from torchrl_gn.scenes import ObservationGraph
@@ -26,7 +27,7 @@ class Agent(nn.Module):
         graph: the task's observations and actions.
         stochastic: a Gaussian policy, squashed by a tanh (SVG), or a deterministic one (DDPG).
         policy: ``"mlp"``, or ``"graph"``: a :class:`~torchrl_gn.modules.GraphPolicy`.
-        hidden: hidden sizes of policy and value MLPs.
+        hidden: hidden sizes of policy and value (:class:`LayerNormMLP`).
         min_scale: smallest standard deviation of a stochastic policy, before the tanh.
         model: forward model: ``"gn"``, ``"mlp"`` or None.
         model_options: further options of :class:`~torchrl_gn.modules.ObservationModel`.
@@ -72,13 +73,13 @@ class Agent(nn.Module):
             "policy_options": dict(policy_options or {}),
             "learned_reward": learned_reward,
         }
-        observations, actions, cells = graph.num_observations, graph.num_actions, list(hidden)
+        observations, actions = graph.num_observations, graph.num_actions
         if stochastic:
             parameters: nn.Module
             if policy == "graph":
                 parameters = GraphPolicy(graph, min_scale=min_scale, **(policy_options or {}))
             else:
-                mlp = MLP(observations, 2 * actions, num_cells=cells, activation_class=nn.SiLU)
+                mlp = LayerNormMLP(observations, 2 * actions, hidden)
                 parameters = nn.Sequential(mlp, NormalParamExtractor(scale_lb=cast(Any, min_scale)))
             self.policy = ProbabilisticActor(
                 TensorDictModule(parameters, ["observation"], ["loc", "scale"]),
@@ -87,10 +88,10 @@ class Agent(nn.Module):
                 distribution_class=TanhNormal,
             )
         else:
-            mlp = MLP(observations, actions, num_cells=cells, activation_class=nn.SiLU)
+            mlp = LayerNormMLP(observations, actions, hidden)
             squash = TanhModule(in_keys=["action"])
             self.policy = TensorDictSequential([TensorDictModule(mlp, ["observation"], ["action"]), squash])
-        value = MLP(observations + actions, 1, num_cells=cells, activation_class=nn.SiLU)
+        value = LayerNormMLP(observations + actions, 1, hidden)
         self.value = ValueOperator(value, in_keys=["observation", "action"])
         self.model = None if model is None else ObservationModel(graph, core=model, **(model_options or {}))
         self.reward = LearnedReward(observations, actions, hidden) if learned_reward else None
