@@ -325,6 +325,8 @@ def test_it_plans_with_the_model_of_a_scene(scenes, windows, special):
     ended = torch.zeros(30, 1, dtype=torch.bool)
     data["next"].update({"reward": torch.rand(30, 1), "done": ended, "terminated": ended})
     out = loss(data)
+    if special:
+        assert planned._folds == 1 and "loss_actor" in loss(data) and planned._folds == 1  # nothing has changed
 
     x, total = data["state"], 0.0
     for step in range(2):

@@ -71,6 +71,16 @@ def test_weights_stored_in_half_precision_compute_in_single(tmp_path, trained):
     assert all(torch.equal(loaded[name], value.to(loaded[name].dtype)) for name, value in halves.state_dict().items())
 
 
+@pytest.mark.parametrize("change", [{"hidden": [9]}, {"no_such_option": 1}])
+def test_networks_of_another_version_are_refused(tmp_path, monkeypatch, change):
+    graph = ObservationGraph.swimmer(3)
+    description = Agent(graph, hidden=(8,)).description()
+    monkeypatch.setattr(Agent, "description", lambda self: {**description, "options": description["options"] | change})
+    save_checkpoint(tmp_path / "c.safetensors", Agent(graph, hidden=(8,)))
+    with pytest.raises(CheckpointError, match=r"c\.safetensors is of another version .*train again"):
+        load_checkpoint(tmp_path / "c.safetensors")
+
+
 def test_optimizers_keep_integer_keys_and_exact_rates(saved, trained, make_trainer):
     state = load_checkpoint(saved).training["optimizer"]
     before = trained.optimizer.state_dict()

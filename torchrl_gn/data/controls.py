@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from torchrl_gn.scenes.scene import Scene
 
@@ -43,6 +42,8 @@ def spline_controls(
     rng = np.random.default_rng(rng)
     if num == 0 or steps == 0 or scene.num_actions == 0:
         return np.zeros((num, steps, scene.num_actions))
+
+    from scipy.interpolate import CubicSpline  # here, as importing it takes a second
 
     knots = math.ceil((steps - 1) / knot_interval) + 2 + 2 * _MARGIN
     values = rng.uniform(scene.action_low, scene.action_high, (knots, num, scene.num_actions))

@@ -24,6 +24,7 @@ from torchrl_gn.modules.mlp_core import MLPCore as MLPCore
 from torchrl_gn.modules.normalizer import Normalizer as Normalizer
 from torchrl_gn.modules.observation_model import ObservationModel as ObservationModel
 from torchrl_gn.modules.observation_network import ObservationNetwork as ObservationNetwork
+from torchrl_gn.modules.output_normalization import OutputNormalization as OutputNormalization
 from torchrl_gn.modules.precision import fast_matmul as fast_matmul
 from torchrl_gn.modules.recurrent_core import RecurrentCore as RecurrentCore
 from torchrl_gn.modules.specialized_model import SpecializedForwardModel as SpecializedForwardModel

@@ -14,6 +14,7 @@ from torchrl_gn.modules.graph_policy import GraphPolicy
 from torchrl_gn.modules.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.modules.learned_reward import LearnedReward
 from torchrl_gn.modules.observation_model import ObservationModel
+from torchrl_gn.modules.output_normalization import OutputNormalization
 from torchrl_gn.scenes import ObservationGraph
 
 
@@ -21,7 +22,8 @@ class Agent(nn.Module):
     """Policy, value and, to plan with, a forward model and a reward, on one task's flat observations.
 
     Each is a module of its own, to be wired into TorchRL's losses and collectors; this class only makes them alike
-    every time and describes them for checkpoints. Actions lie in -1 to 1, as in the suite.
+    every time and describes them for checkpoints. Actions lie in -1 to 1, as in the suite: policies end in
+    :class:`OutputNormalization` and a tanh.
 
     Args:
         graph: the task's observations and actions.
@@ -82,15 +84,25 @@ class Agent(nn.Module):
                 mlp = LayerNormMLP(observations, 2 * actions, hidden)
                 parameters = nn.Sequential(mlp, NormalParamExtractor(scale_lb=cast(Any, min_scale)))
             self.policy = ProbabilisticActor(
-                TensorDictModule(parameters, ["observation"], ["loc", "scale"]),
+                TensorDictSequential(
+                    [
+                        TensorDictModule(parameters, ["observation"], ["loc", "scale"]),
+                        TensorDictModule(OutputNormalization(), ["loc"], ["loc"]),
+                    ]
+                ),
                 in_keys=["loc", "scale"],
                 out_keys=["action"],
                 distribution_class=TanhNormal,
             )
         else:
             mlp = LayerNormMLP(observations, actions, hidden)
-            squash = TanhModule(in_keys=["action"])
-            self.policy = TensorDictSequential([TensorDictModule(mlp, ["observation"], ["action"]), squash])
+            self.policy = TensorDictSequential(
+                [
+                    TensorDictModule(mlp, ["observation"], ["action"]),
+                    TensorDictModule(OutputNormalization(), ["action"], ["action"]),
+                    TanhModule(in_keys=["action"]),
+                ]
+            )
         value = LayerNormMLP(observations + actions, 1, hidden)
         self.value = ValueOperator(value, in_keys=["observation", "action"])
         self.model = None if model is None else ObservationModel(graph, core=model, **(model_options or {}))

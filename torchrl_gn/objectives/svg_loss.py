@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, cast
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -103,9 +104,11 @@ class SVGLoss(DDPGLoss):
             for module, parameters in (
                 (self.actor_network, self.actor_network_params),
                 (self.value_network, self._cached_detached_value_params),
-                *((module, _frozen(module)) for module in (self.model, self.reward) if isinstance(module, nn.Module)),
             ):
                 stack.enter_context(_with_weights(module, parameters))
+            for module in (self.model, self.reward):
+                if isinstance(module, nn.Module):
+                    stack.enter_context(_frozen(module))
             for _ in range(self.steps):
                 now = self.actor_network(now)
                 now, reward = self._imagine(now)
@@ -151,6 +154,18 @@ def _with_weights(module: nn.Module, weights: TensorDictBase) -> Iterator[None]:
         swapped.__exit__(None, None, None)
 
 
-def _frozen(module: nn.Module) -> TensorDictBase:
-    """The module's weights and buffers, cut from gradients."""
-    return cast(TensorDictBase, TensorDict.from_module(module)).data
+@contextmanager
+def _frozen(module: nn.Module) -> Iterator[None]:
+    """Cut a network's weights from gradients."""
+    if torch.compiler.is_compiling():  # where what requires gradients cannot be changed
+        with _with_weights(module, cast(TensorDictBase, TensorDict.from_module(module)).detach()):
+            yield
+        return
+    trained = [weight for weight in module.parameters() if weight.requires_grad]
+    try:
+        for weight in trained:
+            weight.requires_grad_(False)
+        yield
+    finally:
+        for weight in trained:
+            weight.requires_grad_(True)

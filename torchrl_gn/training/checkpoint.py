@@ -202,11 +202,17 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise CheckpointError(f"Checkpoint {path} has NaN or Inf in {name!r}; use another or train again.")
     description = json.loads(text)
-    model = KINDS[description["kind"]].from_description(description["model"])
     weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
     stored = next(value.dtype for name, value in weights.items() if name.endswith(".weight"))
-    model.to(torch.float32 if stored == torch.float16 else stored)
-    model.load_state_dict(weights)
+    try:
+        model = KINDS[description["kind"]].from_description(description["model"])
+        model.to(torch.float32 if stored == torch.float16 else stored).load_state_dict(weights)
+    except (RuntimeError, TypeError) as error:
+        what = str(error).splitlines()[0]
+        raise CheckpointError(
+            f"Checkpoint {path} is of another version of torchrl_gn, whose networks are not built as here ({what});"
+            " train again."
+        ) from error
     return Checkpoint(
         trained=model,
         scene_descriptions=description["scenes"],
