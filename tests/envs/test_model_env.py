@@ -136,6 +136,21 @@ def test_runs_a_bound_forward_model(swimmer):
     assert (actions.grad != 0).any()
 
 
+@pytest.mark.parametrize("kind", ["static", "inferred", "recurrent"])
+def test_specs_name_what_else_a_model_reads(swimmer, kind):
+    small = {"latent": 8, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+    options = {
+        "static": {},
+        "inferred": {"static": "inferred", "inferred": (4, 4, 4)},
+        "recurrent": {"core": "recurrent", "memory": [4, 4, 4]},
+    }
+    model = ForwardModel(FeatureSet.of(swimmer), **options[kind], **small)
+    env = ModelEnv(model.bind(swimmer, static_key=None if kind == "recurrent" else "static"), seed=0)
+    check_env_specs(env)
+    assert ("memory" in env.observation_spec.keys()) == (kind == "recurrent")
+    assert ("static" in env.state_spec.keys()) == (kind != "recurrent")
+
+
 def test_a_given_start_must_be_given(scene_env, model_env):
     for env, entry in ((scene_env, "physics"), (model_env, "state")):
         with pytest.raises(KeyError, match=f"needs an entry '{entry}'"):

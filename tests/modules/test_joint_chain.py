@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.data import log_chain, log_trajectories, simulate_log, trajectory_buffer
+from torchrl_gn.envs import ModelEnv
 from torchrl_gn.evaluation import evaluate_errors, plot_joints
 from torchrl_gn.modules import FeatureSet, ForwardModel, joint_layout, specialize
 from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.scenes import JointChain, load_scene
 from torchrl_gn.training import load_checkpoint, save_checkpoint
 
@@ -49,6 +53,52 @@ def test_it_trains_is_saved_and_evaluated_like_any_scene(robot, core, tmp_path):
     assert torch.equal(base, state[:, 0])  # the base stays
     if core == "gn":
         torch.testing.assert_close(specialize(bound).step(state, action), bound.step(state, action))
+
+
+def angles_near(targets: torch.Tensor):
+    """Reward: cosine of the distance of every joint to its target."""
+
+    def reward(state, action, next_state, task):
+        cosine, sine = next_state[..., 1:, 0], next_state[..., 1:, 1]
+        return (cosine * targets.cos() + sine * targets.sin()).mean(-1, keepdim=True)
+
+    return reward
+
+
+@pytest.mark.parametrize("core", ["gn", "recurrent"])
+def test_it_is_an_environment_and_is_planned_with(robot, core):
+    chain, data = robot
+    torch.manual_seed(0)
+    options = {"layout": joint_layout(chain.extras), "joint_axes": False, "contacts": False, "core": core}
+    bound = ForwardModel(FeatureSet.of(chain), **options, **SMALL).bind(chain)
+    loss = ForwardModelLoss(bound)
+    loss.fit_normalizers(trajectory_buffer(data, batch_size=1000, seed=0).sample())
+    starts = data["state"].flatten(0, 1)
+    env = ModelEnv(bound, angles_near(torch.zeros(9)), start_states=starts, seed=0)
+    check_env_specs(env)
+    rollout = env.rollout(4, tensordict=env.reset(TensorDict(batch_size=[3])), auto_reset=False)
+    assert rollout["state"].shape == (3, 4, 10, 3)
+    assert all((starts == state).all(-1).all(-1).any() for state in rollout["state"][:, 0])
+    again = bound.rollout(rollout["state"][:, 0], rollout["action"])
+    torch.testing.assert_close(rollout["next", "state"], again[:, 1:])
+    now = env.reset(TensorDict(batch_size=[3]))
+    returns = []
+    for warm_up in (0, 10):
+        td = GradientPlanner(env, 4, 2, warm_up=warm_up, seed=0)(now.copy())
+        planned = torch.cat((td["action"].unsqueeze(1), td["plan", "actions"][:, 0, :3]), 1)
+        returns.append(env.imagine(now, planned)[1].sum())
+    before, after = returns
+    assert after > before
+
+
+def test_where_it_starts_must_be_said(robot):
+    chain, _ = robot
+    options = {"layout": joint_layout(chain.extras), "joint_axes": False, "contacts": False}
+    bound = ForwardModel(FeatureSet.of(chain), **options, **SMALL).bind(chain)
+    with pytest.raises(ValueError, match=r"robot 'jaco' starts; give start_states \[M, 10, 3\]"):
+        ModelEnv(bound)
+    with pytest.raises(ValueError, match=r"must be \[M, 10, 3\], got \[4, 9, 3\]"):
+        ModelEnv(bound, start_states=torch.zeros(4, 9, 3))
 
 
 def test_several_commands_a_joint(robot):

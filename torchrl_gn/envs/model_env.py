@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
@@ -50,15 +52,17 @@ class ModelEnv(ModelBasedEnvBase):
             :class:`~torchrl_gn.modules.BoundForwardModel`.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
         start_states: ``[M, S]`` full MuJoCo states to start from, or a function
-            ``(n, generator) -> [n, S]``. Default: the system's reset distribution.
+            ``(n, generator) -> [n, S]``. Default: the system's reset distribution. Of a robot that is known by its
+            joints alone (:class:`~torchrl_gn.scenes.JointChain`): its states ``[M, N, C]``, those of a log, say.
         unstable_reward: reward of a step whose prediction is not finite.
         seed: seed of the start states. Default: drawn from torch's global generator.
         device: where everything lives. Default: the model's device.
 
     Raises:
         TypeError: the model lacks these keys or the scene.
-        ValueError: start states, or when stepping ``state`` or ``action``, of a wrong shape; an
-            ``unstable_reward``, or when resetting a ``state`` or static values, that are not finite.
+        ValueError: start states, or when stepping ``state`` or ``action``, of a wrong shape; no start states of a
+            robot without a model; an ``unstable_reward``, or when resetting a ``state`` or static values, that are
+            not finite.
         KeyError: when stepping, no ``state`` or ``action``.
     """
 
@@ -92,19 +96,38 @@ class ModelEnv(ModelBasedEnvBase):
         self.unstable_reward = finite_reward(unstable_reward)
         self.starts = StartSampler(self.scene, start_states, seed)
         set_specs(self, self.scene, physics=False)
+        if self._static_key is not None:
+            self.state_spec[self._static_key] = self._spec_of(cast(Any, model).own_static())
+        if "memory" in inputs:
+            for spec in (self.observation_spec, self.state_spec):
+                spec["memory"] = self._spec_of(cast(Any, model).own_memory())
+
+    def _spec_of(self, entries: TensorDictBase) -> Composite:
+        of = {str(key): (value.shape, value.dtype) for key, value in entries.items()}
+        specs = {key: Unbounded(shape=shape, dtype=dtype, device=self.device) for key, (shape, dtype) in of.items()}
+        return Composite(specs, device=self.device)
+
+    @property
+    def _static_key(self) -> NestedKey | None:
+        return getattr(self.world_model, "static_key", None)
+
+    @property
+    def _state_shape(self) -> tuple[int, int]:
+        return self.scene.num_nodes, self.scene.state_size
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDict:
         if tensordict is None:
             tensordict = TensorDict(batch_size=self.batch_size)
         shape = tensordict.shape
         if set_state:
-            state = read(tensordict, "state", (self.scene.num_nodes, 13), self).to(torch.float64, copy=True)
+            state = read(tensordict, "state", self._state_shape, self).to(torch.float64, copy=True)
             require_finite(state, f"{self}: 'state'")
         else:
-            physics = self.starts.draw(shape, tensordict.get("_reset", None))
-            state = Simulator(self.scene, num_threads=1).observe(physics)
+            state = self.starts.draw(shape, tensordict.get("_reset", None))
+            if isinstance(self.scene, Scene):
+                state = Simulator(self.scene, num_threads=1).observe(state)
         reset = TensorDict({"state": state}, batch_size=shape)
-        key = getattr(self.world_model, "static_key", None)
+        key = self._static_key
         if key is not None:
             static = tensordict.get(key, None)
             if static is None:
@@ -120,7 +143,7 @@ class ModelEnv(ModelBasedEnvBase):
         return reset.to(self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        state = read(tensordict, "state", (self.scene.num_nodes, 13), self)
+        state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         # The model writes into its input: give it a shallow copy.
         predicted = self.world_model(tensordict.select(*self.world_model.in_keys))["next"]
@@ -161,7 +184,10 @@ class ModelEnv(ModelBasedEnvBase):
                 f"actions must be [*B, H, {self.scene.num_actions}] with the TensorDict's batch"
                 f" {list(tensordict.shape)} and H at least 1, got {list(actions.shape)}"
             )
-        state, model = read(tensordict, "state", (self.scene.num_nodes, 13), self), cast(object, self.world_model)
+        state, model = (
+            read(tensordict, "state", self._state_shape, self),
+            cast(object, self.world_model),
+        )
         if isinstance(model, BoundForwardModel):
             memory = cast("TensorDictBase | None", tensordict.get("memory", None))
             states, _ = model.rollout_and_memory(state, actions, model.static_in(tensordict), memory)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -34,7 +35,7 @@ def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -
     def unbounded(*shape: int) -> Unbounded:
         return Unbounded(shape=torch.Size(shape), dtype=torch.float64, device=device)
 
-    observation: dict[str, Unbounded | Bounded] = {"state": unbounded(scene.num_nodes, 13)}
+    observation: dict[str, Unbounded | Bounded] = {"state": unbounded(scene.num_nodes, scene.state_size)}
     if physics:
         observation["physics"] = unbounded(scene.physics_size)
     if variants > 1:
@@ -43,13 +44,11 @@ def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -
     # What a step reads besides the action: the physics, or the state where that is all there is.
     carried = {"physics" if physics else "state", "variant"} & observation.keys()
     env.state_spec = Composite({key: observation[key].clone() for key in carried}, device=device)
-    env.action_spec = Bounded(
-        low=torch.as_tensor(scene.action_low, dtype=torch.float32),
-        high=torch.as_tensor(scene.action_high, dtype=torch.float32),
-        shape=torch.Size((scene.num_actions,)),
-        dtype=torch.float32,
-        device=device,
-    )
+    actions: dict[str, Any] = {"shape": torch.Size((scene.num_actions,)), "dtype": torch.float32, "device": device}
+    low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (scene.action_low, scene.action_high))
+    # Of a robot that is known by its logs bounds may not be.
+    bounded = bool(low.isfinite().all() & high.isfinite().all())
+    env.action_spec = Bounded(low=low, high=high, **actions) if bounded else Unbounded(**actions)
     env.reward_spec = Unbounded(shape=torch.Size((1,)), dtype=torch.float32, device=device)
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.scenes.joint_chain import JointChain
 from torchrl_gn.scenes.scene import Scene
 
 StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndarray]
@@ -20,22 +21,36 @@ class StartSampler:
     """Draw start states of a scene, reproducibly.
 
     Args:
-        scenes: the scene, or variants of it.
+        scenes: the scene, or variants of it; or a robot that is known by its joints alone.
         start_states: ``[M, S]`` full MuJoCo states to choose from, each equally likely,
             or a function ``(n, generator) -> [n, S]``. Default: the system's own
-            reset distribution.
+            reset distribution. Of a robot of joints: node states, ``[N, C]`` in place of ``[S]``; it has no default.
         seed: seed of the draws. Default: one drawn from torch's global generator, so
             that ``torch.manual_seed`` makes runs repeat.
 
     Raises:
-        ValueError: the start states are not ``[M, S]`` of finite numbers.
+        ValueError: the start states are not ``[M, S]`` of finite numbers, or there are none of a robot of joints.
     """
 
     def __init__(
-        self, scenes: Scene | Sequence[Scene], start_states: StartStates | None = None, seed: int | None = None
+        self,
+        scenes: Scene | JointChain | Sequence[Scene],
+        start_states: StartStates | None = None,
+        seed: int | None = None,
     ):
-        self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
+        self.scenes = (scenes,) if isinstance(scenes, (Scene, JointChain)) else tuple(scenes)
         self.scene = self.scenes[0]
+        first = self.scene
+        if isinstance(first, Scene):
+            self.shape: tuple[int, ...] = (first.physics_size,)
+        else:
+            self.shape = (first.num_nodes, first.state_size)
+            if start_states is None:
+                wanted = f"[M, {first.num_nodes}, {first.state_size}]"
+                raise ValueError(
+                    f"Nothing is known of where robot {first.name!r} starts; give start_states {wanted}, those of its"
+                    " log, say."
+                )
         self._function: Callable[[int, np.random.Generator], np.ndarray] | None = None
         self._table: np.ndarray | None = None
         if isinstance(start_states, (Tensor, np.ndarray)):
@@ -58,17 +73,17 @@ class StartSampler:
             variant: ``[*B, 1]`` which of several variants each of them is of.
 
         Returns:
-            ``[*B, S]`` float64 full MuJoCo states, on the CPU.
+            ``[*B, S]`` float64 full MuJoCo states, or ``[*B, N, C]``, on the CPU.
         """
         size = shape.numel()
         mask = np.ones(size, dtype=bool) if reset is None else reset.reshape(size).cpu().numpy()
-        states = np.zeros((size, self.scene.physics_size))
+        states = np.zeros((size, *self.shape))
         count = int(mask.sum())
         if count:
             drawn = self._sample(count, None if variant is None else variant.reshape(size).cpu().numpy()[mask])
             states[:] = drawn[0]
             states[mask] = drawn
-        return torch.from_numpy(states).reshape(*shape, -1)
+        return torch.from_numpy(states).reshape(*shape, *self.shape)
 
     def _sample(self, count: int, variant: np.ndarray | None) -> np.ndarray:
         if self._table is not None:
@@ -76,18 +91,19 @@ class StartSampler:
         if self._function is not None:
             return self._checked(self._function(count, self._rng), count)
         variant = np.zeros(count, dtype=np.int64) if variant is None else variant
-        return draw_start_states(Simulator(self.scenes), variant, self._rng)[0]
+        scenes = [scene for scene in self.scenes if isinstance(scene, Scene)]
+        return draw_start_states(Simulator(scenes), variant, self._rng)[0]
 
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:
         if isinstance(states, Tensor):
             states = states.detach().cpu().numpy()
         states = np.array(states, dtype=np.float64)
-        rows = "M" if count is None else count
-        right = states.ndim == 2 and states.shape[1] == self.scene.physics_size and len(states) > 0
+        right = states.shape[1:] == self.shape and len(states) > 0
         if not right or (count is not None and len(states) != count):
-            wanted = f"[{rows}, {self.scene.physics_size}]"
+            wanted = f"[{', '.join(map(str, ('M' if count is None else count, *self.shape)))}]"
             raise ValueError(f"start states of {self.scene.name!r} must be {wanted}, got {list(states.shape)}")
-        if not np.isfinite(states).all():
-            bad = int(np.flatnonzero(~np.isfinite(states).all(axis=1))[0])
+        finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
+        if not finite.all():
+            bad = int(np.flatnonzero(~finite)[0])
             raise ValueError(f"start state {bad} of {self.scene.name!r} is not finite")
         return states

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from torch import Tensor, nn
@@ -63,4 +64,6 @@ def _each(cell: nn.GRUCell, features: Tensor, hidden: Tensor) -> Tensor:
     """The cell for every item ``[*B, (I,) F]``."""
     if cell.hidden_size == 0:
         return hidden
-    return cell(features.flatten(0, -2), hidden.flatten(0, -2)).view_as(hidden)
+    rows = math.prod(hidden.shape[:-1])  # one, of a single graph's globals
+    flat = (each.reshape(rows, each.shape[-1]) for each in (features, hidden))
+    return cell(*flat).view_as(hidden)

@@ -92,6 +92,11 @@ class JointChain:
         return 1 + max((index for indices in self.commands for index in indices), default=-1)
 
     @property
+    def state_size(self) -> int:
+        """Numbers of a node's state: cosine, sine, velocity, extras."""
+        return 3 + len(self.extras)
+
+    @property
     def node_names(self) -> tuple[str, ...]:
         """The base and the bodies, named after their joints."""
         return ("base", *self.joint_names)

@@ -137,6 +137,11 @@ class Scene:
         return mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
     @property
+    def state_size(self) -> int:
+        """Numbers of a node's state: position 3, quaternion 4, linear and angular velocity 3 each."""
+        return 13
+
+    @property
     def sensor_slice(self) -> slice:
         """Where ``mjData.sensordata`` holds the state.
 
