@@ -17,6 +17,7 @@ from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.incidence import Incidence
 from torchrl_gn.modules.joint_linking import make_linking
 from torchrl_gn.modules.local_frame import LocalFrame, Seen
+from torchrl_gn.modules.shapes import check_shapes
 from torchrl_gn.modules.unseen_features import check_seen
 from torchrl_gn.scenes.scene_values import SceneValues, topology
 
@@ -228,7 +229,7 @@ class BoundForwardModel(TensorDictModuleBase):
         Raises:
             ValueError: if a shape does not fit the scene.
         """
-        self._check_shapes(state, action, static)
+        check_shapes(self.scene, self.layout.size, state, action, static)
         return self._advance(state, action, self.fold(static))[0]
 
     def rollout(
@@ -263,7 +264,7 @@ class BoundForwardModel(TensorDictModuleBase):
     ) -> tuple[Tensor, TensorDictBase | None]:
         """As :meth:`rollout`, with what a recurrent model remembers at its end, to go on from; others remember None."""
         for action in actions.unbind(-2)[:1]:
-            self._check_shapes(state, action, static)
+            check_shapes(self.scene, self.layout.size, state, action, static)
         states, folded = [state], self.fold(static)
         for action in actions.unbind(-2):
             state, memory = self._advance(state, action, folded, memory)
@@ -288,7 +289,7 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def delta(self, state: Tensor, action: Tensor, folded: Folded | None = None) -> Tensor:
         """Predicted change of the state ``[*B, N, 12]``, exactly zero in dead components."""
-        self._check_shapes(state, action)
+        check_shapes(self.scene, self.layout.size, state, action)
         return self._delta(state, action, folded or self.fold())
 
     def delta_and_memory(
@@ -326,7 +327,7 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def dynamic_graph(self, state: Tensor, action: Tensor, values: SceneValues | None = None) -> Graph:
         """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
-        self._check_shapes(state, action)
+        check_shapes(self.scene, self.layout.size, state, action)
         values = values or self.values
         return self._dynamic_graph(self.frame.see(state, values), action, values)
 
@@ -346,23 +347,6 @@ class BoundForwardModel(TensorDictModuleBase):
             normalizers = self.model.static_normalizers.items()
             nodes, edges, globals_ = (normalizer(getattr(values, part), dtype) for part, normalizer in normalizers)
         return Graph(nodes, edges, globals_, self.incidence.edge_index)
-
-    def _check_shapes(self, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> None:
-        item = (self.scene.num_nodes, self.layout.size)
-        if tuple(state.shape[-2:]) != item:
-            raise ValueError(
-                f"State of scene {self.scene.name!r} must be [*B, {item[0]}, {item[1]}], got {list(state.shape)}."
-            )
-        if action.shape != (*state.shape[:-2], self.scene.num_actions):
-            raise ValueError(
-                f"Action of scene {self.scene.name!r} must be {[*state.shape[:-2], self.scene.num_actions]} to go with"
-                f" a state {list(state.shape)}, got {list(action.shape)}."
-            )
-        if static is not None and static.shape not in ((), state.shape[:-2]):
-            raise ValueError(
-                f"Static values must have no batch or that of the state, {list(state.shape[:-2])},"
-                f" got {list(static.shape)}."
-            )
 
     def update_static_normalizers(self, static: TensorDictBase | None = None) -> None:
         """Take static values, by default this scene's, into the model's statistics: once, before training.
@@ -390,7 +374,7 @@ class BoundForwardModel(TensorDictModuleBase):
         Raises:
             ValueError: if a shape does not fit or a number is not finite; no statistic is changed.
         """
-        self._check_shapes(state, action, static)
+        check_shapes(self.scene, self.layout.size, state, action, static)
         for what, given in (("state", state), ("action", action), ("next state", next_state), ("static", static)):
             if given is not None:
                 require_finite(given, what)

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.recurrent_core import RecurrentCore
+from torchrl_gn.modules.shapes import check_shapes
 
 if TYPE_CHECKING:
     from torchrl_gn.modules.forward_model import ForwardModel
@@ -45,7 +46,7 @@ class BoundRecurrentModel(BoundForwardModel):
         """Write the predicted next state and the memory into ``tensordict`` and return it."""
         state, action = (tensordict[key] for key in self.in_keys[:2])
         folded = self.fold(self.static_in(tensordict))
-        self._check_shapes(state, action)
+        check_shapes(self.scene, self.layout.size, state, action)
         next_state, memory = self._advance(state, action, folded, tensordict.get("memory", None))
         tensordict.set(self.out_keys[0], next_state)
         return tensordict.set(self.out_keys[1], memory)

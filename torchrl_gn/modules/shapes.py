@@ -1,0 +1,37 @@
+"""Shapes of what a model is given."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.scenes.scene import Scene
+
+
+def check_shapes(scene: Scene, size: int, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> None:
+    """Refuse what does not fit a scene.
+
+    Args:
+        scene: the scene.
+        size: numbers of a node's state.
+        state: should be ``[*B, N, size]``.
+        action: should be ``[*B, A]``.
+        static: should have the same batch, or none.
+
+    Raises:
+        ValueError: naming what does not.
+    """
+    batch = state.shape[:-2]
+    if tuple(state.shape[-2:]) != (scene.num_nodes, size):
+        raise ValueError(
+            f"State of scene {scene.name!r} must be [*B, {scene.num_nodes}, {size}], got {list(state.shape)}."
+        )
+    if action.shape != (*batch, scene.num_actions):
+        raise ValueError(
+            f"Action of scene {scene.name!r} must be {[*batch, scene.num_actions]} to go with a state"
+            f" {list(state.shape)}, got {list(action.shape)}."
+        )
+    if static is not None and static.shape not in ((), batch):
+        raise ValueError(
+            f"Static values must have no batch or that of the state, {list(batch)}, got {list(static.shape)}."
+        )
