@@ -64,5 +64,5 @@ def test_collectors_act_by_the_last_policy(cluster):
     assert progress.frames == 160
     actions = trainer.buffer[:]["action"]
     assert actions[:40].std() > 0.3
-    assert actions[-40:].min() > 0.9
+    assert actions[-40:].min() > 0.5  # the tanh of 1, but for some noise
     assert len(trainer.buffer[:]["observation"].unique(dim=0)) == 160  # each collector has a seed of its own

@@ -6,12 +6,14 @@ from torch import Tensor, nn
 
 
 class OutputNormalization(nn.Module):
-    """Divide by the mean magnitude where that is above 1 (Wang et al. 2020, "Striving for simplicity").
+    r"""Location :math:`\mu / \sqrt{1 + \overline{\mu^2}}`, with a mean square of at most 1.
 
     A value that always asks for more drives a policy far into the flat ends of its tanh, the more so under Adam, which
-    makes up for small gradients; what is drawn there hardly varies, and nothing else is tried again.
+    makes up for small gradients; what is drawn there hardly varies, and nothing else is tried again. Wang et al. 2020
+    ("Striving for simplicity") divide by the mean magnitude where that is above 1, which leaves a single action without
+    any gradient there; this is the same, smoothly.
     """
 
     def forward(self, location: Tensor) -> Tensor:
-        """``[*B, A]`` with a mean magnitude of at most 1."""
-        return location / location.abs().mean(-1, keepdim=True).clamp(min=1)
+        """Bounded locations ``[*B, A]``."""
+        return location * (1 + location.square().mean(-1, keepdim=True)).rsqrt()
