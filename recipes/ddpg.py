@@ -32,6 +32,7 @@ from torchrl_gn.training import (
     clean_exit,
     learn_with_progress,
     load_checkpoint,
+    make_agent_optimizer,
     mean_return,
     report_learning,
 )
@@ -43,15 +44,6 @@ MAY_CHANGE = ("trainer.frames", "trainer.compile", "threads", "logger", "run_dir
 def options(cfg: DictConfig) -> dict[str, Any]:
     """Options as plain values."""
     return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
-
-
-def make_optimizer(cfg: DictConfig, loss: DDPGLoss) -> torch.optim.Optimizer:
-    """One for both, each network with a rate of its own."""
-    groups = [
-        {"params": list(loss.actor_network_params.parameters()), "lr": cfg.policy_lr},
-        {"params": list(loss.value_network_params.parameters()), "lr": cfg.value_lr},
-    ]
-    return torch.optim.Adam(groups, fused=True)
 
 
 @hydra.main(version_base=None, config_path="config", config_name="ddpg")
@@ -81,7 +73,7 @@ def main(cfg: DictConfig) -> None:
         env,
         TensorDictSequential([agent.policy, noise]),
         lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
-        make_optimizer(cfg, loss),
+        make_agent_optimizer([loss], policy_lr=cfg.policy_lr, value_lr=cfg.value_lr),
         seed=cfg.seed,
         **options(cfg.trainer),
     )

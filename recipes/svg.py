@@ -35,6 +35,7 @@ from torchrl_gn.training import (
     clean_exit,
     learn_with_progress,
     load_checkpoint,
+    make_agent_optimizer,
     mean_return,
     report_learning,
 )
@@ -64,17 +65,6 @@ def make_losses(cfg: DictConfig, agent: Agent) -> list[LossModule]:
     loss = SVGLoss(agent.policy, agent.value, agent.model, reward, steps=cfg.horizon, delay_actor=True)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.gamma)
     return [loss] if agent.model is None else [loss, ObservationModelLoss(agent.model, agent.reward)]
-
-
-def make_optimizer(cfg: DictConfig, losses: list[LossModule]) -> torch.optim.Optimizer:
-    """One for all, each network with a rate of its own."""
-    agent = cast("SVGLoss", losses[0])
-    groups = [
-        {"params": list(agent.actor_network_params.parameters()), "lr": cfg.policy_lr},
-        {"params": list(agent.value_network_params.parameters()), "lr": cfg.value_lr},
-    ]
-    groups += [{"params": list(loss.parameters()), "lr": cfg.model_lr} for loss in losses[1:]]
-    return torch.optim.Adam(groups, fused=True)
 
 
 @hydra.main(version_base=None, config_path="config", config_name="svg")
@@ -109,7 +99,7 @@ def main(cfg: DictConfig) -> None:
             makers[0]() if cfg.ray is None else makers,
             agent.policy,
             lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
-            make_optimizer(cfg, losses),
+            make_agent_optimizer(losses, policy_lr=cfg.policy_lr, value_lr=cfg.value_lr, model_lr=cfg.model_lr),
             seed=cfg.seed,
             **options(cfg.trainer),
         )

@@ -8,7 +8,10 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_gn.training.optimizers import ScheduledOptimizer, make_optimizer
+from torchrl_gn.modules import Agent
+from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
+from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.training.optimizers import ScheduledOptimizer, make_agent_optimizer, make_optimizer
 
 
 def network() -> nn.Module:
@@ -123,3 +126,26 @@ def test_bad_choices_are_named():
     for lr in (0.0, -1.0):
         with pytest.raises(ValueError, match=f"lr={lr} must be positive"):
             make_optimizer(network(), lr=lr)
+
+
+def test_an_agents_networks_learn_at_rates_of_their_own():
+    agent = Agent(ObservationGraph.swimmer(3), model="gn", learned_reward=True, hidden=[8])
+    losses = [
+        SVGLoss(agent.policy, agent.value, agent.model, agent.reward),
+        ObservationModelLoss(agent.model, agent.reward),
+    ]
+    optimizer = make_agent_optimizer(losses, policy_lr=1e-4, value_lr=2e-4, model_lr=3e-4)
+    found = {weight: group["lr"] for group in optimizer.param_groups for weight in group["params"]}
+    trained = [weight for loss in losses for weight in loss.parameters()]
+    assert len(found) == len(trained) == sum(len(group["params"]) for group in optimizer.param_groups)
+    for part, rate in ((agent.policy, 1e-4), (agent.value, 2e-4), (agent.model, 3e-4), (agent.reward, 3e-4)):
+        assert {found.get(weight) for weight in part.parameters()} == {rate}
+
+
+def test_a_rate_that_is_needed_is_missed():
+    agent = Agent(ObservationGraph.swimmer(3), model="gn", hidden=[8])
+    losses = [SVGLoss(agent.policy, agent.value, agent.model, lambda td: td), ObservationModelLoss(agent.model)]
+    with pytest.raises(ValueError, match="model_lr=None must be positive"):
+        make_agent_optimizer(losses, policy_lr=1e-4, value_lr=1e-3)
+    with pytest.raises(ValueError, match="value_lr=0"):
+        make_agent_optimizer(losses[:1], policy_lr=1e-4, value_lr=0)

@@ -103,8 +103,10 @@ class ModelEnv(ModelBasedEnvBase):
                 spec["memory"] = self._spec_of(cast(Any, model).own_memory())
 
     def _spec_of(self, entries: TensorDictBase) -> Composite:
-        of = {str(key): (value.shape, value.dtype) for key, value in entries.items()}
-        specs = {key: Unbounded(shape=shape, dtype=dtype, device=self.device) for key, (shape, dtype) in of.items()}
+        specs = {
+            str(key): Unbounded(shape=value.shape, dtype=value.dtype, device=self.device)
+            for key, value in entries.items()
+        }
         return Composite(specs, device=self.device)
 
     @property
@@ -184,10 +186,8 @@ class ModelEnv(ModelBasedEnvBase):
                 f"actions must be [*B, H, {self.scene.num_actions}] with the TensorDict's batch"
                 f" {list(tensordict.shape)} and H at least 1, got {list(actions.shape)}"
             )
-        state, model = (
-            read(tensordict, "state", self._state_shape, self),
-            cast(object, self.world_model),
-        )
+        state = read(tensordict, "state", self._state_shape, self)
+        model = cast(object, self.world_model)
         if isinstance(model, BoundForwardModel):
             memory = cast("TensorDictBase | None", tensordict.get("memory", None))
             states, _ = model.rollout_and_memory(state, actions, model.static_in(tensordict), memory)

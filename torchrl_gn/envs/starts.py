@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -39,18 +40,14 @@ class StartSampler:
         seed: int | None = None,
     ):
         self.scenes = (scenes,) if isinstance(scenes, (Scene, JointChain)) else tuple(scenes)
-        self.scene = self.scenes[0]
-        first = self.scene
-        if isinstance(first, Scene):
-            self.shape: tuple[int, ...] = (first.physics_size,)
-        else:
-            self.shape = (first.num_nodes, first.state_size)
-            if start_states is None:
-                wanted = f"[M, {first.num_nodes}, {first.state_size}]"
-                raise ValueError(
-                    f"Nothing is known of where robot {first.name!r} starts; give start_states {wanted}, those of its"
-                    " log, say."
-                )
+        self.scene = scene = self.scenes[0]
+        joints = isinstance(scene, JointChain)
+        self.shape = (scene.num_nodes, scene.state_size) if joints else (scene.physics_size,)
+        if joints and start_states is None:
+            raise ValueError(
+                f"Nothing is known of where robot {scene.name!r} starts; give start_states"
+                f" [M, {scene.num_nodes}, {scene.state_size}], those of its log, say."
+            )
         self._function: Callable[[int, np.random.Generator], np.ndarray] | None = None
         self._table: np.ndarray | None = None
         if isinstance(start_states, (Tensor, np.ndarray)):
@@ -91,7 +88,7 @@ class StartSampler:
         if self._function is not None:
             return self._checked(self._function(count, self._rng), count)
         variant = np.zeros(count, dtype=np.int64) if variant is None else variant
-        scenes = [scene for scene in self.scenes if isinstance(scene, Scene)]
+        scenes = cast("tuple[Scene, ...]", self.scenes)  # a robot of joints has one of the above
         return draw_start_states(Simulator(scenes), variant, self._rng)[0]
 
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:

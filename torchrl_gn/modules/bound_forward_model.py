@@ -229,7 +229,7 @@ class BoundForwardModel(TensorDictModuleBase):
         Raises:
             ValueError: if a shape does not fit the scene.
         """
-        check_shapes(self.scene, self.layout.size, state, action, static)
+        check_shapes(self.scene, state, action, static)
         return self._advance(state, action, self.fold(static))[0]
 
     def rollout(
@@ -264,7 +264,7 @@ class BoundForwardModel(TensorDictModuleBase):
     ) -> tuple[Tensor, TensorDictBase | None]:
         """As :meth:`rollout`, with what a recurrent model remembers at its end, to go on from; others remember None."""
         for action in actions.unbind(-2)[:1]:
-            check_shapes(self.scene, self.layout.size, state, action, static)
+            check_shapes(self.scene, state, action, static)
         states, folded = [state], self.fold(static)
         for action in actions.unbind(-2):
             state, memory = self._advance(state, action, folded, memory)
@@ -289,7 +289,7 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def delta(self, state: Tensor, action: Tensor, folded: Folded | None = None) -> Tensor:
         """Predicted change of the state ``[*B, N, 12]``, exactly zero in dead components."""
-        check_shapes(self.scene, self.layout.size, state, action)
+        check_shapes(self.scene, state, action)
         return self._delta(state, action, folded or self.fold())
 
     def delta_and_memory(
@@ -327,7 +327,7 @@ class BoundForwardModel(TensorDictModuleBase):
 
     def dynamic_graph(self, state: Tensor, action: Tensor, values: SceneValues | None = None) -> Graph:
         """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
-        check_shapes(self.scene, self.layout.size, state, action)
+        check_shapes(self.scene, state, action)
         values = values or self.values
         return self._dynamic_graph(self.frame.see(state, values), action, values)
 
@@ -374,7 +374,7 @@ class BoundForwardModel(TensorDictModuleBase):
         Raises:
             ValueError: if a shape does not fit or a number is not finite; no statistic is changed.
         """
-        check_shapes(self.scene, self.layout.size, state, action, static)
+        check_shapes(self.scene, state, action, static)
         for what, given in (("state", state), ("action", action), ("next state", next_state), ("static", static)):
             if given is not None:
                 require_finite(given, what)

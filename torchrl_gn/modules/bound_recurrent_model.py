@@ -46,7 +46,7 @@ class BoundRecurrentModel(BoundForwardModel):
         """Write the predicted next state and the memory into ``tensordict`` and return it."""
         state, action = (tensordict[key] for key in self.in_keys[:2])
         folded = self.fold(self.static_in(tensordict))
-        check_shapes(self.scene, self.layout.size, state, action)
+        check_shapes(self.scene, state, action)
         next_state, memory = self._advance(state, action, folded, tensordict.get("memory", None))
         tensordict.set(self.out_keys[0], next_state)
         return tensordict.set(self.out_keys[1], memory)

@@ -8,23 +8,22 @@ from torch import Tensor
 from torchrl_gn.scenes.scene import Scene
 
 
-def check_shapes(scene: Scene, size: int, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> None:
+def check_shapes(scene: Scene, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> None:
     """Refuse what does not fit a scene.
 
     Args:
         scene: the scene.
-        size: numbers of a node's state.
-        state: should be ``[*B, N, size]``.
+        state: should be ``[*B, N, C]``, with ``C`` the scene's ``state_size``.
         action: should be ``[*B, A]``.
         static: should have the same batch, or none.
 
     Raises:
         ValueError: naming what does not.
     """
-    batch = state.shape[:-2]
-    if tuple(state.shape[-2:]) != (scene.num_nodes, size):
+    batch, wanted = state.shape[:-2], [scene.num_nodes, scene.state_size]
+    if list(state.shape[-2:]) != wanted:
         raise ValueError(
-            f"State of scene {scene.name!r} must be [*B, {scene.num_nodes}, {size}], got {list(state.shape)}."
+            f"State of scene {scene.name!r} must be [*B, {', '.join(map(str, wanted))}], got {list(state.shape)}."
         )
     if action.shape != (*batch, scene.num_actions):
         raise ValueError(

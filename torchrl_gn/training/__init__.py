@@ -12,6 +12,7 @@ from torchrl_gn.training.learning import report_learning as report_learning
 from torchrl_gn.training.off_policy import OffPolicyTrainer as OffPolicyTrainer
 from torchrl_gn.training.off_policy import mean_return as mean_return
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer
+from torchrl_gn.training.optimizers import make_agent_optimizer as make_agent_optimizer
 from torchrl_gn.training.optimizers import make_optimizer as make_optimizer
 from torchrl_gn.training.ray_cluster import RayCluster as RayCluster
 from torchrl_gn.training.run_folder import RunFolder as RunFolder

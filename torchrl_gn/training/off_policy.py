@@ -76,8 +76,8 @@ class OffPolicyTrainer:
         capacity: transitions that the replay buffer holds.
         target_interval: updates between copies of the target networks (paper: 1000).
         max_norm: norm that the gradient of all weights together is clipped to.
-        compile: compile the losses and their gradients with ``torch.compile``: two or three times as many updates a
-            second, after some minutes of compiling at the first.
+        compile: compile the losses and their gradients with ``torch.compile`` from the second update on, which takes
+            some minutes: 1.6 to 1.9 times as many updates a second then.
         seed: of the replay buffer.
 
     Raises:

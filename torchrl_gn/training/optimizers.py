@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Literal, get_args
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, cast, get_args
 
 import torch
 from torch import nn
+from torchrl.objectives import LossModule
 
 Preset = Literal["muon", "adam", "paper"]
 
@@ -110,6 +111,30 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
     if rest:
         optimizers.append(torch.optim.Adam(rest, lr=1e-3, fused=True))
     return ScheduledOptimizer(optimizers, _cosine)
+
+
+def make_agent_optimizer(
+    losses: Sequence[LossModule], *, policy_lr: float, value_lr: float, model_lr: float | None = None
+) -> torch.optim.Optimizer:
+    """One Adam for all that an agent learns by, each network with a rate of its own.
+
+    Args:
+        losses: a loss of policy and value first (``DDPGLoss``, :class:`~torchrl_gn.objectives.SVGLoss`), those of what
+            it plans with after.
+        policy_lr: learning rate of the policy.
+        value_lr: of the value.
+        model_lr: of model and reward, which the other losses train.
+
+    Raises:
+        ValueError: if a rate that is needed is missing, or not positive and finite.
+    """
+    first = cast(Any, losses[0])
+    groups = [(first.actor_network_params, policy_lr, "policy_lr"), (first.value_network_params, value_lr, "value_lr")]
+    groups += [(loss, model_lr, "model_lr") for loss in losses[1:]]
+    for _, rate, name in groups:
+        if rate is None or not 0 < rate < math.inf:
+            raise ValueError(f"{name}={rate} must be positive and finite.")
+    return torch.optim.Adam([{"params": list(of.parameters()), "lr": rate} for of, rate, _ in groups], fused=True)
 
 
 def _paper_decay(step: int, fraction: float) -> float:
