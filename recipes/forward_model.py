@@ -13,6 +13,8 @@ systems"); `zero_shot` systems are only evaluated (paper: Figure "Zero-shot dyna
 `parametrized=true` trains on random variants of the systems instead, each sequence of its own (paper: SM
 "Datasets"), and evaluates on variants never trained on and on the standard systems; of several systems, those
 without variants stay as they are.
+`start_from=cheetah data.extra=runs/mpc/<time>/gn.safetensors` goes on from a model that comes with the package; half of
+what it learns from are the episodes that recipes/mpc.py played with it.
 All options with their defaults: recipes/config/forward_model.yaml. What came out, and how
 long it took: docs/results.md.
 """
@@ -27,6 +29,7 @@ from typing import Any, cast
 import hydra
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from safetensors.torch import load_file
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
 from tqdm import tqdm
@@ -35,6 +38,7 @@ from torchrl_gn.data import TrajectoryDataset, collect_trajectories, trajectory_
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_training_curve, report, summary
 from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
+from torchrl_gn.pretrained import load_pretrained, pretrained_names
 from torchrl_gn.scenes import Scene, has_variants, load_scene
 from torchrl_gn.training import (
     Budget,
@@ -114,17 +118,34 @@ def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]
 
 
 def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
-    """Half of the training trajectories, and as many of `data.extra`."""
+    """Half of the training trajectories, and as many of `data.extra`, over and over where those are fewer."""
     if cfg.data.extra is None:
         return dataset.train
-    extra = TensorDict.load_memmap(cfg.data.extra)
-    count = min(len(extra), (len(dataset.train) + 1) // 2)
-    halves = [cast(TensorDict, data[:count]).select("state", "action") for data in (dataset.train, extra)]
-    return cast(TensorDictBase, torch.cat(cast(list, halves)))
+    sources = [cfg.data.extra] if isinstance(cfg.data.extra, str) else list(cfg.data.extra)
+    more = torch.cat([extra_trajectories(source, cfg.data.length) for source in sources])
+    count = (len(dataset.train) + 1) // 2
+    own = cast(TensorDict, dataset.train[:count]).select("state", "action")
+    return cast(TensorDictBase, torch.cat([own, more[torch.arange(count) % len(more)].to(own["action"].dtype)]))
+
+
+def extra_trajectories(source: str, length: int) -> TensorDict:
+    """Trajectories ``[M]`` of a folder, or of a file of recipes/mpc.py's episodes, in pieces of `length` steps."""
+    if not source.endswith(".safetensors"):
+        return cast(TensorDict, TensorDict.load_memmap(source)).select("state", "action")
+    kept = load_file(source)
+    episodes, steps = kept["action"].shape[:2]
+    if steps < length:
+        raise ValueError(f"data.extra={source} has episodes of {steps} steps, fewer than data.length={length}.")
+    states, actions = (kept[name].unfold(1, length + more, length) for name, more in (("state", 1), ("action", 0)))
+    pieces = {"state": states.movedim(-1, 2).flatten(0, 1), "action": actions.movedim(-1, 2).flatten(0, 1)}
+    return TensorDict(pieces, [episodes * (steps // length)])
 
 
 def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
-    """A model with fresh weights."""
+    """A model with fresh weights, or the one to start from."""
+    if cfg.start_from is not None:
+        load = load_pretrained if cfg.start_from in pretrained_names() else load_checkpoint
+        return load(cfg.start_from).model
     if cfg.model.core == "mlp" and len(scenes) > 1:
         raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
     items = (scenes[0].num_nodes, scenes[0].num_edges) if cfg.model.core == "mlp" else None
@@ -228,7 +249,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     with workers.first_goes_first():
         tasks = make_tasks(cfg, scenes, Path(cfg.data.folder) if cfg.data.folder else run.data)
     trainer = make_trainer(cfg, model, tasks, workers)
-    if not begun:
+    if not begun and cfg.start_from is None:
         fit_normalizers(cfg, trainer, tasks)
     curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scenes, config=options(cfg))
     if not workers.first:

@@ -138,6 +138,7 @@ def fill_in(cfg: DictConfig) -> None:
             raise ValueError(f"{cfg.system!r} is no system of the paper: say which {key} it gets, as {key}=...")
         cfg[key] = value if cfg[key] is None else cfg[key]
     cfg.steps = (task.steps if task else 200) if cfg.steps is None else cfg.steps
+    cfg.gn.iterations = ((task or {}).get("iterations") or 3) if cfg.gn.iterations is None else cfg.gn.iterations
     if not isinstance(cfg.planner, ListConfig):
         cfg.planner = [cfg.planner]
     unknown = [name for name in cfg.planner if name not in ON_MODEL + ON_PHYSICS]

@@ -8,7 +8,12 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.pretrained import load_pretrained
+from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_checkpoint
 
 ROOT = Path(__file__).parents[2]
@@ -83,6 +88,23 @@ def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path, c
     assert {path.name for path in tmp_path.glob("*/rollout.gif")} and (tmp_path / "errors.png").is_file()
     saved = load_checkpoint(tmp_path)
     assert [scene.name for scene in saved.scenes()] == ["swimmer3", "pendulum"]
+
+
+def test_a_model_goes_on_from_another_with_episodes_as_half_of_its_data(tmp_path, call):
+    scene = load_scene("pendulum")
+    episodes = collect_trajectories(scene, 3, 120, seed=9)
+    save_file({"state": episodes["state"], "action": episodes["action"].float()}, tmp_path / "gn.safetensors")
+    small = (*SMALL, "minutes=null", "steps=3", "lr=1e-6", "start_from=pendulum")
+    options = (*small, f"data.extra=[{tmp_path / 'gn.safetensors'}]")
+    code, _, errors = call(*options, f"run_dir={tmp_path / 'run'}", recipe="forward_model")
+    assert code == 0, errors
+    before, after = load_pretrained("pendulum").model, load_checkpoint(tmp_path / "run").model
+    assert torch.equal(before.node_normalizer.mean, after.node_normalizer.mean)  # weights go with their statistics
+    distance = torch.cat([(a - b).flatten() for a, b in zip(before.parameters(), after.parameters(), strict=True)])
+    assert 0 < distance.abs().max() < 1e-2
+
+    code, _, errors = call(*options, "data.length=130", f"run_dir={tmp_path / 'long'}", recipe="forward_model")
+    assert code == 1 and "episodes of 120 steps, fewer than data.length=130" in errors and "Traceback" not in errors
 
 
 def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path, run, call):

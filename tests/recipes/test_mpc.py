@@ -11,12 +11,12 @@ SMALL = ("episodes=2", "horizon=4", "gn.warm_up=2", "gn.samples=3", "gn.iteratio
 SAMPLED = ("cem.iterations=1", "cem.candidates=4", "cem.top_k=2", "mppi.iterations=1", "mppi.candidates=4")
 
 
-def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run):
+def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, call):
     options = (*SMALL, *SAMPLED, "mppi.top_k=2", f"run_dir={tmp_path}")
     code, output, errors = run(*options, "steps=2", "planner=[gn,random]", "video=false", recipe="mpc")
     assert code == 0, errors
     first = load_file(tmp_path / "gn.safetensors")["state"]
-    code, output, errors = run(*options, "steps=4", "planner=[gn,ilqg,mppi,cem_true,random]", recipe="mpc")
+    code, output, errors = call(*options, "steps=4", "planner=[gn,ilqg,mppi,cem_true,random]", recipe="mpc")
     assert code == 0, errors
     assert "warning" not in errors.lower()
     played = {path.stem: load_file(path)["state"] for path in tmp_path.glob("*.safetensors")}
@@ -28,7 +28,7 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run):
     printed = {Path(line).name for line in output.splitlines() if Path(line).is_file()}
     assert printed >= {"metrics.json", "rewards.png", "gn.gif", "ilqg.gif"}
 
-    code, _, errors = run(*options, "steps=4", "horizon=5", recipe="mpc")
+    code, _, errors = call(*options, "steps=4", "horizon=5", recipe="mpc")
     assert code == 1 and "other options: horizon=5 (was 4)" in errors and "Traceback" not in errors
 
 
