@@ -12,6 +12,7 @@ from torchrl_gn.atomic import write_json
 from torchrl_gn.evaluation import plot_learning_curves
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
 from torchrl_gn.training.off_policy import OffPolicyTrainer
+from torchrl_gn.training.progress import saving
 from torchrl_gn.training.run_folder import RunFolder
 from torchrl_gn.training.tracking import Tracker
 
@@ -34,9 +35,10 @@ def learn_with_progress(
     def save() -> None:
         save_checkpoint(path, trainer.agent, config=config, training=trainer.state_dict())
 
-    saved = trainer.seconds
-    bar = tqdm(total=trainer.total, initial=trainer.frames, unit=" frames", desc="learning", leave=False)
-    try:
+    with (
+        tqdm(total=trainer.total, initial=trainer.frames, unit=" frames", desc="learning", leave=False) as bar,
+        saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
+    ):
         for progress in trainer.run():
             bar.update(progress.frames - bar.n)
             tracker.log({f"train/{name}": value for name, value in progress.losses.items()}, progress.frames)
@@ -44,14 +46,7 @@ def learn_with_progress(
                 bar.set_postfix({"return": f"{progress.evaluation:.4g}", "updates": progress.updates})
                 numbers = {"return": progress.evaluation, "updates": progress.updates, "seconds": progress.seconds}
                 tracker.log({f"evaluation/{name}": value for name, value in numbers.items()}, progress.frames)
-            if progress.seconds - saved > config["checkpoint_seconds"]:
-                save()
-                saved = progress.seconds
-    except KeyboardInterrupt:
-        save()
-        raise
-    finally:
-        bar.close()
+            save_when_due()
     save()
 
 

@@ -58,6 +58,30 @@ def dataset_with_progress(
             return create_dataset(folder / name, scene, **sizes, **options, progress=show)
 
 
+@contextmanager
+def saving(save: Callable[[], None], seconds: Callable[[], float], every: float) -> Iterator[Callable[[], None]]:
+    """Save on Ctrl-C, and whenever what this yields is called and enough time has passed since the last time.
+
+    Args:
+        save: saves.
+        seconds: spent on what is saved.
+        every: seconds between saves.
+    """
+    last = seconds()
+
+    def save_when_due() -> None:
+        nonlocal last
+        if seconds() - last > every:
+            save()
+            last = seconds()
+
+    try:
+        yield save_when_due
+    except KeyboardInterrupt:
+        save()
+        raise
+
+
 def train_with_progress(
     trainer: Trainer,
     path: Path,
@@ -95,9 +119,11 @@ def train_with_progress(
         state = {**trainer.state_dict(), "curves": curves}
         save_checkpoint(path, trainer.model, scene=scene, config=config, training=state)
 
-    saved, losses = trainer.seconds, []
-    bar = tqdm(total=100, initial=int(100 * trainer.fraction), unit="%", desc="training", leave=False)
-    try:
+    losses: list[float] = []
+    with (
+        tqdm(total=100, initial=int(100 * trainer.fraction), unit="%", desc="training", leave=False) as bar,
+        saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
+    ):
         for progress in trainer.run():
             losses.append(progress.loss)
             if progress.step % 100 == 0:
@@ -110,14 +136,7 @@ def train_with_progress(
                 bar.update(int(100 * progress.fraction) - bar.n)
             if progress.validation is not None:
                 tracker.log({"validation/rollout_error_20": progress.validation}, progress.step)
-            if progress.seconds - saved > config["checkpoint_seconds"]:
-                save()
-                saved = progress.seconds
-    except KeyboardInterrupt:
-        save()
-        raise
-    finally:
-        bar.close()
+            save_when_due()
     trainer.restore_best()
     save()
     return curves
