@@ -88,8 +88,11 @@ def swim(scene: Scene, gait: np.ndarray, count: int, steps: int, rng: np.random.
     return TensorDict({"state": found["state"][:, going:].clone(), "action": action}, [count])
 
 
-def swim_by_policy(scene: Scene, agent: Agent, count: int, steps: int, seed: int) -> TensorDict:
-    """Trajectories ``[count]`` under a learned policy, each to a target of its own, begun when it has got going."""
+def swim_by_policy(scene: Scene, agent: Agent, hold: int, count: int, steps: int, seed: int) -> TensorDict:
+    """Trajectories ``[count]`` under a learned policy, each to a target of its own, begun when it has got going.
+
+    Each action is held for as many control steps as the policy learned with.
+    """
     env, going = SceneEnv(scene, seed=seed), 100
     policy = TensorDictSequential([SwimmerObservation(scene), agent.policy])
     generator = torch.Generator().manual_seed(seed)
@@ -98,9 +101,11 @@ def swim_by_policy(scene: Scene, agent: Agent, count: int, steps: int, seed: int
     now["target"] = torch.cat((targets, torch.full((count, 1), 0.05, dtype=torch.float64)), dim=1)
     states, actions = [], []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in tqdm(range(going + steps + 1), desc="swimming", leave=False):
+        for step in tqdm(range(going + steps + 1), desc="swimming", leave=False):
             states.append(now["state"])
-            actions.append(policy(now)["action"].double())
+            if step % hold == 0:
+                now = policy(now)
+            actions.append(now["action"].double())
             now.update(env.step(now)["next"].select("state", "physics"))
     kept = {"state": torch.stack(states[going:], 1), "action": torch.stack(actions[going:-1], 1)}
     return TensorDict(kept, [count])
@@ -148,9 +153,10 @@ def main(cfg: DictConfig) -> None:
     scene, rng = load_scene(cfg.system), np.random.default_rng(cfg.seed)
     metrics: dict[str, float | int] = {}
     if cfg.policy is not None:
-        agent, sizes = load_checkpoint(cfg.policy).agent, cfg.swimming
+        loaded, sizes = load_checkpoint(cfg.policy), cfg.swimming
+        hold = max(1, round(loaded.config["task"]["timestep"] / scene.timestep))
         swimming = {
-            name: swim_by_policy(scene, agent, sizes[name], cfg.length, cfg.seed + index)
+            name: swim_by_policy(scene, loaded.agent, hold, sizes[name], cfg.length, cfg.seed + index)
             for index, name in enumerate(("train", "test"))
         }
     else:
