@@ -1,6 +1,7 @@
 """Evaluate a trained forward model, on its own system or on another one.
 
     python recipes/evaluate.py checkpoint=runs/forward_model/<time> [system=swimmer8] [key=value ...]
+    python recipes/evaluate.py checkpoint=swimmerN system=swimmer12
 
 Collects fresh test trajectories, prints the error table (docs/evaluation.md says how errors
 are defined), and leaves metrics.json, a figure and a video in its run folder. All options:
@@ -14,15 +15,16 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.evaluation import report
+from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
+from torchrl_gn.training import RunFolder, clean_exit
 from torchrl_gn.training.progress import collecting
 
 
 @hydra.main(version_base=None, config_path="config", config_name="evaluate")
 @clean_exit
 def main(cfg: DictConfig) -> None:
-    checkpoint = load_checkpoint(cfg.checkpoint)
+    checkpoint = load_model(cfg.checkpoint)
     scene = load_scene(cfg.system, timestep=cfg.timestep) if cfg.system else checkpoint.scene()
     model = checkpoint.model.bind(scene, strict=cfg.strict)
     run = RunFolder(cfg.run_dir, "evaluate")

@@ -38,7 +38,7 @@ from torchrl_gn.data import TrajectoryDataset, collect_trajectories, trajectory_
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_training_curve, report, summary
 from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
-from torchrl_gn.pretrained import load_pretrained, pretrained_names
+from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import Scene, has_variants, load_scene
 from torchrl_gn.training import (
     Budget,
@@ -144,8 +144,7 @@ def extra_trajectories(source: str, length: int) -> TensorDict:
 def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
     """A model with fresh weights, or the one to start from."""
     if cfg.start_from is not None:
-        load = load_pretrained if cfg.start_from in pretrained_names() else load_checkpoint
-        return load(cfg.start_from).model
+        return load_model(cfg.start_from).model
     if cfg.model.core == "mlp" and len(scenes) > 1:
         raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
     items = (scenes[0].num_nodes, scenes[0].num_edges) if cfg.model.core == "mlp" else None

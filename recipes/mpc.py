@@ -42,10 +42,10 @@ from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards, rollout_video
 from torchrl_gn.modules import IdentifyingModel, specialize
 from torchrl_gn.planners import GradientPlanner, ILQGPlanner
-from torchrl_gn.pretrained import load_pretrained, pretrained_names
+from torchrl_gn.pretrained import load_model, pretrained_names
 from torchrl_gn.rewards import FixTask, Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, load_checkpoint
+from torchrl_gn.training import RunFolder, Tracker, clean_exit
 
 ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
 SAVE_SECONDS = 60
@@ -155,7 +155,7 @@ def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
     return scene, sample_variants(cfg.system, cfg.episodes, rng)
 
 
-def load_model(cfg: DictConfig, scene: Scene):
+def bind_model(cfg: DictConfig, scene: Scene):
     """The trained model, bound to the scene, and the inference model if it has one."""
     fitting = [cfg.system, re.sub(r"^swimmer\d+$", "swimmerN", cfg.system)]
     if cfg.variants:
@@ -164,7 +164,7 @@ def load_model(cfg: DictConfig, scene: Scene):
     if cfg.checkpoint is None and not names:
         what = f"variants of {cfg.system!r}" if cfg.variants else repr(cfg.system)
         raise ValueError(f"No trained model of {what} comes with the package; give checkpoint=PATH.")
-    checkpoint = load_pretrained(names[0]) if cfg.checkpoint is None else load_checkpoint(cfg.checkpoint)
+    checkpoint = load_model(cfg.checkpoint or names[0])
     if isinstance(checkpoint.trained, IdentifyingModel):
         bound, inference = checkpoint.trained.bind(scene)
         return specialize(bound, compile=cfg.compile), inference
@@ -271,7 +271,7 @@ def main(cfg: DictConfig) -> None:
     scene, scenes = make_scenes(cfg)
     reward = make_reward(cfg.reward, scene)
     env = SceneEnv(scenes, reward, seed=cfg.seed)
-    bound, inference = load_model(cfg, scene) if set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint else (None, None)
+    bound, inference = bind_model(cfg, scene) if set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint else (None, None)
     imagined = None if bound is None else ModelEnv(bound, reward)
     run = RunFolder(cfg.run_dir, "mpc")
     if (run.path / "config.yaml").exists():

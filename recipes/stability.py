@@ -42,9 +42,9 @@ from torchrl_gn.modules import (
     specialize,
 )
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.pretrained import load_pretrained, pretrained_names
+from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import Scene, has_variants, load_scene, make_variants, parameter_ranges
-from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
+from torchrl_gn.training import RunFolder, clean_exit
 
 RECIPES = Path(__file__).parent
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
@@ -358,7 +358,7 @@ def all_checks(scene: Scene, steps: int) -> list[Check]:
 
 def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
     """The model in every dtype, and states to try."""
-    loaded = load_pretrained(str(checkpoint)) if checkpoint in pretrained_names() else load_checkpoint(checkpoint)
+    loaded = load_model(checkpoint)
     scene = loaded.scene()
     rng = np.random.default_rng(cfg.seed)
     physics = torch.as_tensor(sample_start_states(scene, 64, rng))

@@ -8,8 +8,9 @@ import pytest
 
 from torchrl_gn.evaluation import fresh_errors
 from torchrl_gn.modules import Agent
-from torchrl_gn.pretrained import WEIGHTS, load_pretrained, pretrained_names
+from torchrl_gn.pretrained import WEIGHTS, load_model, load_pretrained, pretrained_names
 from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import CheckpointError, save_checkpoint
 
 
 @pytest.mark.parametrize("name", pretrained_names())
@@ -47,3 +48,13 @@ def test_there_are_some_and_they_are_small():
 def test_a_wrong_name_names_the_right_ones():
     with pytest.raises(ValueError, match=r"no trained model 'swimer6'; use one of .* Did you mean 'swimmer6'\?"):
         load_pretrained("swimer6")
+
+
+def test_a_model_is_found_by_its_name_or_where_it_lies(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = load_model("pendulum")
+    save_checkpoint(tmp_path / "cartpole", shipped.model, scene=shipped.scene())
+    assert load_model("cartpole").scene().name == "cartpole"
+    assert load_model("./cartpole").scene().name == load_model(tmp_path / "cartpole").scene().name == "pendulum"
+    with pytest.raises(CheckpointError, match="No checkpoint at no_such_model"):
+        load_model("no_such_model")

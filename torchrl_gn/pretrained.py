@@ -43,3 +43,15 @@ def load_pretrained(name: str) -> Checkpoint:
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"There is no trained model {name!r}; use one of {names}.{hint}")
     return load_checkpoint(WEIGHTS / f"{name}.safetensors")
+
+
+def load_model(source: str | Path) -> Checkpoint:
+    """Load a trained model by the name that it comes with the package under, or from a run folder or checkpoint file.
+
+    Args:
+        source: the name, or the path; ``"./cheetah"`` where a folder has the name of a model.
+
+    Raises:
+        CheckpointError: if it is neither, or the file cannot be used.
+    """
+    return load_pretrained(str(source)) if source in pretrained_names() else load_checkpoint(source)
