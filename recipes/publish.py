@@ -2,7 +2,8 @@
 
     python recipes/publish.py checkpoint=runs/forward_model/<time> file=swimmer6.safetensors [also=[swimmer7]]
 
-Weights become half-precision numbers and the state of the training is left out. What is written is evaluated on fresh
+Weights become half-precision numbers, the state of the training is left out, and of the places on disk that the
+configuration names only the last part is kept. What is written is evaluated on fresh
 trajectories of every system that the model was trained on, and of those named by `also` (a model that identifies, on
 random variants of them); the errors go into the file
 (`load_checkpoint(file).metrics`) and are printed. All options: recipes/config/publish.yaml.
@@ -11,7 +12,10 @@ random variants of them); the errors go into the file
 from __future__ import annotations
 
 import copy
+import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
@@ -22,6 +26,15 @@ from torchrl_gn.evaluation import fresh_errors, summary
 from torchrl_gn.modules import Agent
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import clean_exit, load_checkpoint, save_checkpoint
+
+
+def without_places(value: Any) -> Any:
+    """A configuration that does not say where things lay on somebody's disk."""
+    if isinstance(value, Mapping):
+        return {key: without_places(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [without_places(each) for each in value]
+    return Path(value).name if isinstance(value, str) and os.sep in value else value
 
 
 @hydra.main(version_base=None, config_path="config", config_name="publish")
@@ -37,7 +50,7 @@ def main(cfg: DictConfig) -> None:
     scenes = tqdm([*own, *map(load_scene, cfg.also)], desc="evaluating", leave=False)
     tables = {scene.name: fresh_errors(model, scene, **how) for scene in scenes}
     errors = {name: {key: error.total for key, error in table.errors.items()} for name, table in tables.items()}
-    save_checkpoint(file, half, scene=own, config=loaded.config, metrics={**errors, "evaluation": how})
+    save_checkpoint(file, half, scene=own, config=without_places(loaded.config), metrics={**errors, "evaluation": how})
     print(summary(tables))
     print(f"{file} ({file.stat().st_size / 1e6:.2f} MB)")
 

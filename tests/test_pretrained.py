@@ -56,5 +56,5 @@ def test_a_model_is_found_by_its_name_or_where_it_lies(tmp_path, monkeypatch):
     save_checkpoint(tmp_path / "cartpole", shipped.model, scene=shipped.scene())
     assert load_model("cartpole").scene().name == "cartpole"
     assert load_model("./cartpole").scene().name == load_model(tmp_path / "cartpole").scene().name == "pendulum"
-    with pytest.raises(CheckpointError, match="No checkpoint at no_such_model"):
+    with pytest.raises(CheckpointError, match="no checkpoint at no_such_model, and no model of that name.*'cheetah'"):
         load_model("no_such_model")

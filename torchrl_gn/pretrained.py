@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
-from torchrl_gn.training.checkpoint import Checkpoint, load_checkpoint
+from torchrl_gn.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 
 WEIGHTS = Path(__file__).with_name("weights")
 """Where they lie."""
@@ -54,4 +54,11 @@ def load_model(source: str | Path) -> Checkpoint:
     Raises:
         CheckpointError: if it is neither, or the file cannot be used.
     """
-    return load_pretrained(str(source)) if source in pretrained_names() else load_checkpoint(source)
+    if source in pretrained_names():
+        return load_pretrained(str(source))
+    if not Path(source).exists():
+        raise CheckpointError(
+            f"There is no checkpoint at {source}, and no model of that name comes with the package; those that do are"
+            f" {pretrained_names()}."
+        )
+    return load_checkpoint(source)
