@@ -22,6 +22,7 @@ SHORT_LEARNING = (
     "trainer.random_frames=40",
     "trainer.evaluate_frames=40",
     "trainer.batch_size=16",
+    "trainer.updates_per_frame=0.1",
     "trainer.compile=false",
 )
 """Options of the recipes that learn policies, with which they take seconds."""

@@ -81,4 +81,4 @@ def test_what_cannot_be_is_one_line(tmp_path, call):
 def test_help_shows_the_options(run):
     code, output, errors = run("--help", recipe="svg")
     assert code == 0, errors
-    assert all(option in output for option in ("horizon: 1", "target_interval: 1000", "min_scale: 0.3"))
+    assert all(option in output for option in ("horizon: 1", "target_interval: 200", "min_scale: 0.3"))
