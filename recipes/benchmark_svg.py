@@ -29,7 +29,7 @@ from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
 from torchrl_gn.rewards import TargetDistance
 from torchrl_gn.scenes import ObservationGraph
-from torchrl_gn.training import OffPolicyTrainer, RunFolder, clean_exit
+from torchrl_gn.training import OffPolicyTrainer, RunFolder, clean_exit, make_agent_optimizer
 
 
 def make_update(
@@ -42,7 +42,7 @@ def make_update(
     loss = SVGLoss(agent.policy, agent.value, agent.model, reward, steps=horizon, delay_actor=True)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.99)
     losses = [loss] if agent.model is None else [loss, ObservationModelLoss(agent.model)]
-    optimizer = torch.optim.Adam([weight for each in losses for weight in each.parameters()], lr=1e-4, fused=True)
+    optimizer = make_agent_optimizer(losses, policy_lr=1e-4, value_lr=1e-4, model_lr=1e-4)
     options = {"frames": data.numel(), "batch_size": cfg.batch_size, "compile": "compiled" in way}
     trainer = OffPolicyTrainer(agent, losses, env, agent.policy, lambda: 0.0, optimizer, **options)
     trainer.remember(data)

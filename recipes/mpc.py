@@ -132,13 +132,18 @@ def options(cfg: DictConfig) -> dict[str, Any]:
 
 def fill_in(cfg: DictConfig) -> None:
     """The paper's task of the system, where options are left open."""
-    task = cfg.tasks.get(re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system)
-    for key, value in (("reward", task and task.rewards[0]), ("horizon", task and task.horizon)):
-        if cfg[key] is None and value is None:
+    name = re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system
+    task = cfg.tasks.get(name, {"rewards": [None], "horizon": None, "steps": 200})
+    defaults = [
+        (cfg, "reward", task["rewards"][0]),
+        (cfg, "horizon", task["horizon"]),
+        (cfg, "steps", task["steps"]),
+        (cfg.gn, "iterations", task.get("iterations", 3)),
+    ]
+    for part, key, value in defaults:
+        if part[key] is None and value is None:
             raise ValueError(f"{cfg.system!r} is no system of the paper: say which {key} it gets, as {key}=...")
-        cfg[key] = value if cfg[key] is None else cfg[key]
-    cfg.steps = (task.steps if task else 200) if cfg.steps is None else cfg.steps
-    cfg.gn.iterations = ((task or {}).get("iterations") or 3) if cfg.gn.iterations is None else cfg.gn.iterations
+        part[key] = value if part[key] is None else part[key]
     if not isinstance(cfg.planner, ListConfig):
         cfg.planner = [cfg.planner]
     unknown = [name for name in cfg.planner if name not in ON_MODEL + ON_PHYSICS]

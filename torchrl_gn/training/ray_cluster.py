@@ -38,11 +38,12 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or it warns of a change to come
-        if self.address == "local":  # Ray's workers give way to all else; but this process only waits for them
+        where: dict[str, Any] = {"address": self.address}
+        if self.address == "local":
+            where = {"address": None, "include_dashboard": False}
+            # Ray's workers give way to all else; but this process only waits for them.
             os.environ.setdefault("RAY_worker_niceness", "0")
-        local = {"include_dashboard": False} if self.address == "local" else {}
-        address = None if self.address == "local" else self.address
-        self._ray.init(address=address, log_to_driver=False, logging_level="ERROR", **local)
+        self._ray.init(log_to_driver=False, logging_level="ERROR", **where)
         return self
 
     def __exit__(self, *_: object) -> None:
