@@ -27,7 +27,7 @@ from typing import Any, cast
 import hydra
 import numpy as np
 import torch
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
@@ -144,6 +144,8 @@ def fill_in(cfg: DictConfig) -> None:
         if part[key] is None and value is None:
             raise ValueError(f"{cfg.system!r} is no system of the paper: say which {key} it gets, as {key}=...")
         part[key] = value if part[key] is None else part[key]
+    with open_dict(cfg):  # what other systems get is none of this run's business
+        del cfg.tasks
     if not isinstance(cfg.planner, ListConfig):
         cfg.planner = [cfg.planner]
     unknown = [name for name in cfg.planner if name not in ON_MODEL + ON_PHYSICS]
