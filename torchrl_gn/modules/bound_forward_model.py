@@ -55,7 +55,7 @@ class BoundForwardModel(TensorDictModuleBase):
     :class:`~torchrl_gn.scenes.scene_values.SceneValues`, as :meth:`static_of` gives them or an
     inference model writes them. Without one, samples that bring other values are refused. A model with
     ``static="none"`` or ``"inferred"`` never reads a sample's true values, nor does anything around
-    its network: bodies are then not linked, for their lengths are hidden.
+    its network: bodies are linked where an inference model has found their pins, and without one not at all.
 
     Args:
         model: the shared weights.
@@ -105,10 +105,12 @@ class BoundForwardModel(TensorDictModuleBase):
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
         self.incidence = Incidence(torch.stack(ends).long(), scene.num_nodes, predicted)
         self.frame = LocalFrame(scene, model)
-        pinned = bool((scene.linkage.root != np.arange(scene.num_nodes)).any())
+        # Of bodies that turn about one place there is nothing to link.
+        pinned = bool((scene.live[:, :3].any(1) & (scene.linkage.root != np.arange(scene.num_nodes))).any())
         # Pins are where lengths say, which are hidden from a model of variants that does not read them.
-        hidden = static_key is not None and model.static != "scene"
+        hidden = static_key is not None and model.static == "none"
         self.linking = make_linking(scene) if model.link and pinned and not hidden else None
+        self.arm_length = scene.linkage.arm_length
         for name, value in model.values_of(scene)._asdict().items():
             self._register(f"static_{name}", value)
         check_seen(self, strict)
@@ -125,22 +127,34 @@ class BoundForwardModel(TensorDictModuleBase):
         """Numbers that samples bring, or the scene's own.
 
         Raises:
-            ValueError: if the model infers its static graph and they are true parameters.
+            ValueError: if the model infers its static graph and they are true parameters, or pins are missing.
         """
         if static is None:
             return self.values
-        given = set(map(str, static.keys()))
-        if self.model.static == "inferred" and not given <= {"nodes", "edges", "globals_"}:
-            raise ValueError(
-                f"The model reads an inferred static graph; {sorted(given - {'nodes', 'edges', 'globals_'})} are true"
-                " parameters, which it must not see. Give what an inference model wrote."
-            )
+        if self.model.static == "inferred":
+            given, wanted = set(map(str, static.keys())), set(self._inferred)
+            if given - wanted:
+                raise ValueError(
+                    f"The model reads an inferred static graph; {sorted(given - wanted)} are true"
+                    " parameters, which it must not see. Give what an inference model wrote."
+                )
+            if self.linking is not None and not wanted <= given:
+                raise ValueError(
+                    f"The model links bodies where an inference model finds their pins; {sorted(wanted - given)} are"
+                    " missing. Give what this model's own inference model wrote."
+                )
         return SceneValues.read(static, self.values)
+
+    @property
+    def _inferred(self) -> tuple[str, ...]:
+        """Entries of what an inference model writes."""
+        graph = ("nodes", "edges", "globals_")
+        return graph if self.linking is None else (*graph, "parent_arm", "arm")
 
     def own_static(self) -> TensorDict:
         """What a sample of the scene itself has at the ``static_key``, without batch; zeros of an inferred graph."""
         own = self.values.tensordict()
-        return own.select("nodes", "edges", "globals_") if self.model.static == "inferred" else own
+        return own.select(*self._inferred) if self.model.static == "inferred" else own
 
     def static_of(self, scene: Scene) -> TensorDict:
         """Static values of a variant of this scene, to give samples at the ``static_key``.
@@ -343,6 +357,11 @@ class BoundForwardModel(TensorDictModuleBase):
         values, dtype = values or self.values, dtype or self.network_dtype
         if self.model.static == "inferred":  # comes from a network already
             nodes, edges, globals_ = (part.to(dtype) for part in values[:3])
+            if self.model.link:
+                found = torch.cat((values.parent_arm, values.arm), dim=-1)
+                usual = torch.cat((self.values.parent_arm, self.values.arm), dim=-1)
+                off = ((found - usual) / self.arm_length).to(dtype).expand(*nodes.shape[:-1], 6)
+                nodes = torch.cat((nodes, off), dim=-1)
         else:
             normalizers = self.model.static_normalizers.items()
             nodes, edges, globals_ = (normalizer(getattr(values, part), dtype) for part, normalizer in normalizers)
@@ -351,11 +370,15 @@ class BoundForwardModel(TensorDictModuleBase):
     def update_static_normalizers(self, static: TensorDictBase | None = None) -> None:
         """Take static values, by default this scene's, into the model's statistics: once, before training.
 
+        Inferred ones have none.
+
         Raises:
             ValueError: if one is not finite; no statistic is changed.
         """
         if static is not None:
             require_finite(static, "static")
+        if self.model.static == "inferred":
+            return  # comes from a network already
         values = self._read(static)
         for part, normalizer in self.model.static_normalizers.items():
             normalizer.update(getattr(values, part))

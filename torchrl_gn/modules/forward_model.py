@@ -194,8 +194,10 @@ class ForwardModel(nn.Module):
 
         encoded = layout.encoded_size(encoding) + (Contacts.size if contacts else 0)
         names = self.features
+        self.inferred_size = GraphSize(*inferred)
         if static == "inferred":
-            self.static_size = GraphSize(*inferred)
+            # Where pins were found says how long bodies are.
+            self.static_size = self.inferred_size + GraphSize(6 if link else 0, 0, 0)
         else:
             self.static_size = GraphSize(len(names.nodes), len(names.edges), len(names.globals_))
         self.node_normalizer = Normalizer(encoded, floor=_DYNAMIC_FLOOR)
@@ -247,7 +249,7 @@ class ForwardModel(nn.Module):
             return values
         zeros = {
             part: getattr(values, part).new_zeros(*getattr(values, part).shape[:-1], size)
-            for part, size in asdict(self.static_size).items()
+            for part, size in asdict(self.inferred_size).items()
         }
         return values._replace(**zeros)
 

@@ -15,7 +15,20 @@ from torchrl_gn.modules.bound_forward_model import BoundForwardModel
 from torchrl_gn.modules.forward_model import ForwardModel
 from torchrl_gn.modules.gn_block import GNBlock
 from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat, graph_split
+from torchrl_gn.modules.pin_finder import PinFinder
 from torchrl_gn.scenes import Scene
+
+
+class Memory(NamedTuple):
+    """What is kept of observations, to go on with more.
+
+    Attributes:
+        hidden: hidden graph of the network.
+        pins: ``[*B, N, 7, 7]`` what was seen of where bodies are pinned together; None where they are not linked.
+    """
+
+    hidden: Graph
+    pins: Tensor | None
 
 
 class Inferred(NamedTuple):
@@ -23,12 +36,13 @@ class Inferred(NamedTuple):
 
     Attributes:
         static: TensorDict ``[*B]`` of the inferred static graph: ``nodes`` ``[*B, N, 10]``, ``edges`` ``[*B, E, 10]``
-            and ``globals_`` ``[*B, 10]``.
-        memory: hidden graph, to go on with more observations.
+            and ``globals_`` ``[*B, 10]``; where the forward model links bodies also where they are pinned together:
+            ``parent_arm`` and ``arm`` ``[*B, N, 3]``.
+        memory: what to go on with when there are more observations.
     """
 
     static: TensorDict
-    memory: Graph
+    memory: Memory
 
 
 class InferenceModel(nn.Module):
@@ -100,6 +114,9 @@ class BoundInferenceModel(TensorDictModuleBase):
     ``static``, where a forward model with ``static="inferred"`` reads it. It is one entry a system: identify once, save
     it, and use it for any number of rollouts from any state. True static parameters are not read, only what moves.
 
+    Where the forward model links bodies, the pins are found beside the network, by least squares
+    (:class:`~torchrl_gn.modules.pin_finder.PinFinder`).
+
     Args:
         model: the weights.
         bound: the forward model of the scene, whose features and normalisers it shares.
@@ -118,6 +135,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         super().__init__()
         key = (observed_key,) if isinstance(observed_key, str) else tuple(observed_key)
         self.model, self.bound = model, bound
+        self.pins = PinFinder(bound.scene) if bound.linking is not None else None
         self.in_keys: list[NestedKey] = [(*key, "state"), (*key, "action"), (*key, "next", "state")]
         self.out_keys: list[NestedKey] = [static_key]
 
@@ -132,23 +150,23 @@ class BoundInferenceModel(TensorDictModuleBase):
             raise KeyError(f"The inference model reads {self.in_keys}; there is {list(tensordict.keys(True))}.")
         return tensordict.set(self.out_keys[0], self.infer(state, action, next_state).static)
 
-    def infer(self, state: Tensor, action: Tensor, next_state: Tensor, memory: Graph | None = None) -> Inferred:
+    def infer(self, state: Tensor, action: Tensor, next_state: Tensor, memory: Memory | None = None) -> Inferred:
         """What a sequence of transitions tells.
 
         Args:
             state: ``[*B, T, N, 13]``.
             action: ``[*B, T, A]``, each applied in the state of its step.
             next_state: ``[*B, T, N, 13]``, what came of it.
-            memory: hidden graph after earlier observations of the same systems; default: none were made.
+            memory: of earlier observations of the same systems; default: none were made.
 
         Returns:
-            The inferred graph after the last observation.
+            What is known after the last observation.
 
         Raises:
             ValueError: if there is no observation, or a shape does not fit the scene.
         """
-        *_, last = self.observe(state, action, next_state, memory)
-        return last
+        *_, last = self._observe(state, action, next_state, memory)
+        return self._known(*last)
 
     def identify(self, states: Tensor, actions: Tensor) -> TensorDict:
         """The inferred graph of whole trajectories.
@@ -160,9 +178,15 @@ class BoundInferenceModel(TensorDictModuleBase):
         return self.infer(states[..., :-1, :, :], actions, states[..., 1:, :, :]).static
 
     def observe(
-        self, state: Tensor, action: Tensor, next_state: Tensor, memory: Graph | None = None
+        self, state: Tensor, action: Tensor, next_state: Tensor, memory: Memory | None = None
     ) -> Iterator[Inferred]:
         """As :meth:`infer`, yielding what is known after each observation."""
+        for known in self._observe(state, action, next_state, memory):
+            yield self._known(*known)
+
+    def _observe(
+        self, state: Tensor, action: Tensor, next_state: Tensor, memory: Memory | None
+    ) -> Iterator[tuple[Graph, Memory]]:
         if state.shape[-3] == 0 or next_state.shape != state.shape:
             raise ValueError(
                 "The inference model needs at least one transition, states and next states of equal shape; got"
@@ -173,6 +197,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         dynamic = bound.dynamic_graph(state, action)
         change = bound.model.residual_normalizer(bound.residual(state, next_state), bound.network_dtype)
         nodes = torch.cat((dynamic.nodes, change * bound.live), dim=-1)
+        pins = self._pins(state, next_state, memory)
         for step in range(state.shape[-3]):
             now = Graph(
                 nodes[..., step, :, :],
@@ -180,10 +205,27 @@ class BoundInferenceModel(TensorDictModuleBase):
                 dynamic.globals_[..., step, :],
                 dynamic.edge_index,
             )
-            known = self.model.start(now) if memory is None else memory
-            inferred, memory = self.model(now, known)
-            assert memory is not None
-            yield Inferred(inferred.tensordict(), memory)
+            inferred, hidden = self.model(now, self.model.start(now) if memory is None else memory.hidden)
+            memory = Memory(hidden, None if pins is None else pins[..., step, :, :, :])
+            yield inferred, memory
+
+    @torch.no_grad()
+    def _pins(self, state: Tensor, next_state: Tensor, memory: Memory | None) -> Tensor | None:
+        """What was seen of the pins after each observation, ``[*B, T, N, 7, 7]``."""
+        if self.pins is None:
+            return None
+        # Both ends of every transition: they need not follow each other.
+        sums = self.pins.sums(torch.stack((state, next_state), dim=-3)).cumsum(-4)
+        return sums if memory is None or memory.pins is None else sums + memory.pins.unsqueeze(-4)
+
+    def _known(self, inferred: Graph, memory: Memory) -> Inferred:
+        """What is known, as the forward model reads it."""
+        static = inferred.tensordict()
+        if self.pins is not None and memory.pins is not None:
+            with torch.no_grad():
+                parent_arm, arm = self.pins.solve(memory.pins)
+            static.update({"parent_arm": parent_arm, "arm": arm})
+        return Inferred(static, memory)
 
 
 class IdentifyingModel(nn.Module):
@@ -201,7 +243,7 @@ class IdentifyingModel(nn.Module):
         super().__init__()
         if forward_model.static != "inferred":
             raise ValueError(f"The forward model reads static={forward_model.static!r}; build it with 'inferred'.")
-        self.forward_model, size = forward_model, forward_model.static_size
+        self.forward_model, size = forward_model, forward_model.inferred_size
         options["inferred"] = (size.nodes, size.edges, size.globals_)
         observed = forward_model.dynamic_size + GraphSize(forward_model.layout.delta_size, 0, 0)
         self.inference = InferenceModel(observed, **options)

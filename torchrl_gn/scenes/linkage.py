@@ -34,6 +34,12 @@ class Linkage:
     chain: np.ndarray
     root: np.ndarray
 
+    @property
+    def arm_length(self) -> float:
+        """Usual length of a coordinate of an arm that is not 0, metres; 1 without any."""
+        arms = np.concatenate((self.parent_arm, self.arm))
+        return float(np.sqrt(np.mean(arms[arms != 0] ** 2))) if arms.any() else 1.0
+
 
 def find_linkage(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> Linkage:
     """Read the pins of a model's joints.
