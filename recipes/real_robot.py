@@ -57,7 +57,7 @@ def read(cfg: DictConfig) -> tuple[RobotLog, JointChain]:
         log = load_robot_log(cfg.log, timestep=cfg.timestep, names=options(cfg)["names"])
         name, carried_by = Path(cfg.log).stem, cfg.carried_by or ()
     else:
-        scene = load_scene("jaco", timestep=cfg.timestep)
+        scene = load_scene("jaco", timestep=cfg.simulated.timestep)
         log = simulate_log(
             scene, cfg.simulated.episodes, cfg.simulated.steps, cfg.seed, **options(cfg.simulated.faults)
         )
