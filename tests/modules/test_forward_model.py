@@ -302,9 +302,9 @@ def test_statics_are_read_by_name(scenes, make_model, random_states, random_acti
     names = FeatureSet.of(scene)
     model = ForwardModel(FeatureSet(("mass",), tuple(reversed(names.edges)), ("timestep",)))
     bound = model.bind(scene)
-    assert torch.equal(bound.static_nodes[:, 0], torch.as_tensor(scene.static.nodes[:, names.nodes.index("mass")]))
-    assert torch.equal(bound.static_edges, torch.as_tensor(scene.static.edges[:, ::-1].copy()))
-    assert bound.static_globals_.tolist() == [scene.timestep]
+    assert torch.equal(bound.values.nodes[:, 0], torch.as_tensor(scene.static.nodes[:, names.nodes.index("mass")]))
+    assert torch.equal(bound.values.edges, torch.as_tensor(scene.static.edges[:, ::-1].copy()))
+    assert bound.values.globals_.tolist() == [scene.timestep]
     with pytest.raises(ValueError, match=r"'swimmer6' lacks the static features \['charm'\]"):
         ForwardModel(FeatureSet(nodes=("mass", "charm"))).bind(scene)
 

@@ -200,7 +200,7 @@ def test_an_inferred_graph_is_read_as_it_is_and_gets_gradients(variants, samples
     state, action = samples["state"][:, 0, 0], samples["action"][:, 0, 0]
     shapes = {"nodes": (scene.num_nodes, 4), "edges": (scene.num_edges, 3), "globals_": (2,)}
     leaves = {name: torch.randn(3, *shape, dtype=torch.float64, requires_grad=True) for name, shape in shapes.items()}
-    static = TensorDict(leaves, [3])
+    static = bounds[0].own_static().expand(3).clone().update(leaves)  # pins beside the graph, where bodies are linked
     outs = [bound.step(state, action, static) for bound in bounds]
     torch.testing.assert_close(*outs, rtol=0, atol=1e-12)
     gradients = [torch.autograd.grad(out.square().sum(), list(leaves.values())) for out in outs]

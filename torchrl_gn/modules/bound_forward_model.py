@@ -18,6 +18,7 @@ from torchrl_gn.modules.incidence import Incidence
 from torchrl_gn.modules.joint_linking import make_linking
 from torchrl_gn.modules.local_frame import LocalFrame, Seen
 from torchrl_gn.modules.shapes import check_shapes
+from torchrl_gn.modules.static_values import StaticValues
 from torchrl_gn.modules.unseen_features import check_seen
 from torchrl_gn.scenes.scene_values import SceneValues, topology
 
@@ -101,7 +102,7 @@ class BoundForwardModel(TensorDictModuleBase):
         self.timestep, self.plain = float(scene.timestep), plain
 
         ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
-        self._register("live", torch.as_tensor(scene.live, dtype=torch.bool))
+        self.register_buffer("live", torch.as_tensor(scene.live, dtype=torch.bool), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
         self.incidence = Incidence(torch.stack(ends).long(), scene.num_nodes, predicted)
         self.frame = LocalFrame(scene, model)
@@ -111,50 +112,19 @@ class BoundForwardModel(TensorDictModuleBase):
         hidden = static_key is not None and model.static == "none"
         self.linking = make_linking(scene) if model.link and pinned and not hidden else None
         self.arm_length = scene.linkage.arm_length
-        for name, value in model.values_of(scene)._asdict().items():
-            self._register(f"static_{name}", value)
+        self.statics = StaticValues(
+            model.values_of(scene), model.static, static_key, linked=self.linking is not None, scene=scene.name
+        )
         check_seen(self, strict)
-
-    def _register(self, name: str, value: Tensor) -> None:
-        self.register_buffer(name, value, persistent=False)
 
     @property
     def values(self) -> SceneValues:
         """The scene's own numbers, without batch."""
-        return SceneValues(*(getattr(self, f"static_{name}") for name in SceneValues._fields))
-
-    def _read(self, static: TensorDictBase | None) -> SceneValues:
-        """Numbers that samples bring, or the scene's own.
-
-        Raises:
-            ValueError: if the model infers its static graph and they are true parameters, or pins are missing.
-        """
-        if static is None:
-            return self.values
-        if self.model.static == "inferred":
-            given, wanted = set(map(str, static.keys())), set(self._inferred)
-            if given - wanted:
-                raise ValueError(
-                    f"The model reads an inferred static graph; {sorted(given - wanted)} are true"
-                    " parameters, which it must not see. Give what an inference model wrote."
-                )
-            if self.linking is not None and not wanted <= given:
-                raise ValueError(
-                    f"The model links bodies where an inference model finds their pins; {sorted(wanted - given)} are"
-                    " missing. Give what this model's own inference model wrote."
-                )
-        return SceneValues.read(static, self.values)
-
-    @property
-    def _inferred(self) -> tuple[str, ...]:
-        """Entries of what an inference model writes."""
-        graph = ("nodes", "edges", "globals_")
-        return graph if self.linking is None else (*graph, "parent_arm", "arm")
+        return self.statics.own
 
     def own_static(self) -> TensorDict:
         """What a sample of the scene itself has at the ``static_key``, without batch; zeros of an inferred graph."""
-        own = self.values.tensordict()
-        return own.select(*self._inferred) if self.model.static == "inferred" else own
+        return self.statics.entries()
 
     def static_of(self, scene: Scene) -> TensorDict:
         """Static values of a variant of this scene, to give samples at the ``static_key``.
@@ -172,16 +142,6 @@ class BoundForwardModel(TensorDictModuleBase):
                 " Bind the model to it instead."
             )
         return self.model.values_of(scene).tensordict().to(self.live.device)
-
-    def _apply(self, fn, recurse: bool = True):
-        # Masks and static values keep their dtype (float64) when the network is cast; only the device follows.
-        kept = dict(self._buffers)
-        super()._apply(fn, recurse)
-        for name, buffer in kept.items():
-            applied = self._buffers[name]
-            if buffer is not None and applied is not None and applied.dtype != buffer.dtype:
-                self._buffers[name] = buffer.to(applied.device)
-        return self
 
     @property
     def network_dtype(self) -> torch.dtype:
@@ -205,29 +165,7 @@ class BoundForwardModel(TensorDictModuleBase):
             KeyError: if the model reads them and they are missing.
             ValueError: if the model does not read them and they are not its scene's.
         """
-        static = tensordict.get("static" if self.static_key is None else self.static_key, None)
-        if self.static_key is not None:
-            if self.model.static == "none":
-                return None
-            if static is None:
-                raise KeyError(
-                    f"The model reads each sample's static values at {self.static_key!r}; give static_of(scene),"
-                    " or bind without static_key."
-                )
-            return static
-        if isinstance(static, TensorDictBase):
-            self._refuse_others(static)
-        return None
-
-    def _refuse_others(self, static: TensorDictBase) -> None:
-        for name, own in self.values._asdict().items():
-            given = static.get(name, None)
-            if given is None or bool((given.to(own.device) - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
-                continue
-            raise ValueError(
-                f"Samples have other static {name!r} than scene {self.scene.name!r}, which the model is bound to."
-                " Bind it with static_key='static' to predict variants of the scene."
-            )
+        return self.statics.find(tensordict)
 
     def step(self, state: Tensor, action: Tensor, static: TensorDictBase | None = None) -> Tensor:
         """Next state.
@@ -297,7 +235,7 @@ class BoundForwardModel(TensorDictModuleBase):
         Args:
             static: static values of every sample, by default the scene's.
         """
-        values = self._read(static)
+        values = self.statics.read(static)
         core = None if self.plain else self.model.fold(self.static_graph(values), self.incidence)
         return Folded(core, values)
 
@@ -379,7 +317,7 @@ class BoundForwardModel(TensorDictModuleBase):
             require_finite(static, "static")
         if self.model.static == "inferred":
             return  # comes from a network already
-        values = self._read(static)
+        values = self.statics.read(static)
         for part, normalizer in self.model.static_normalizers.items():
             normalizer.update(getattr(values, part))
 
@@ -401,7 +339,7 @@ class BoundForwardModel(TensorDictModuleBase):
         for what, given in (("state", state), ("action", action), ("next state", next_state), ("static", static)):
             if given is not None:
                 require_finite(given, what)
-        values = self._read(static)
+        values = self.statics.read(static)
         encoded, controls = self.frame.features(self.frame.see(state, values), action, values)
         self.model.node_normalizer.update(encoded)
         self.model.edge_normalizer.update(controls)

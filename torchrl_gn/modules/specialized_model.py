@@ -94,12 +94,12 @@ class SpecializedForwardModel(BoundForwardModel):
     def fold(self, static: TensorDictBase | None = None) -> Folded:
         """The snapshot, made again if anything it came from has changed."""
         if self._folded is None or not self._same(static) or not all(s.unchanged() for s in self._sources):
-            folded = self._fold(self._read(static))
+            folded = self._fold(self.statics.read(static))
             if self._folded is None or not copy_into(self._folded, folded):
                 self._folded, self._compiled = folded, None
             self._folds += 1
             owners = [module._parameters for module in self.model.modules()]
-            owners += [module._buffers for module in (*self.model.modules(), self)]
+            owners += [module._buffers for module in (*self.model.modules(), self, self.statics)]
             self._sources = [_Source(owner, name) for owner in owners for name in owner]
             given = {} if static is None else {str(name): value for name, value in static.items()}
             self._given = {name: _Source(given, name) for name in given}
