@@ -15,6 +15,8 @@ from torchrl_gn.evaluation import palette
 from torchrl_gn.evaluation.canvas import clean, new_figure, save
 from torchrl_gn.evaluation.error_table import ErrorTable
 
+_WIDEST = 12.0  # inches of panels side by side
+
 
 def plot_loglog(
     panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]],
@@ -245,8 +247,9 @@ def plot_bars(
 ) -> Path:
     """Groups of bars on a logarithmic axis (paper, figure "One-step and rollout errors for different models").
 
-    One panel below the other, in each a group for every system, in each group a bar for every model, with a
-    dashed line at 1, the constant prediction. What is not finite reaches the top, hatched.
+    Panels side by side while they fit, else one below the other, in each a group for every system, in each group
+    a bar for every model, with a dashed line at 1, the constant prediction. What is not finite reaches the top,
+    hatched.
 
     Args:
         panels: ``(height, half-range)`` by system, by model, by the panel's title; a system that a model lacks
@@ -267,10 +270,13 @@ def plot_bars(
         raise ValueError("plot_bars needs at least one bar.")
     finite = [height for height in heights if math.isfinite(height) and height > 0] + [1.0]
     bottom, top = 10.0 ** math.floor(math.log10(0.8 * min(finite))), 3 * max(finite)
-    figure = new_figure((max(6.0, 1.6 + 0.22 * len(groups) * (len(models) + 1)), 3.4 * len(panels) + 0.3 * len(models)))
+    wide = max(3.2, 1.2 + 0.22 * len(groups) * (len(models) + 1))
+    beside = wide * len(panels) <= _WIDEST
+    rows, columns = (1, len(panels)) if beside else (len(panels), 1)
+    figure = new_figure((max(6.0, wide * columns), 2.6 * rows + 0.1 * len(models) + 0.4))
     colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
     width = 0.84 / len(models)
-    for axes, (title, panel) in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels.items(), strict=True):
+    for axes, (title, panel) in zip(figure.subplots(rows, columns, squeeze=False).flat, panels.items(), strict=True):
         for number, model in enumerate(models):
             # Colours repeat after a while, then lighter.
             look = {"color": colors[number % len(colors)], "alpha": 0.9 if number < len(colors) else 0.45}
@@ -286,7 +292,8 @@ def plot_bars(
         axes.set_xlim(-0.6, len(groups) - 0.4)
         axes.set_yscale("log")
         axes.set_ylim(bottom, top)
-        axes.set_ylabel(ylabel, fontsize=8)
+        if not beside or axes is figure.axes[0]:
+            axes.set_ylabel(ylabel, fontsize=8)
         axes.set_title(title, fontsize=10)
         clean(axes)
     handles, labels = figure.axes[0].get_legend_handles_labels()
