@@ -148,7 +148,7 @@ def probe(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestS
     state, action = (cast(Tensor, systems.observed.get(key)) for key in ("state", "action"))
     with torch.no_grad():
         static = inference.identify(state[:, : cfg.phase + 1], action[:, : cfg.phase])
-    features = torch.cat([cast(Tensor, static.get(part)).flatten(1) for part in ("nodes", "edges", "globals_")], dim=1)
+    features = torch.cat([cast(Tensor, value).flatten(1) for value in static.values()], dim=1)
     share = linear_probe(features, torch.from_numpy(systems.parameters), train=int(0.75 * len(features)))
     return dict(zip(systems.names, share.tolist(), strict=True))
 

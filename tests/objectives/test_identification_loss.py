@@ -116,5 +116,8 @@ def test_a_linear_probe_finds_what_is_linear():
     targets = torch.stack((features[:, 0] - 2 * features[:, 1], torch.randn(400, generator=generator)), 1)
     found = linear_probe(features, targets, train=300)
     assert found[0] > 0.99 and found[1] < 0.1
+    many = torch.cat((features, torch.randn(400, 500, generator=generator)), dim=1)  # more than samples
+    found = linear_probe(many, targets, train=300)
+    assert found[0] > 0.4 and -0.1 < found[1] < 0.1
     with pytest.raises(ValueError, match="train=399 of 400"):
         linear_probe(features, targets, train=399)

@@ -13,6 +13,8 @@ from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import evaluate_errors
 from torchrl_gn.modules import BoundForwardModel, BoundInferenceModel
 
+_PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # on squared weights, as shares of the number of samples
+
 
 @torch.no_grad()
 def identification_errors(
@@ -56,16 +58,16 @@ def identification_errors(
     return evaluate_errors(model, test, horizons=horizons, one_step=one_step)
 
 
-def linear_probe(features: Tensor, targets: Tensor, *, train: int, penalty: float = 1e-2) -> Tensor:
+def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
     """How much of each target a linear map of the features tells, on samples that it was not fitted to.
 
-    Ridge regression on standardised features and targets.
+    Ridge regression on standardised features and targets, for each target with the penalty whose leave-one-out
+    error is lowest: there may be more features than samples.
 
     Args:
         features: ``[M, F]``.
         targets: ``[M, P]``.
         train: number of samples to fit to; the rest are tested on.
-        penalty: on squared weights, as a share of the number of samples.
 
     Returns:
         ``[P]`` coefficients of determination: 1 where the targets can be read off, 0 where no better than their
@@ -82,7 +84,16 @@ def linear_probe(features: Tensor, targets: Tensor, *, train: int, penalty: floa
     used = std > 1e-9 * mean.abs().clamp(min=1)
     fitted, tested = ((part[:, used] - mean[used]) / std[used] for part in (fitted, tested))
     center = targets[:train].mean(0)
-    gram = fitted.T @ fitted + penalty * train * torch.eye(fitted.shape[1], dtype=torch.float64)
-    weights = torch.linalg.solve(gram, fitted.T @ (targets[:train] - center))
-    left = targets[train:] - center - tested @ weights
+    wanted = targets[:train] - center
+    u, s, v = torch.linalg.svd(fitted, full_matrices=False)
+    best, record = torch.zeros_like(targets[train:]), torch.full_like(center, torch.inf)
+    for penalty in _PENALTIES:
+        shrunk = s.square() / (s.square() + penalty * train)
+        # The mean is fitted too: one over the number of samples of each one's influence on itself.
+        influence = (u.square() * shrunk).sum(1, keepdim=True) + 1 / train
+        missed = wanted - u @ (shrunk[:, None] * (u.T @ wanted))
+        error = (missed / (1 - influence).clamp(min=1e-9)).square().sum(0)
+        predicted = tested @ (v.T @ ((shrunk / s.clamp(min=1e-300))[:, None] * (u.T @ wanted)))
+        best, record = torch.where(error < record, predicted, best), torch.minimum(error, record)
+    left = targets[train:] - center - best
     return 1 - left.square().sum(0) / (targets[train:] - targets[train:].mean(0)).square().sum(0)
