@@ -86,6 +86,22 @@ def test_observations_one_by_one_are_the_sequence(make_identifying):
         inference.infer(*(part[:, :0] for part in sequence))
 
 
+def test_what_is_inferred_is_the_mean_of_what_each_observation_tells(make_identifying):
+    model, scene = make_identifying("swimmer3")
+    _, inference = model.bind(scene)
+    data = collect_trajectories(scene, 4, 6, seed=1)
+    sequence = data["state"][:, :6], data["action"], data["state"][:, 1:]
+    means = [known.static for known in inference.observe(*sequence)]
+    model.inference.readout = "last"
+    each = [known.static for known in inference.observe(*sequence)]
+    for count in (1, 2, 6):
+        for key in ("nodes", "edges", "globals_"):
+            mean = sum(known[key] for known in each[:count]) / count
+            torch.testing.assert_close(means[count - 1][key], mean)
+    with pytest.raises(ValueError, match="readout must be 'mean' or 'last', got 'first'"):
+        InferenceModel(GraphSize(3, 2, 1), readout="first")
+
+
 def test_as_tensordict_modules_they_chain(make_identifying):
     model, scene = make_identifying()
     bound, inference = model.bind(scene)

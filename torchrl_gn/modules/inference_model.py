@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -24,10 +24,14 @@ class Memory(NamedTuple):
 
     Attributes:
         hidden: hidden graph of the network.
+        told: mean of what each observation told.
+        count: number of observations.
         pins: ``[*B, N, 7, 7]`` what was seen of where bodies are pinned together; None where they are not linked.
     """
 
     hidden: Graph
+    told: Graph
+    count: int
     pins: Tensor | None
 
 
@@ -61,6 +65,11 @@ class InferenceModel(nn.Module):
         node_hidden: hidden sizes of the node MLP.
         global_hidden: hidden sizes of the global MLP.
         activation: between the layers.
+        readout: what is inferred of several observations: the ``"mean"`` of what the network says after each, or what
+            it says after the ``"last"`` (paper).
+
+    Raises:
+        ValueError: if ``readout`` is neither.
     """
 
     def __init__(
@@ -73,8 +82,12 @@ class InferenceModel(nn.Module):
         node_hidden: Sequence[int] = (64, 64),
         global_hidden: Sequence[int] = (64, 64),
         activation: str = "silu",
+        readout: Literal["mean", "last"] = "mean",
     ) -> None:
         super().__init__()
+        if readout not in ("mean", "last"):
+            raise ValueError(f"readout must be 'mean' or 'last', got {readout!r}.")
+        self.readout = readout
         self.inferred_size, self.memory_size = GraphSize(*inferred), GraphSize(*memory)
         self.options = {
             "inferred": list(inferred),
@@ -83,6 +96,7 @@ class InferenceModel(nn.Module):
             "node_hidden": list(node_hidden),
             "global_hidden": list(global_hidden),
             "activation": activation,
+            "readout": readout,
         }
         self.block = GNBlock(
             observed + self.memory_size,
@@ -166,7 +180,7 @@ class BoundInferenceModel(TensorDictModuleBase):
             ValueError: if there is no observation, or a shape does not fit the scene.
         """
         *_, last = self._observe(state, action, next_state, memory)
-        return self._known(*last)
+        return self._known(last)
 
     def identify(self, states: Tensor, actions: Tensor) -> TensorDict:
         """The inferred graph of whole trajectories.
@@ -182,11 +196,9 @@ class BoundInferenceModel(TensorDictModuleBase):
     ) -> Iterator[Inferred]:
         """As :meth:`infer`, yielding what is known after each observation."""
         for known in self._observe(state, action, next_state, memory):
-            yield self._known(*known)
+            yield self._known(known)
 
-    def _observe(
-        self, state: Tensor, action: Tensor, next_state: Tensor, memory: Memory | None
-    ) -> Iterator[tuple[Graph, Memory]]:
+    def _observe(self, state: Tensor, action: Tensor, next_state: Tensor, memory: Memory | None) -> Iterator[Memory]:
         if state.shape[-3] == 0 or next_state.shape != state.shape:
             raise ValueError(
                 "The inference model needs at least one transition, states and next states of equal shape; got"
@@ -205,9 +217,12 @@ class BoundInferenceModel(TensorDictModuleBase):
                 dynamic.globals_[..., step, :],
                 dynamic.edge_index,
             )
-            inferred, hidden = self.model(now, self.model.start(now) if memory is None else memory.hidden)
-            memory = Memory(hidden, None if pins is None else pins[..., step, :, :, :])
-            yield inferred, memory
+            told, hidden = self.model(now, self.model.start(now) if memory is None else memory.hidden)
+            count = 1 if memory is None else memory.count + 1
+            if memory is not None and self.model.readout == "mean":
+                told = _between(memory.told, told, 1 / count)
+            memory = Memory(hidden, told, count, None if pins is None else pins[..., step, :, :, :])
+            yield memory
 
     @torch.no_grad()
     def _pins(self, state: Tensor, next_state: Tensor, memory: Memory | None) -> Tensor | None:
@@ -218,14 +233,24 @@ class BoundInferenceModel(TensorDictModuleBase):
         sums = self.pins.sums(torch.stack((state, next_state), dim=-3)).cumsum(-4)
         return sums if memory is None or memory.pins is None else sums + memory.pins.unsqueeze(-4)
 
-    def _known(self, inferred: Graph, memory: Memory) -> Inferred:
+    def _known(self, memory: Memory) -> Inferred:
         """What is known, as the forward model reads it."""
-        static = inferred.tensordict()
+        static = memory.told.tensordict()
         if self.pins is not None and memory.pins is not None:
             with torch.no_grad():
                 parent_arm, arm = self.pins.solve(memory.pins)
             static.update({"parent_arm": parent_arm, "arm": arm})
         return Inferred(static, memory)
+
+
+def _between(first: Graph, second: Graph, share: float) -> Graph:
+    """Features a share of the way from the first graph's to the second's."""
+    return Graph(
+        torch.lerp(first.nodes, second.nodes, share),
+        torch.lerp(first.edges, second.edges, share),
+        torch.lerp(first.globals_, second.globals_, share),
+        first.edge_index,
+    )
 
 
 class IdentifyingModel(nn.Module):
