@@ -41,6 +41,7 @@ def test_there_are_some_and_they_are_small():
         "swimmerN",
         "five_systems",
         "identified_pendulum",
+        "identified_cheetah",
     } <= set(pretrained_names())
     assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 1e7
 

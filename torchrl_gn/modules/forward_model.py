@@ -84,7 +84,8 @@ class ForwardModel(nn.Module):
         features: static features that the model reads, see :meth:`FeatureSet.of`.
         static: ``"scene"`` reads the true static parameters, ``"none"`` none of them, ``"inferred"`` a graph that
             another network makes instead, with features as they are.
-        inferred: numbers of node, edge and global features of the inferred graph.
+        inferred: numbers of node, edge and global features of the inferred graph. With ``link`` nodes get six more: how
+            far pins were found from where the scene has them.
         layout: what the state's channels mean.
         encoding: how the network sees an orientation: as the entries of its rotation
             ``"matrix"`` or (paper) as the ``"quaternion"``.

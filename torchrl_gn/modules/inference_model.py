@@ -24,7 +24,7 @@ class Memory(NamedTuple):
 
     Attributes:
         hidden: hidden graph of the network.
-        told: mean of what each observation told.
+        told: what is inferred so far: the mean of what each observation told, or what the last one did.
         count: number of observations.
         pins: ``[*B, N, 7, 7]`` what was seen of where bodies are pinned together; None where they are not linked.
     """
