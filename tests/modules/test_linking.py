@@ -78,12 +78,12 @@ def test_pinned_bodies_stay_together(make_model, random_actions, name):
 
 def test_a_body_that_turns_about_one_place_needs_no_linking(make_model):
     scene = load_scene("pendulum")
-    assert scene.linkage.chain.any() and make_model(scene).bind(scene).linking is None
-    linking, state = Linking(scene), collect_trajectories(scene, 2, 20)["state"]
-    bound = make_model(scene).bind(scene)
-    delta = bound.delta(state[:, :-1], collect_trajectories(scene, 2, 20)["action"]).detach()
-    matrices = bound.frame.matrices(state[:, :-1])
-    assert torch.equal(linking(state[:, :-1], matrices, delta, bound.model.delta_normalizer.std, bound.values), delta)
+    bound, linking = make_model(scene).bind(scene), Linking(scene)
+    assert scene.linkage.chain.any() and bound.linking is None
+    trajectories = collect_trajectories(scene, 2, 20)
+    state = trajectories["state"][:, :-1]
+    delta, matrices = bound.delta(state, trajectories["action"]).detach(), bound.frame.matrices(state)
+    assert torch.equal(linking(state, matrices, delta, bound.model.delta_normalizer.std, bound.values), delta)
 
 
 def off_axis(scene, state):

@@ -86,14 +86,15 @@ def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
     center = targets[:train].mean(0)
     wanted = targets[:train] - center
     u, s, v = torch.linalg.svd(fitted, full_matrices=False)
+    told = u.T @ wanted
     best, record = torch.zeros_like(targets[train:]), torch.full_like(center, torch.inf)
     for penalty in _PENALTIES:
-        shrunk = s.square() / (s.square() + penalty * train)
+        gain = s / (s.square() + penalty * train)
         # The mean is fitted too: one over the number of samples of each one's influence on itself.
-        influence = (u.square() * shrunk).sum(1, keepdim=True) + 1 / train
-        missed = wanted - u @ (shrunk[:, None] * (u.T @ wanted))
+        influence = (u.square() * (s * gain)).sum(1, keepdim=True) + 1 / train
+        missed = wanted - u @ ((s * gain)[:, None] * told)
         error = (missed / (1 - influence).clamp(min=1e-9)).square().sum(0)
-        predicted = tested @ (v.T @ ((shrunk / s.clamp(min=1e-300))[:, None] * (u.T @ wanted)))
+        predicted = tested @ (v.T @ (gain[:, None] * told))
         best, record = torch.where(error < record, predicted, best), torch.minimum(error, record)
     left = targets[train:] - center - best
     return 1 - left.square().sum(0) / (targets[train:] - targets[train:].mean(0)).square().sum(0)

@@ -296,9 +296,9 @@ class BoundForwardModel(TensorDictModuleBase):
         if self.model.static == "inferred":  # comes from a network already
             nodes, edges, globals_ = (part.to(dtype) for part in values[:3])
             if self.model.link:
-                found = torch.cat((values.parent_arm, values.arm), dim=-1)
-                usual = torch.cat((self.values.parent_arm, self.values.arm), dim=-1)
-                off = ((found - usual) / self.arm_length).to(dtype).expand(*nodes.shape[:-1], 6)
+                usual = self.values
+                off = torch.cat((values.parent_arm - usual.parent_arm, values.arm - usual.arm), dim=-1)
+                off = (off / self.arm_length).to(dtype).expand(*nodes.shape[:-1], 6)
                 nodes = torch.cat((nodes, off), dim=-1)
         else:
             normalizers = self.model.static_normalizers.items()

@@ -224,7 +224,6 @@ class BoundInferenceModel(TensorDictModuleBase):
             memory = Memory(hidden, told, count, None if pins is None else pins[..., step, :, :, :])
             yield memory
 
-    @torch.no_grad()
     def _pins(self, state: Tensor, next_state: Tensor, memory: Memory | None) -> Tensor | None:
         """What was seen of the pins after each observation, ``[*B, T, N, 7, 7]``."""
         if self.pins is None:
@@ -237,8 +236,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         """What is known, as the forward model reads it."""
         static = memory.told.tensordict()
         if self.pins is not None and memory.pins is not None:
-            with torch.no_grad():
-                parent_arm, arm = self.pins.solve(memory.pins)
+            parent_arm, arm = self.pins.solve(memory.pins)
             static.update({"parent_arm": parent_arm, "arm": arm})
         return Inferred(static, memory)
 

@@ -25,7 +25,7 @@ class PinFinder(Float64Buffers):
     A pin is at one place on both bodies that it joins, ``x + R a = x' + R' a'`` in every state, and that is linear in
     the arms ``a`` and ``a'``. States whose joints turn tell both; what they leave open (along the axis of a hinge, or
     where a joint did not turn) stays as in the standard scene. How much that is trusted follows from how badly one
-    pin explains all states: of noisy ones less is believed.
+    pin explains all states: of noisy ones less is believed. No gradient flows through what is found.
 
     Paper: bodies are not linked.
 
@@ -47,6 +47,7 @@ class PinFinder(Float64Buffers):
         }
         self.constants(values)
 
+    @torch.no_grad()
     def sums(self, states: Tensor) -> Tensor:
         """All that states tell about pins: add these up over observations of one system.
 
@@ -64,6 +65,7 @@ class PinFinder(Float64Buffers):
         rows = rows.transpose(-4, -3).flatten(-3, -2)  # [*B, N, 3 T, 7]
         return rows.mT @ rows
 
+    @torch.no_grad()
     def solve(self, sums: Tensor) -> tuple[Tensor, Tensor]:
         """Arms from parent and node to each pin, ``[*B, N, 3]`` in metres, as a scene's linkage has them.
 
