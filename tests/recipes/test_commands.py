@@ -1,0 +1,92 @@
+"""Every command that the README and the docs tell to type is one that its program takes."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from torchrl_gn.__main__ import main
+
+hydra = pytest.importorskip("hydra")
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"^ *```sh\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`((?:python )?recipes/\w+\.py [^`]+)`")
+PROGRAMS = ("python", "torchrun", "torchrl-gn", "ray")
+NESTED = {  # options that hold options of other recipes
+    ("compare", "overrides"): "forward_model",
+    ("mlp_baseline", "overrides"): "forward_model",
+    ("data_shift", "overrides"): "forward_model",
+    ("learning_curves", "overrides"): "svg",
+    ("plan_and_learn", "planning"): "mpc",
+    ("plan_and_learn", "training"): "forward_model",
+}
+
+
+def scripts(page: Path) -> list[str]:
+    """What a page tells to type, but for how to make the environment, which CI does by the README's own lines."""
+    text = page.read_text()
+    inline = ["python " + found.removeprefix("python ") for found in INLINE.findall(text)]
+    return [block for block in [*BLOCK.findall(text), *inline] if ".venv" not in block and ".ci/" not in block]
+
+
+def commands(script: str, folder: Path) -> list[list[str]]:
+    """What a shell would run, word by word: loops and variables are its own, programs only write themselves down."""
+    log = folder / "commands"
+    log.write_text("")
+    for name in PROGRAMS:
+        program = folder / name
+        program.write_text(f"#!/bin/sh\nprintf '%s\\037' {name} \"$@\" >>'{log}'\necho >>'{log}'\n")
+        program.chmod(0o755)
+    environment = os.environ | {"PATH": f"{folder}{os.pathsep}{os.environ['PATH']}"}
+    # <time> stands for a name, not for a file to read.
+    script = re.sub(r"<(\w+)>", r"\1", script)
+    subprocess.run(["bash", "-euc", script], cwd=folder, env=environment, check=True, timeout=60)
+    return [line.split("\x1f")[:-1] for line in log.read_text().splitlines()]
+
+
+def check_options(recipe: str, options: list[str]) -> None:
+    """Hydra refuses options that there are not, and names of experiments, presets and tasks."""
+    config = hydra.compose(recipe, overrides=options)
+    unknown = set(config.get("only") or ()) - set(config.get({"compare": "variants"}.get(recipe, "agents"), ()))
+    assert not unknown, f"recipes/{recipe}.py knows no {sorted(unknown)}"
+    for (outer, key), inner in NESTED.items():
+        if outer == recipe and config[key]:
+            hydra.compose(inner, overrides=list(config[key]))
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if scripts(page)], ids=lambda page: str(page.relative_to(ROOT))
+)
+def test_commands_are_understood(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+        for script in scripts(page):
+            typed = commands(script, tmp_path)
+            assert typed, f"nothing to run in {script!r}"
+            for program, *words in typed:
+                if program == "torchrl-gn":
+                    main(words)
+                elif program != "ray":
+                    place = next(index for index, word in enumerate(words) if word.startswith("recipes/"))
+                    check_options(Path(words[place]).stem, words[place + 1 :])
+
+
+@pytest.mark.parametrize(
+    ("recipe", "option"),
+    [
+        ("svg", "horizons=1"),
+        ("compare", "experiment=none"),
+        ("compare", "only=[dflt]"),
+        ("compare", "overrides=['model.skp=true']"),
+    ],
+)
+def test_others_are_not(recipe, option):
+    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+        with pytest.raises((hydra.errors.HydraException, AssertionError)):
+            check_options(recipe, [option])
