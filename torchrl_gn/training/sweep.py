@@ -66,10 +66,12 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
         Those that failed.
     """
     runs, failed = list(dict.fromkeys(runs)), []
+    left = [run for run in runs if run.metrics is None]
+    if not left:
+        return []  # without starting a cluster
     pool = _Threads(jobs) if isinstance(jobs, int) else _OnRay(jobs)
-    with tqdm(total=len(runs), desc=desc, unit="run", leave=False) as bar, pool:
-        futures = {pool.start(run): run for run in runs if run.metrics is None}
-        bar.update(len(runs) - len(futures))
+    with tqdm(total=len(runs), initial=len(runs) - len(left), desc=desc, unit="run", leave=False) as bar, pool:
+        futures = {pool.start(run): run for run in left}
         try:
             for future in as_completed(futures):
                 run = futures[future]

@@ -1,0 +1,97 @@
+"""What the loss of stochastic value gradients shares with its agent and its targets: statistics, and no weights."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ValueOperator
+from torchrl.objectives import HardUpdate, ValueEstimators
+
+from torchrl_gn.modules import Agent
+from torchrl_gn.objectives import SVGLoss
+from torchrl_gn.scenes import ObservationGraph
+
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
+
+
+def test_statistics_of_a_graph_policy_count_in_the_loss_and_its_targets_at_once():
+    """TorchRL's updaters copy weights only: targets must not be left with the statistics of the first hour."""
+    torch.manual_seed(0)
+    gamma, graph = 0.875, ObservationGraph.swimmer(3)
+    agent = Agent(graph, policy="graph", hidden=(8,), policy_options={"latent": 4, "hidden": [8]})
+    loss = SVGLoss(agent.policy, agent.value, steps=0, delay_actor=True)
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+    updater = HardUpdate(loss, value_network_update_interval=1)
+    ended = torch.zeros(9, 1, dtype=torch.bool)
+    after = {"observation": torch.randn(9, 13), "reward": torch.randn(9, 1), "done": ended, "terminated": ended}
+    batch = TensorDict({"observation": torch.randn(9, 13), "action": torch.randn(9, 2), "next": after}, [9])
+
+    def expected() -> tuple[Tensor, Tensor]:
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            torch.manual_seed(1)
+            after = agent.value(agent.policy(batch["next"].select("observation")))["state_action_value"]
+            now = agent.value(agent.policy(batch.select("observation")))["state_action_value"]
+        return -now.mean(), (batch["next", "reward"] + gamma * after).squeeze(-1)
+
+    for turn in range(2):
+        agent.update_normalizers(3 * turn + torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13))
+        actor, target = expected()
+        torch.manual_seed(1)
+        out = loss(batch.clone())
+        torch.testing.assert_close(out["target_value"], target)
+        torch.testing.assert_close(out["loss_actor"].detach(), actor)
+        for weight in agent.parameters():
+            weight.data.mul_(1.1)
+        torch.manual_seed(1)
+        assert torch.equal(loss(batch.clone())["target_value"], out["target_value"])  # weights wait for the updater
+        for _ in range(2):
+            updater.step()
+        torch.manual_seed(1)
+        torch.testing.assert_close(loss(batch.clone())["target_value"], expected()[1])
+
+
+def test_a_loaded_or_cast_loss_still_shares_statistics():
+    torch.manual_seed(0)
+    graph = ObservationGraph.swimmer(3)
+    agents = [Agent(graph, policy="graph", hidden=(8,), policy_options={"latent": 4, "hidden": [8]}) for _ in range(2)]
+    losses = [SVGLoss(agent.policy, agent.value, steps=0, delay_actor=True) for agent in agents]
+    agents[0].update_normalizers(torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13))
+    losses[1].load_state_dict({name: value.clone() for name, value in losses[0].state_dict().items()})
+    losses[1].double()
+    agents[1].update_normalizers(1 + torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13))
+    policy = agents[1].graph_policy
+    assert policy is not None and policy.network.node_normalizer.count[0] == 120
+    for parameters in (losses[1].actor_network_params, losses[1].target_actor_network_params):
+        flat = parameters.flatten_keys(".")
+        for name in ("mean", "std", "inverse_std"):
+            key = next(key for key in flat.keys() if str(key).endswith(f"node_normalizer.{name}"))
+            assert torch.equal(flat[key], getattr(policy.network.node_normalizer, name))
+
+
+def test_targets_share_no_weights():
+    """Not even those that policy and value have in common, which TorchRL then holds as plain tensors."""
+    torch.manual_seed(0)
+    common = nn.Linear(3, 4).double()
+    policy = TensorDictModule(nn.Sequential(common, nn.Linear(4, 2).double()), ["observation"], ["action"])
+    value = ValueOperator(Shared(common), in_keys=["observation", "action"])
+    loss = SVGLoss(policy, value, steps=0, separate_losses=True, delay_actor=True)
+    for name in ("actor_network_params", "value_network_params"):
+        pairs = zip(
+            getattr(loss, name).values(True, True), getattr(loss, f"target_{name}").values(True, True), strict=True
+        )
+        assert all(own.data_ptr() != target.data_ptr() for own, target in pairs)
+
+
+class Shared(nn.Module):
+    """A value that sees observations through a layer of someone else's."""
+
+    def __init__(self, common: nn.Module) -> None:
+        super().__init__()
+        self.common, self.last = common, nn.Linear(6, 1).double()
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        return self.last(torch.cat((self.common(observation), action), dim=-1))
