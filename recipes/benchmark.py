@@ -19,8 +19,6 @@ from __future__ import annotations
 import contextlib
 import math
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -40,8 +38,9 @@ from torchrl_gn.modules import fast_matmul, specialize
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.systems import find_system
 from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
+from torchrl_gn.training.sweep import Run, run_all
 
-RECIPES = Path(__file__).parent
+RECIPE = Path(__file__).with_name("forward_model.py")
 
 
 @dataclass
@@ -65,13 +64,12 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[Path]:
         variants[f"gn_{size}"] = [f"model.latent={size}", *sizes]
     for hidden in cfg.mlps:
         variants[f"mlp_{len(hidden)}x{hidden[0]}"] = ["model.core=mlp", f"model.mlp_hidden={list(hidden)}"]
-    for name, sizes in variants.items():
-        folder = run.path / "models" / name
-        options = [f"system={cfg.system}", f"run_dir={folder}", f"data.folder={run.path / 'data'}", f"seed={cfg.seed}"]
-        options += [*sizes, f"minutes={cfg.minutes}", *cfg.training]
-        print(f"training {name}", flush=True)
-        subprocess.run([sys.executable, RECIPES / "forward_model.py", *options], check=True, stdout=subprocess.DEVNULL)
-    return [run.path / "models" / name for name in variants]
+    shared = [f"system={cfg.system}", f"data.folder={run.data}", f"seed={cfg.seed}", f"threads={cfg.threads}"]
+    shared += [f"minutes={cfg.minutes}", "clock=processor", *cfg.training]
+    runs = [Run(RECIPE, run.path / "models" / name, (*shared, *sizes), name) for name, sizes in variants.items()]
+    if run_all(runs, 1):
+        raise ValueError("Not all models could be trained; see their log.txt. Start again to go on.")
+    return [each.folder for each in runs]
 
 
 def title(options: dict[str, Any]) -> tuple[str, str]:

@@ -154,9 +154,10 @@ def main(cfg: DictConfig) -> None:
     metrics: dict[str, float | int] = {}
     if cfg.policy is not None:
         loaded, sizes = load_checkpoint(cfg.policy), cfg.swimming
+        agent = loaded.agent  # or it says what else the checkpoint is of
         hold = max(1, round(loaded.config["task"]["timestep"] / scene.timestep))
         swimming = {
-            name: swim_by_policy(scene, loaded.agent, hold, sizes[name], cfg.length, cfg.seed + index)
+            name: swim_by_policy(scene, agent, hold, sizes[name], cfg.length, cfg.seed + index)
             for index, name in enumerate(("train", "test"))
         }
     else:

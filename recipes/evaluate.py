@@ -11,6 +11,7 @@ recipes/config/evaluate.yaml. Takes seconds.
 from __future__ import annotations
 
 import hydra
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_gn.data import collect_trajectories
@@ -18,7 +19,7 @@ from torchrl_gn.evaluation import report
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, clean_exit
-from torchrl_gn.training.progress import collecting
+from torchrl_gn.training.progress import HORIZON, collecting
 
 
 @hydra.main(version_base=None, config_path="config", config_name="evaluate")
@@ -27,6 +28,9 @@ def main(cfg: DictConfig) -> None:
     checkpoint = load_model(cfg.checkpoint)
     scene = load_scene(cfg.system, timestep=cfg.timestep) if cfg.system else checkpoint.scene()
     model = checkpoint.model.bind(scene, strict=cfg.strict)
+    if cfg.length < HORIZON:
+        raise ValueError(f"length={cfg.length} is too short: errors are measured over {HORIZON} steps.")
+    torch.set_num_threads(cfg.threads)
     run = RunFolder(cfg.run_dir, "evaluate")
     run.write_config(OmegaConf.to_yaml(cfg))
     with collecting("test data") as show:

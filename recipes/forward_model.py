@@ -122,15 +122,18 @@ def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
     if cfg.data.extra is None:
         return dataset.train
     sources = [cfg.data.extra] if isinstance(cfg.data.extra, str) else list(cfg.data.extra)
-    each = [extra_trajectories(source, cfg.data.length) for source in sources]
-    more = each[0] if len(each) == 1 else cast(TensorDict, torch.cat(cast(list, each)))  # what lies on disk stays there
     count = (len(dataset.train) + 1) // 2
     own = cast(TensorDict, dataset.train[:count]).select("state", "action")
-    shapes, wanted = ([tuple(of.get(key).shape[2:]) for key in ("state", "action")] for of in (more, own))
-    if shapes != wanted:
-        raise ValueError(
-            f"data.extra={cfg.data.extra} has states and actions of shapes {shapes}, {cfg.system} has {wanted}."
-        )
+    each = []
+    for source in sources:
+        each.append(extra_trajectories(source, cfg.data.length))
+        shapes, wanted = ([list(of.get(key).shape[1:]) for key in ("state", "action")] for of in (each[-1], own))
+        if shapes != wanted:
+            raise ValueError(
+                f"data.extra={source} has states and actions [M, *] of shapes {shapes}; {cfg.system} with"
+                f" data.length={cfg.data.length} has {wanted}."
+            )
+    more = each[0] if len(each) == 1 else cast(TensorDict, torch.cat(each))  # what lies on disk stays there
     return cast(TensorDictBase, torch.cat([own, more[torch.arange(count) % len(more)].to(own["action"].dtype)]))
 
 

@@ -7,9 +7,8 @@ Plays episodes in MuJoCo, all from the same start states for every planner: gn p
 model (paper, SM "MPC planner with learned models"), cem and mppi are TorchRL's own planners on that model, ilqg (paper,
 SM "Baseline Mujoco-based planner"), cem_true and mppi_true plan on MuJoCo itself, random plays random controls. A
 checkpoint of an inference model first identifies the system from random controls; `variants=true` plays a random
-variant of the system in every episode, with a checkpoint that was trained on such (one of pendulums that identifies
-comes with the package). Finished episodes are kept: the same
-`run_dir` goes on, with more steps or planners too.
+variant of the system in every episode, with a checkpoint that was trained on such (those that come with the package
+identify pendulums and cheetahs). What was played is kept: the same `run_dir` goes on, with more steps or planners too.
 
 Leaves config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
 a video of the first episode, beside what the plan said before (<planner>.gif). All options: recipes/config/mpc.yaml.
@@ -53,13 +52,13 @@ MAY_CHANGE = ("planner", "steps", "compile", "threads", "video", "logger", "run_
 
 
 class RandomControl(TensorDictModuleBase):
-    """Smooth random controls, or none: what planners are to beat."""
+    """Smooth random controls, or none, from a step on: what planners are to beat."""
 
-    def __init__(self, scene: Scene, episodes: int, steps: int, seed: int, factor: float) -> None:
+    def __init__(self, scene: Scene, episodes: int, steps: int, seed: int, factor: float, *, step: int) -> None:
         super().__init__()
         self.in_keys: list[NestedKey] = ["state"]
         self.out_keys: list[NestedKey] = ["action"]
-        self.step = 0
+        self.step = step
         self.controls = factor * torch.from_numpy(spline_controls(scene, episodes, steps, seed))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -142,7 +141,7 @@ def fill_in(cfg: DictConfig) -> None:
     ]
     for part, key, value in defaults:
         if part[key] is None and value is None:
-            raise ValueError(f"{cfg.system!r} is no system of the paper: say which {key} it gets, as {key}=...")
+            raise ValueError(f"{cfg.system!r} is no system of the paper; those with rewards are {list(cfg.tasks)}.")
         part[key] = value if part[key] is None else part[key]
     with open_dict(cfg):  # what other systems get is none of this run's business
         del cfg.tasks
@@ -194,11 +193,11 @@ def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -
 
 
 def make_planner(
-    name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, steps: int
+    name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, played: int
 ) -> TensorDictModuleBase:
-    """The planner of a name; steps are those still to play."""
+    """The planner of a name, to go on after so many steps."""
     if name in ("random", "nothing"):
-        return RandomControl(env.scene, cfg.episodes, steps, cfg.seed + 2, float(name == "random"))
+        return RandomControl(env.scene, cfg.episodes, cfg.steps, cfg.seed + 2, float(name == "random"), step=played)
     if name == "ilqg":
         return ILQGPlanner(env, cfg.horizon, seed=cfg.seed, **cfg.ilqg)
     if name == "gn":
@@ -296,10 +295,12 @@ def main(cfg: DictConfig) -> None:
     curves: dict[str, Tensor] = {}
     for name in cfg.planner:
         played = Episodes(run.file(f"{name}.safetensors"), start.copy())
-        planner = make_planner(name, cfg, env, imagined, cfg.steps - len(played))
+        if len(played) > cfg.steps:
+            raise ValueError(f"{played.path} has {len(played)} steps, more than steps={cfg.steps}; name a new run_dir.")
+        planner = make_planner(name, cfg, env, imagined, len(played))
         policy = planner if target is None else TensorDictSequential([FixTask(reward), planner])
         play(cfg, name, policy, env, imagined, played)
-        rewards, seconds = played["reward"][:, : cfg.steps], played["seconds"]
+        rewards, seconds = played["reward"], played["seconds"]
         last = rewards[:, -max(1, cfg.steps // 10) :].mean()
         of = {
             "mean_reward": rewards.mean().item(),

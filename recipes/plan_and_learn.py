@@ -31,7 +31,8 @@ RECIPES = Path(__file__).parent
 def playing(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
     """Episodes planned through a model."""
     options = (f"system={cfg.system}", f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"compile={cfg.compile}")
-    options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}", *cfg.planning)
+    options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
+    options += ("video=false", "gn.iterations=3", *cfg.planning)
     return Run(RECIPES / "mpc.py", folder / f"played{index}", options, f"playing, round {index}")
 
 
@@ -51,6 +52,7 @@ def main(cfg: DictConfig) -> None:
     model = cfg.checkpoint or cfg.system
     load_model(model)  # refused before anything is written
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    place = folder.path.resolve()  # named in the rounds' options, which may not change
     lines = ["| round | mean reward (spread over starts) | ms a step | one-step error | 100 steps |", "|---" * 5 + "|"]
     metrics: dict[str, float] = {}
     played: list[Run] = []
@@ -58,7 +60,7 @@ def main(cfg: DictConfig) -> None:
     for index in range(cfg.rounds + 1):
         errors = ["", ""]
         if index:
-            learned = learning(cfg, folder.path, index, model, played)
+            learned = learning(cfg, place, index, model, played)
             failed = run_all([learned], 1, desc=learned.name)
             if failed or learned.metrics is None:
                 break
@@ -66,7 +68,7 @@ def main(cfg: DictConfig) -> None:
             found = {name: learned.metrics[name] for name in ("one_step_error", "rollout_error_100")}
             metrics |= {f"round {index}/{name}": value for name, value in found.items()}
             errors = [f"{value:.1e}" for value in found.values()]
-        played.append(playing(cfg, folder.path, index, model))
+        played.append(playing(cfg, place, index, model))
         failed = run_all(played[-1:], 1, desc=played[-1].name)
         values = played[-1].metrics
         if failed or values is None:

@@ -38,6 +38,7 @@ from torchrl_gn.training import (
     load_checkpoint,
     make_optimizer,
 )
+from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 from torchrl_gn.training.progress import train_with_progress
 
 MODELS = {"feed-forward": "gn", "recurrent": "recurrent"}
@@ -119,7 +120,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, chain: JointChain, data: 
 
 def train(cfg: DictConfig, name: str, run: RunFolder, chain: JointChain, data: dict, tracker: Tracker):
     """Train one of the models, or go on with it; the model, its trainer and its checkpoint."""
-    path = run.path / name / "checkpoint.safetensors"
+    path = run.path / name / CHECKPOINT_FILE
     begun = load_checkpoint(path) if path.exists() else None
     if begun:
         run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
@@ -138,7 +139,7 @@ def train(cfg: DictConfig, name: str, run: RunFolder, chain: JointChain, data: d
     trainer = make_trainer(cfg, model, chain, data)
     if not begun:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
-    train_with_progress(trainer, path, begun, tracker, scene=cast(Any, chain), config=options(cfg))
+    train_with_progress(trainer, path, begun, tracker, scene=cast(Any, chain), config=options(cfg), name=name)
     return model, trainer, path
 
 
@@ -147,20 +148,29 @@ def train(cfg: DictConfig, name: str, run: RunFolder, chain: JointChain, data: d
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)
+    horizon = cfg.length - cfg.warm_up
+    if not 0 < cfg.validation_steps <= horizon:
+        raise ValueError(
+            f"length={cfg.length} leaves {horizon} steps behind warm_up={cfg.warm_up}, too few for"
+            f" validation_steps={cfg.validation_steps}."
+        )
     log, chain = read(cfg)
     print(chain)
     data = split(cfg, log)
     run = RunFolder(cfg.run_dir, "real_robot")
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name=f"real_robot-{chain.name}", config=options(cfg))
-    horizon = cfg.length - cfg.warm_up
     tables: dict[str, ErrorTable] = {}
     metrics: dict[str, float] = {}
     files = []
     for name in MODELS:
         model, trainer, path = train(cfg, name, run, chain, data, tracker)
         tables[name] = evaluate_errors(
-            model.bind(cast(Any, chain)), data["test"], horizons=(20, horizon), warm_up=cfg.warm_up, keep=1
+            model.bind(cast(Any, chain)),
+            data["test"],
+            horizons=(min(20, horizon), horizon),
+            warm_up=cfg.warm_up,
+            keep=1,
         )
         metrics |= {f"{name}/{key}": value for key, value in tables[name].to_metrics().items()}
         metrics |= {f"{name}/steps": trainer.step, f"{name}/training_seconds": trainer.seconds}
@@ -170,7 +180,7 @@ def main(cfg: DictConfig) -> None:
         plot_joints(cast(Any, data["test"]["state"])[0], predictions, chain, run.path / "joints.png"),
         plot_errors(tables, run.path / "errors.png"),
     ]
-    tracker.log(run.write_metrics(metrics, seed=cfg.seed), 0)
+    tracker.log(run.write_metrics(metrics, seed=cfg.seed), trainer.step)
     tracker.log_files([*pictures, *files])
     tracker.close()
     print(summary(tables))

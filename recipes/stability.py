@@ -13,8 +13,6 @@ Writes config.yaml, metrics.json and, if it trains one, the model to its run fol
 from __future__ import annotations
 
 import copy
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -44,8 +42,9 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import Scene, has_variants, load_scene, make_variants, parameter_ranges
 from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training.sweep import Run, run_all
 
-RECIPES = Path(__file__).parent
+RECIPE = Path(__file__).with_name("forward_model.py")
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
 
 # One body with a motor, without, and afloat in the wind: there is no smaller scene, as something must move.
@@ -334,8 +333,9 @@ def main(cfg: DictConfig) -> None:
     run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
     checkpoint = cfg.checkpoint or run.path / "model"
     if not cfg.checkpoint:
-        options = [f"system={cfg.system}", f"minutes={cfg.minutes}", f"run_dir={checkpoint}"]
-        subprocess.run([sys.executable, RECIPES / "forward_model.py", *options], check=True, stdout=subprocess.DEVNULL)
+        options = (f"system={cfg.system}", f"minutes={cfg.minutes}", f"seed={cfg.seed}", f"threads={cfg.threads}")
+        if run_all([Run(RECIPE, run.path / "model", options, cfg.system)], 1):
+            raise ValueError(f"The model could not be trained; see {run.path / 'model' / 'log.txt'}.")
     prepared = settings(cfg, checkpoint)
 
     metrics: dict[str, float | int] = {}

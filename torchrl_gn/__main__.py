@@ -73,7 +73,7 @@ def _models() -> str:
         for system in sorted(stated, key=lambda system: (system.rstrip("0123456789"), len(system), system)):
             errors = (f"{stated[system][key]:.1e}" if key in stated[system] else "-" for key in keys)
             rows.append((name, system, "yes" if system in trained else "no", *errors))
-    return _table(rows) + "\nSquared errors relative to the prediction that nothing moves (1)."
+    return _table(rows) + "\nSquared errors relative to the prediction that nothing moves (1), of 20 trajectories."
 
 
 def _show(source: str, image: str | None) -> str:

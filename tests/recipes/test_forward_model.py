@@ -104,7 +104,10 @@ def test_a_model_goes_on_from_another_with_episodes_as_half_of_its_data(tmp_path
     assert 0 < distance.abs().max() < 1e-2
 
     code, _, errors = call(*options, "system=cartpole", f"run_dir={tmp_path / 'other'}", recipe="forward_model")
-    assert code == 1 and "of shapes [(2, 13), (1,)], cartpole has [(3, 13), (1,)]" in errors
+    assert (
+        code == 1
+        and "of shapes [[101, 2, 13], [100, 1]]; cartpole with data.length=100 has [[101, 3, 13], [100, 1]]" in errors
+    )
     code, _, errors = call(*options, "data.length=130", f"run_dir={tmp_path / 'long'}", recipe="forward_model")
     assert code == 1 and "episodes of 120 steps, fewer than data.length=130" in errors and "Traceback" not in errors
 

@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from torchrl_gn.training import RunFolder
 from torchrl_gn.training.checkpoint import CheckpointError
 from torchrl_gn.training.exit import clean_exit
 
@@ -36,11 +37,21 @@ def test_what_a_user_can_mend_is_one_line(error, capsys):
     assert capsys.readouterr().err == f"{type(error).__name__}: bad lr\n"
 
 
-def test_interruptions_say_that_the_run_is_saved(capsys):
+@pytest.mark.parametrize("saved", [False, True])
+def test_interruptions_say_what_is_kept_and_where(saved, tmp_path, capsys):
+    run = RunFolder(tmp_path / "here", "train")
+    run.write_config("a: 1\n")
+    if saved:
+        run.data.mkdir()
     with pytest.raises(SystemExit) as caught:
         ending(KeyboardInterrupt())()
     assert caught.value.code == 130
-    assert "saved" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said == (
+        f"Interrupted; what was done is in {run.path}, and run_dir={run.path} goes on from there.\n"
+        if saved
+        else "Interrupted; nothing was kept.\n"
+    )
 
 
 def test_being_told_to_end_is_an_interruption(capsys):
@@ -59,7 +70,7 @@ def test_being_told_to_end_is_an_interruption(capsys):
     with pytest.raises(SystemExit) as caught:
         main()
     assert caught.value.code == 143 and saved
-    assert "saved" in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith("Interrupted; ")
     assert signal.getsignal(signal.SIGTERM) is before
 
 

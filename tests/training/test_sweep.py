@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 
@@ -47,6 +48,19 @@ def test_each_runs_once_and_failures_do_not_stop_the_others(make_run, capsys, jo
     assert (runs[0].folder / "times").read_text() == "x"
     assert [run.name for run in best(runs, "error", 3)] == ["value 1", "value 2", "value 3"]
     assert best(runs, "error", 9)[-1] == runs[3]  # without a number: it diverged
+
+
+def test_a_finished_run_with_other_options_is_no_result(make_run):
+    run = make_run("1")
+    assert run_all([run], 1) == []
+    other = replace(run, overrides=("value=1", "minutes=10", "threads=2"))
+    with pytest.raises(ValueError, match="holds a finished run with none of these, not minutes=10. Name a new run_dir"):
+        run_all([other], 1)
+    assert run_all([replace(run, overrides=("value=1", "threads=2"))], 1) == []
+    (run.folder / "metrics.json").unlink()  # not finished: it goes on, if the recipe lets it
+    assert run_all([other], 1) == [] and run.metrics == {"error": 1}
+    with pytest.raises(ValueError, match="with minutes=10, not none of these"):
+        run_all([run], 1)
 
 
 def test_folder_names_are_safe():

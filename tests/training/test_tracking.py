@@ -124,12 +124,15 @@ def test_tensorboard_run_holds_everything(tmp_path, picture, video):
     for step, value in ((1, 0.5), (2, 0.25)):
         tracker.log({"train/loss": value, "version/torch": "no number"}, step)
     tracker.log_table("errors", [["error", "one step"], ["total", 0.1]])
-    tracker.log_files([picture, video])
+    other = tmp_path / "swimmer3" / picture.name  # of one of several systems
+    other.parent.mkdir()
+    other.write_bytes(picture.read_bytes())
+    tracker.log_files([picture, video, other])
     tracker.close()
 
     events = EventAccumulator(str(tmp_path / "log" / "run")).Reload()
     assert [(event.step, event.value) for event in events.Scalars("train/loss")] == [(1, 0.5), (2, 0.25)]
-    assert set(events.Tags()["images"]) == {"prediction", "rollout"}
+    assert set(events.Tags()["images"]) == {"prediction", "rollout", "swimmer3/prediction"}
     assert events.Images("rollout")[0].encoded_image_string == video.read_bytes()
     texts = {tag: events.Tensors(tag)[0].tensor_proto.string_val[0].decode() for tag in events.Tags()["tensors"]}
     assert '"latent": 128' in texts["config/text_summary"]

@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
+from torchrl_gn.training.run_folder import RunFolder
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -18,7 +20,7 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
 
     What its user can mend (a bad option, file or data set, an unstable simulation) is one line
     on standard error and exit code 1, without a traceback. Ctrl-C is exit code 130, and being told to
-    end (SIGTERM, as a cluster does) 143, after the recipe has saved what it has. Anything else is
+    end (SIGTERM, as a cluster does) 143, after the recipe has saved what it has, and said where. Anything else is
     a bug and keeps its traceback.
     """
 
@@ -29,7 +31,7 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
         try:
             return main(*args, **kwargs)
         except KeyboardInterrupt as interrupt:
-            sys.stderr.write("Interrupted; what was done is saved. The same run_dir goes on from there.\n")
+            sys.stderr.write(f"Interrupted; {RunFolder.what_is_kept()}\n")
             raise SystemExit(128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)) from None
         except (ValueError, OSError, RuntimeError, FloatingPointError, ImportError) as error:
             if type(error) is RuntimeError:

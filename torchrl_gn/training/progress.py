@@ -16,6 +16,9 @@ from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
 
+HORIZON = 100
+"""Steps of the longest rollouts that recipes measure."""
+
 
 @contextmanager
 def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
@@ -44,7 +47,12 @@ def dataset_with_progress(
         data: configuration of the data: trajectories to ``train``, for ``validation`` and to ``test``, their ``length``
             in control steps, and their ``seed``; if it has ``ray``, the address of a Ray cluster to simulate on.
         variants: number of random variants in each split. Default: all trajectories are of the scene itself.
+
+    Raises:
+        ValueError: if trajectories are too short for the errors that recipes measure.
     """
+    if data["length"] < HORIZON:
+        raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
     name = scene.name if variants is None else f"{scene.name}_variants"
     sizes = {split: data[split] for split in ("train", "validation", "test")}
     options: dict[str, Any] = {"steps": data["length"], "seed": data["seed"], "variants": variants}
@@ -90,6 +98,7 @@ def train_with_progress(
     *,
     scene: Scene | Sequence[Scene],
     config: Mapping[str, Any],
+    name: str = "",
 ) -> dict[str, list]:
     """Train to the end with a progress bar, saving now and then, on Ctrl-C and at the end, with the best weights.
 
@@ -102,10 +111,12 @@ def train_with_progress(
         tracker: where losses and validation errors are logged.
         scene: the scene, or scenes, trained on.
         config: configuration of the run; its ``checkpoint_seconds`` are the training seconds between checkpoints.
+        name: what is trained, where a run trains several: it begins the names in the log.
 
     Returns:
         ``"seconds"`` and mean ``"loss"`` of every 100 steps.
     """
+    prefix = f"{name}/" if name else ""
     curves: dict[str, list] = {"seconds": [], "loss": []}
     if begun is not None:
         trainer.load_state_dict(begun.training)
@@ -121,7 +132,9 @@ def train_with_progress(
 
     losses: list[float] = []
     with (
-        tqdm(total=100, initial=int(100 * trainer.fraction), unit="%", desc="training", leave=False) as bar,
+        tqdm(
+            total=100, initial=int(100 * trainer.fraction), unit="%", desc=f"training {name}".strip(), leave=False
+        ) as bar,
         saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
     ):
         for progress in trainer.run():
@@ -131,11 +144,11 @@ def train_with_progress(
                 losses.clear()
                 curves["seconds"].append(progress.seconds)
                 curves["loss"].append(mean)
-                tracker.log({"train/loss": mean, "train/seconds": progress.seconds}, progress.step)
-                bar.set_postfix(step=progress.step, loss=f"{mean:.2e}", best20=f"{trainer.best:.2e}")
+                tracker.log({f"{prefix}train/loss": mean, f"{prefix}train/seconds": progress.seconds}, progress.step)
+                bar.set_postfix(step=progress.step, loss=f"{mean:.2e}", best_error=f"{trainer.best:.2e}")
                 bar.update(int(100 * progress.fraction) - bar.n)
             if progress.validation is not None:
-                tracker.log({"validation/rollout_error_20": progress.validation}, progress.step)
+                tracker.log({f"{prefix}validation/rollout_error": progress.validation}, progress.step)
             save_when_due()
     trainer.restore_best()
     save()

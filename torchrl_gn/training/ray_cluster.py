@@ -31,7 +31,7 @@ class RayCluster:
         try:
             import ray
         except ImportError as error:
-            raise ImportError(f"ray={address} needs Ray; install it with pip install 'torchrl_gn[ray]'.") from error
+            raise ImportError(f"ray={address} needs Ray: pip install ray, or torchrl_gn's extra [ray].") from error
         self._ray: Any = ray
         self.address, self.cpus = address, cpus
         self._started: list[Any] = []

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import time
 from collections.abc import Collection, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
+
+CONFIG_FILE = "config.yaml"
 
 
 class RunFolder:
@@ -27,14 +30,29 @@ class RunFolder:
         NotADirectoryError: if ``path`` is a file.
     """
 
+    _latest: ClassVar[RunFolder | None] = None
+
     def __init__(self, path: str | os.PathLike | None, name: str) -> None:
-        self.path = Path(path) if path else Path("runs") / name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        self.path = Path(path) if path else _new_folder(Path("runs") / name)
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"run_dir={self.path} is a file; name a folder.")
         self.name = name
         self.path.mkdir(parents=True, exist_ok=True)
         self._start = time.perf_counter()
         self._written: list[Path] = []
+        RunFolder._latest = self
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        RunFolder._latest = self  # of workers that share the first one's
+
+    @classmethod
+    def what_is_kept(cls) -> str:
+        """What a run that stops now leaves in this process's latest folder, as a person is told."""
+        run = cls._latest
+        if run is None or not any(path.name != CONFIG_FILE for path in run.path.glob("*")):
+            return "nothing was kept."
+        return f"what was done is in {run.path}, and run_dir={run.path} goes on from there."
 
     @property
     def checkpoint(self) -> Path:
@@ -82,7 +100,7 @@ class RunFolder:
 
     def write_config(self, text: str) -> None:
         """Write ``config.yaml``."""
-        with atomic_path(self.file("config.yaml")) as temporary:
+        with atomic_path(self.file(CONFIG_FILE)) as temporary:
             temporary.write_text(text)
 
     def write_metrics(self, metrics: Mapping[str, Any], *, seed: int) -> dict[str, Any]:
@@ -103,6 +121,19 @@ class RunFolder:
         }
         write_json(self.file("metrics.json"), everything)
         return everything
+
+
+def _new_folder(parent: Path) -> Path:
+    """A folder named by the time; of two that begin in one second, the later is the next one."""
+    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    for number in itertools.count(1):
+        path = parent / (name if number == 1 else f"{name}_{number}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return path
+    raise AssertionError
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

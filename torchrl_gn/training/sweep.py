@@ -16,10 +16,13 @@ from typing import Any
 
 from tqdm import tqdm
 
-from torchrl_gn.atomic import atomic_path
+from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.evaluation import plot_bars
 from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.run_folder import RunFolder
+
+OPTIONS_FILE = "options.json"
+MAY_DIFFER = ("threads=", "compile=", "data.folder=")  # of a finished run
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,21 @@ class Run:
         path = self.folder / "metrics.json"
         return json.loads(path.read_text()) if path.exists() else None
 
+    def refuse_changes(self) -> None:
+        """Refuse to take what was measured with other options for this run.
+
+        Raises:
+            ValueError: naming the options that differ.
+        """
+        path = self.folder / OPTIONS_FILE
+        if self.metrics is None or not path.exists():
+            return
+        both = json.loads(path.read_text()), self.overrides
+        before, now = ({option for option in options if not option.startswith(MAY_DIFFER)} for options in both)
+        if before != now:
+            was, wanted = (", ".join(sorted(options)) or "none of these" for options in (before - now, now - before))
+            raise ValueError(f"{self.folder} holds a finished run with {was}, not {wanted}. Name a new run_dir.")
+
 
 def folder_name(text: str) -> str:
     """A text as a folder's name that Hydra does not misread (it takes a comma for a list)."""
@@ -64,8 +82,13 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
 
     Returns:
         Those that failed.
+
+    Raises:
+        ValueError: if a finished run was made with other options.
     """
     runs, failed = list(dict.fromkeys(runs)), []
+    for run in runs:
+        run.refuse_changes()
     left = [run for run in runs if run.metrics is None]
     if not left:
         return []  # without starting a cluster
@@ -123,6 +146,7 @@ def _start(run: Run, folder: Path) -> subprocess.Popen:
     """Start a run's process in a working folder; what it prints goes to its log."""
     place = folder / run.folder
     place.mkdir(parents=True, exist_ok=True)
+    write_json(place / OPTIONS_FILE, list(run.overrides))
     command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]
     with (place / "log.txt").open("a") as log:
         log.write(f"$ {shlex.join(command)}\n")
@@ -147,6 +171,8 @@ class _Threads(ThreadPoolExecutor):
             return 130
         process = _start(run, Path.cwd())
         self.running.add(process)
+        if self.stopped:  # while it was started
+            process.terminate()
         try:
             return process.wait()
         finally:

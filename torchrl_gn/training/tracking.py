@@ -20,7 +20,7 @@ class Tracker:
     Args:
         kind: ``"none"``, ``"csv"`` files, ``"tensorboard"`` or ``"wandb"``. Without an account (no API key and no
             login), wandb runs offline; ``wandb sync`` uploads such a run later.
-        folder: where the logger writes.
+        folder: where the logger writes, in the run's folder.
         name: name of the run.
         config: configuration of the run.
 
@@ -32,7 +32,7 @@ class Tracker:
     def __init__(self, kind: LoggerKind, folder: Path, *, name: str, config: Mapping[str, Any]) -> None:
         if kind not in get_args(LoggerKind):
             raise ValueError(f"logger={kind!r} is not known; use one of {list(get_args(LoggerKind))}.")
-        self.kind = kind
+        self.kind, self._run = kind, folder.parent
         self._logger: Any = None
         if kind == "none":
             return
@@ -83,7 +83,7 @@ class Tracker:
                 # As the file has it: the writer's own way decodes pictures, and needs moviepy for moving ones.
                 made: Any = summary_pb2  # its classes are made at import
                 image = made.Summary.Image(encoded_image_string=path.read_bytes())
-                summary = made.Summary(value=[made.Summary.Value(tag=path.stem, image=image)])
+                summary = made.Summary(value=[made.Summary.Value(tag=self._tag(path), image=image)])
                 self._logger.experiment._get_file_writer().add_summary(summary)
 
     def _log_to_wandb(self, path: Path) -> None:
@@ -91,13 +91,18 @@ class Tracker:
 
         run = self._logger.experiment
         if path.suffix == ".png":
-            run.log({path.stem: wandb.Image(str(path))})
+            run.log({self._tag(path): wandb.Image(str(path))})
         elif path.suffix in (".gif", ".mp4"):
-            run.log({path.stem: wandb.Video(str(path), format="gif" if path.suffix == ".gif" else "mp4")})
+            run.log({self._tag(path): wandb.Video(str(path), format="gif" if path.suffix == ".gif" else "mp4")})
         elif path.suffix == ".safetensors":
             artifact = wandb.Artifact(f"{run.id}-{path.parent.name}", type="model")
             artifact.add_file(str(path))
             run.log_artifact(artifact)
+
+    def _tag(self, path: Path) -> str:
+        """Name of a figure; of several systems each has a folder of its own."""
+        inside = path.resolve().is_relative_to(self._run.resolve())
+        return str(path.resolve().relative_to(self._run.resolve()).with_suffix("")) if inside else path.stem
 
     def log_table(self, name: str, rows: Sequence[Sequence[Any]]) -> None:
         """Log a table whose first row holds the titles; csv takes none."""
