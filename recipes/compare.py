@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
@@ -35,18 +36,27 @@ ERRORS = {"one_step_error": "one step", "rollout_error_100": "100 steps"}
 
 @dataclass(frozen=True)
 class Variant:
-    """What is compared: options, and the systems that one model is trained on (none: each of the experiment's)."""
+    """What is compared: options, and the systems that one model is trained on.
+
+    Without, each of the experiment's systems has a model of its own, or each of those that the variant is for.
+    """
 
     name: str
     overrides: tuple[str, ...] = ()
     train_on: tuple[str, ...] = ()
+    systems: tuple[str, ...] | None = None
 
     @classmethod
     def read(cls, name: str, value: Any) -> Variant:
-        """From a list of overrides, or a mapping with ``train_on`` and ``overrides``."""
-        if isinstance(value, dict):
-            return cls(name, tuple(value.get("overrides", ())), tuple(value.get("train_on", ())))
-        return cls(name, tuple(value))
+        """From a list of overrides, or a mapping of what a variant has."""
+        given = value if isinstance(value, dict) else {"overrides": value}
+        return cls(name, **{key: tuple(of) for key, of in given.items()})
+
+    def trainings(self, systems: Sequence[str]) -> list[tuple[str, ...]]:
+        """Systems of each of its models, of an experiment's systems."""
+        if self.train_on:
+            return [self.train_on]
+        return [(system,) for system in systems if self.systems is None or system in self.systems]
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,7 @@ def all_trainings(cfg: DictConfig, folder: Path) -> list[Training]:
     trainings = []
     for seed, name in itertools.product(cfg.seeds, chosen):
         variant = variants[name]
-        for systems in [variant.train_on] if variant.train_on else [(system,) for system in cfg.systems]:
+        for systems in variant.trainings(cfg.systems):
             overrides = (
                 f"system=[{','.join(systems)}]" if variant.train_on else f"system={systems[0]}",
                 f"zero_shot=[{','.join(cfg.zero_shot)}]",
