@@ -62,6 +62,13 @@ def test_collected_data_repeat_and_replay(pendulum: Scene) -> None:
     assert len(starts.unique(dim=0)) == 30
 
 
+def test_a_simulator_of_another_scene_is_refused(pendulum: Scene) -> None:
+    heavy = load_scene("pendulum", parameters={"mass": 2.0})
+    for simulated in (heavy, [pendulum, heavy]):
+        with pytest.raises(ValueError, match="simulator is of another 'pendulum' than the scene"):
+            collect_trajectories(pendulum, 3, 2, simulator=Simulator(simulated, 1))
+
+
 def test_on_disk_as_in_memory(tmp_path: Path, pendulum: Scene) -> None:
     seen = []
     made = create_dataset(tmp_path / "d", pendulum, **SIZES, progress=lambda *counts: seen.append(counts))
@@ -131,6 +138,19 @@ def test_interrupted_resumes_to_identical_data(
         for part in ("whole", "parts")
     )
     assert whole == parts
+
+
+def test_interrupted_before_its_manifest_it_can_be_made_again(
+    tmp_path: Path, pendulum: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DatasetFiles, "_write", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            create_dataset(tmp_path / "d", pendulum, **SIZES)
+    assert len(create_dataset(tmp_path / "d", pendulum, **SIZES).train) == 10
 
 
 def _truncate(folder: Path) -> Path:
@@ -215,6 +235,24 @@ def test_another_is_not_overwritten(tmp_path: Path, pendulum: Scene) -> None:
     with pytest.raises(ValueError, match="seed must not be negative, got -1"):
         create_dataset(tmp_path / "e", pendulum, seed=-1)
     assert not (tmp_path / "e").exists()
+
+
+def test_data_of_an_edited_model_are_refused(tmp_path: Path) -> None:
+    """Friction is in no fingerprint."""
+    model = """<mujoco><worldbody><geom type="plane" size="1 1 1" friction="0.5"/>
+      <body pos="0 0 1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    (tmp_path / "ball.xml").write_text(model)
+    create_dataset(tmp_path / "d", load_scene(tmp_path / "ball.xml"), **SIZES)
+    assert load_dataset(tmp_path / "d", load_scene(model)).train.shape == (10,)
+    (tmp_path / "ball.xml").write_text(model.replace("0.5", "1.5"))
+    edited = load_scene(tmp_path / "ball.xml")
+    assert edited.fingerprint() == load_scene(model).fingerprint()
+    for attempt in (
+        lambda: create_dataset(tmp_path / "d", edited, **SIZES),
+        lambda: load_dataset(tmp_path / "d", edited),
+    ):
+        with pytest.raises(DatasetError, match="the MJCF of 'ball', or a file that it reads, changed since"):
+            attempt()
 
 
 def test_resuming_with_other_versions_is_refused(

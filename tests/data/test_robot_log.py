@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
 from pathlib import Path
 
@@ -72,7 +74,7 @@ def test_trajectories_hold_the_rows_and_cross_no_episode():
     )
     assert (first[:, 0] == torch.tensor([1.0, 0, 0, 0])).all()
     assert trajectories["action"][2, :, 0].tolist() == list(range(30, 42))
-    assert (report.rows, report.trajectories, report.kept, report.short) == (80, 6, 72, 8)
+    assert (report.rows, report.trajectories, report.kept) == (80, 6, 72)
     late, _ = log_trajectories(log, 12, lag=3)
     assert late["action"][0, 0, 0] == 0  # the command of row 0 goes with the state of row 3
     torch.testing.assert_close(late["state"][0, 0, 1, 1], torch.tensor(np.sin(log.angle[3, 0])))
@@ -99,6 +101,22 @@ def test_it_is_cut_at_jumps_and_gaps_and_says_so():
     assert "dropped 1 rows that are not finite" in str(report)
 
 
+@pytest.mark.parametrize("channel", ["angle", "velocity"])
+def test_an_infinity_hides_no_jump(channel):
+    log = smooth_log((60, 60))
+    log.angle[20:60] += 2.0
+    getattr(log, channel)[80] = np.inf
+    trajectories, report = log_trajectories(log, 10)
+    assert report.jumps == ((0, 19),) and report.not_finite == 1
+    assert trajectories["state"].isfinite().all()
+
+
+def test_rows_that_a_trajectory_holds_are_not_left_over():
+    log = smooth_log((25, 3))
+    for options, short in (({}, 3), ({"every": 2}, 3), ({"lag": 4}, 3 + 8), ({"overlap": True}, 3)):
+        assert log_trajectories(log, 12, **options)[1].short == short
+
+
 def test_an_angle_that_turns_over_does_not_jump():
     log = smooth_log((100,))
     rate = 4.0
@@ -123,6 +141,23 @@ def test_bad_files_are_refused(tmp_path, change, message):
     np.savez(tmp_path / "log.npz", **{name: value for name, value in arrays.items() if value is not None})
     with pytest.raises(DatasetError, match=message):
         load_robot_log(tmp_path / "log.npz")
+
+
+@pytest.mark.parametrize("size", [0, 1000])
+def test_a_file_that_broke_off_is_refused(tmp_path, size):
+    np.savez(tmp_path / "whole.npz", **arrays_of(smooth_log()))
+    (tmp_path / "log.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:size])
+    with pytest.raises(DatasetError, match="cannot be read as a robot log"):
+        load_robot_log(tmp_path / "log.npz", timestep=0.01)
+
+
+def test_a_single_joint_needs_no_second_axis(tmp_path):
+    log = smooth_log(joints=1)
+    np.savez(tmp_path / "log.npz", angle=log.angle[:, 0], velocity=log.velocity[:, 0], command=log.command[:, 0])
+    read = load_robot_log(tmp_path / "log.npz", timestep=0.01)
+    for name in ("angle", "velocity", "command"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(log, name))
+    assert read.length.tolist() == [80]
 
 
 def test_other_bad_input_is_named(tmp_path):
@@ -156,6 +191,21 @@ def test_a_chain_is_a_graph_that_comes_back_from_its_description():
     assert "joint2, carried by joint0" in str(chain)
     with pytest.raises(ValueError, match="carried_by="):
         log_chain(smooth_log(), "arm", carried_by=[0, 1])
+
+
+def test_a_chain_of_numpy_numbers_can_be_saved():
+    plain = log_chain(smooth_log(joints=3), "arm", commands=[[2], [0], [1]], carried_by=[-1, 0, 0])
+    own = {"commands": np.array([[2], [0], [1]]), "carried_by": np.array([-1, 0, 0])}
+    chain = log_chain(dataclasses.replace(smooth_log(joints=3), timestep=np.float32(0.01)), "arm", **own)
+    assert json.loads(json.dumps(chain.description())) == chain.description()
+    assert chain.fingerprint() == plain.fingerprint()
+
+
+def test_bounds_are_of_every_command():
+    with pytest.raises(ValueError, match="action_low of 'arm' must be of its 2 commands, got 1 numbers"):
+        JointChain("arm", ("a", "b"), 0.01, ((0,), (1,)), action_low=np.zeros(1))
+    with pytest.raises(ValueError, match="action_low of 'arm' must be of its 1 commands, got 2 numbers"):
+        log_chain(smooth_log(), "arm", commands=[[0], [0]])
 
 
 def test_a_simulated_robot_has_the_faults_of_a_real_one():

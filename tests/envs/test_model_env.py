@@ -12,6 +12,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.modules import ForwardModel
 from torchrl_gn.modules.forward_model import FeatureSet
+from torchrl_gn.scenes import SceneValues, load_scene
 
 
 def rollout(env: ModelEnv, start: TensorDict, actions: torch.Tensor) -> TensorDict:
@@ -134,6 +135,20 @@ def test_runs_a_bound_forward_model(swimmer):
     played["next", "state"].square().sum().backward()
     assert played["next", "state"].isfinite().all()
     assert (actions.grad != 0).any()
+
+
+def test_samples_of_another_scene_are_refused(pendulum):
+    small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+    env = ModelEnv(ForwardModel(FeatureSet.of(pendulum), **small).bind(pendulum), seed=0)
+    start = env.rand_action(env.reset(TensorDict(batch_size=[2])))
+    own, heavy = (
+        SceneValues.of(scene).tensordict().expand(2)
+        for scene in (pendulum, load_scene("pendulum", parameters={"mass": 2.0}))
+    )
+    expected = env.step(start.clone())["next", "state"]
+    assert torch.equal(env.step(start.clone().set("static", own))["next", "state"], expected)
+    with pytest.raises(ValueError, match="other static 'nodes' than scene 'pendulum'"):
+        env.step(start.clone().set("static", heavy))
 
 
 @pytest.mark.parametrize("kind", ["static", "inferred", "recurrent"])

@@ -11,6 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_gn.data import Simulator
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
@@ -185,6 +186,23 @@ def test_copies_and_pickles(scene_env):
     for twin in (copy.deepcopy(scene_env), pickle.loads(pickle.dumps(scene_env))):
         assert (twin.step(start.clone())["next"] == expected).all()
         assert torch.equal(twin.reset(batch(3))["physics"], copy.deepcopy(scene_env).reset(batch(3))["physics"])
+
+
+def test_resets_and_steps_share_one_simulator(env, monkeypatch):
+    made, start = [], Simulator.__init__
+
+    def counted(self, *args, **options):
+        made.append(self)
+        start(self, *args, **options)
+
+    monkeypatch.setattr(Simulator, "__init__", counted)
+    if isinstance(env, SceneEnv):
+        env.num_threads = 1
+    for _ in range(3):
+        env.step(env.rand_action(env.reset(batch(2))))
+    assert len(made) == 1 and (made[0].num_threads == 1 or not isinstance(env, SceneEnv))
+    twin = copy.deepcopy(env)
+    assert torch.equal(twin.reset(batch(2))["state"], env.reset(batch(2))["state"])
 
 
 def test_a_task_entry_reaches_the_reward(pendulum):

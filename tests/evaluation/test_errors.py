@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.evaluation import evaluate_errors, squared_errors
+from torchrl_gn.evaluation import evaluate_errors, fresh_errors, squared_errors
 
 from .conftest import as_model, random_states, random_trajectories
 
@@ -241,6 +241,19 @@ def test_bad_trajectories_are_refused(scenes, change, message):
     scene = scenes["cheetah"]
     with pytest.raises(ValueError, match=message):
         evaluate_errors(as_model(lambda s, a: s * 1, scene), change(random_trajectories(scene, 3, 5)), horizons=(5,))
+
+
+def test_fresh_trajectories_too_short_are_refused_before_they_are_made(swimmer):
+    with pytest.raises(ValueError, match="length=99 is too short: errors are measured over rollouts of 100 steps"):
+        fresh_errors(swimmer.model, swimmer.scene, sequences=1, length=99, seed=0)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_model_on_a_gpu_is_measured_there(swimmer, simulated):
+    here = evaluate_errors(swimmer, simulated, horizons=(5,))
+    there = evaluate_errors(swimmer.cuda(), simulated, horizons=(5,), keep=1)
+    assert there["rollout_error_5"].total == pytest.approx(here["rollout_error_5"].total, rel=1e-6)
+    assert there.rollouts.device == simulated["state"].device
 
 
 def test_only_what_is_asked_for_is_predicted(scenes):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import subprocess
 import warnings
 
 import mujoco
@@ -158,3 +159,17 @@ def test_gl_renders_or_says_why_not(scenes, silent, monkeypatch):
     with pytest.raises(RuntimeError, match="nonsense"):
         list(rollout_frames(scenes["swimmer6"], truth, size=64, engine="gl"))
     assert torch.isfinite(truth).all()
+
+
+def test_a_gl_backend_that_hangs_is_given_up(scenes, silent, monkeypatch):
+    tried = []
+
+    def hang(command, *, env, timeout, **_):
+        tried.append(env["MUJOCO_GL"])
+        raise subprocess.TimeoutExpired(command, timeout)
+
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(subprocess, "run", hang)
+    with pytest.raises(RuntimeError, match="egl: nothing within 600 s; osmesa: .*; glfw: nothing within 600 s"):
+        list(rollout_frames(scenes["swimmer6"], moving_states(scenes["swimmer6"], 1), size=64, engine="gl"))
+    assert tried == ["egl", "osmesa", "glfw"]

@@ -18,10 +18,12 @@ from torchrl_gn.modules import (
     Component,
     FeatureSet,
     ForwardModel,
+    IdentifyingModel,
     StateLayout,
     UnseenFeatureWarning,
     specialize,
 )
+from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.systems import find_system
 
@@ -164,6 +166,22 @@ def test_values_that_training_never_saw_are_named(scenes, make_model):
         model.bind(scenes["falling"])
 
 
+def test_variants_with_values_that_training_never_saw_are_named(scenes, make_model, fit):
+    model = make_model(scenes["swimmer6"])
+    bound, strict = (model.bind(scenes["swimmer6"], strict=strict, static_key="static") for strict in (False, True))
+    for module in (bound, specialize(bound)):
+        with pytest.warns(UnseenFeatureWarning, match="'thick' has values .*viscosity") as caught:
+            module.static_of(thick_swimmer())
+        assert caught[0].filename == __file__
+    for module in (strict, specialize(strict)):
+        with pytest.raises(ValueError, match="viscosity"):
+            module.static_of(thick_swimmer())
+        module.static_of(scenes["swimmer6"])
+    with pytest.warns(UnseenFeatureWarning):
+        fit(model, thick_swimmer())
+    strict.static_of(thick_swimmer())
+
+
 def test_a_feature_that_varied_in_training_is_not_unseen(scenes, make_model, fit):
     model = make_model(scenes["swimmer6"])
     with pytest.warns(UnseenFeatureWarning):
@@ -254,6 +272,21 @@ def test_casting_the_network_leaves_the_scenes_numbers(scenes, make_model):
         assert bound.network_dtype == cast
         for name, buffer in bound.named_buffers():
             assert buffer.dtype == before[name].dtype and torch.equal(buffer, before[name]), name
+
+
+def test_what_binding_makes_lies_where_the_model_is(scenes, make_model, monkeypatch):
+    """Before its numbers are compared with the model's. A device without numbers stands in for a GPU."""
+    model, places = make_model(scenes["cheetah"], static="inferred").to("meta"), set()
+
+    def look(bound: BoundForwardModel, *_, **__) -> None:
+        places.update(tensor.device.type for tensor in bound.buffers())
+
+    monkeypatch.setattr("torchrl_gn.modules.bound_forward_model.check_seen", look)
+    bound = model.bind(scenes["cheetah"])
+    specialize(bound)
+    for module in (ForwardModelLoss(bound), IdentifyingModel(model).bind(bound.scene)[1]):
+        places.update(tensor.device.type for tensor in module.buffers())
+    assert places == {"meta"}
 
 
 def transitions(scene, random_states, random_actions, *batch: int, robot: bool = False) -> TensorDict:

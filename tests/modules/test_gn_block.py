@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchrl_gn.modules import GNBlock, GNCore, Graph, GraphSize, graph_concat
+from torchrl_gn.modules import GNBlock, GNCore, Graph, GraphSize, InferenceModel, graph_concat
 
 # Multi-edges (0 -> 1 twice), a self-loop at 2, node 3 without edges, node 4 that only sends.
 EDGES = torch.tensor([[0, 1, 0, 2, 4, 2], [1, 0, 1, 2, 2, 1]])
@@ -150,3 +150,10 @@ def test_gradients_are_the_finite_differences(random_graph):
 def test_a_core_without_hidden_layers_is_refused():
     with pytest.raises(ValueError, match=r"needs a hidden layer, got edge_hidden=\(8,\), node_hidden=\(\)"):
         GNCore(GraphSize(3, 2, 1), 4, edge_hidden=(8,), node_hidden=(), global_hidden=(8,))
+
+
+def test_an_unknown_activation_is_named_by_every_network():
+    size = GraphSize(3, 2, 1)
+    for make in (lambda: GNBlock(size, size, activation="sin"), lambda: InferenceModel(size, activation="sin")):
+        with pytest.raises(ValueError, match=r"activation='sin' is not known; use one of \['relu', 'silu', "):
+            make()

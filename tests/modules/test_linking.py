@@ -76,6 +76,25 @@ def test_pinned_bodies_stay_together(make_model, random_actions, name):
     assert max(gaps(scene, loose.rollout(state, actions)[:, 1:].detach())) > 1e-4
 
 
+def test_parallel_hinges_at_one_place_share_their_turn_in_single_precision_too(make_model, random_states):
+    scene = load_scene("""
+      <mujoco><worldbody>
+        <body><joint axis="0 0 1"/><geom size=".1" pos=".3 0 0"/>
+          <body pos=".3 .1 0"><joint axis="1 1 0" armature=".1"/><joint axis="1 1 0" armature=".1"/>
+            <geom size=".1" pos=".2 0 .1"/>
+          </body>
+        </body>
+      </worldbody></mujoco>
+    """)
+    bound = make_model(scene, fitted=False).bind(scene)
+    assert isinstance(bound.linking, JointLinking)
+    state = collect_trajectories(scene, 20, 5, seed=0)["state"][:, -1]
+    delta = BODY_STATE.delta(state, random_states(scene, 20, scale=0.1))
+    delta = 0.1 * delta / delta.abs().amax((-2, -1), keepdim=True)
+    single, double = (link(bound, state.to(dtype), delta.to(dtype)) for dtype in (torch.float32, torch.float64))
+    assert (single - double).norm() < 1e-5 * double.norm()
+
+
 def test_a_body_that_turns_about_one_place_needs_no_linking(make_model):
     scene = load_scene("pendulum")
     bound, linking = make_model(scene).bind(scene), Linking(scene)

@@ -71,3 +71,6 @@ def test_bad_options_are_named(scenes):
         ForwardModel(features, activation="sigmoid")
     with pytest.raises(ValueError, match="needs a hidden layer"):
         ForwardModel(features, core="mlp", items=(2, 2), mlp_hidden=())
+    for core in ("recurrent", "mlp"):
+        with pytest.raises(ValueError, match=f"skip=False is for two graph networks; core='{core}'"):
+            ForwardModel(features, core=core, items=(2, 2), skip=False)

@@ -168,3 +168,14 @@ def test_wrong_shapes_are_named(observation_graphs, make_observation_model, tran
             model.step(observation, wrong)
     with pytest.raises(ValueError, match="NaN or Inf"):
         model.update_normalizers(observation, action, observation * torch.nan)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    for inputs, what in (
+        ((observation[:, :1], action, observation[:, :1]), "Observations of 'swimmer3' must be"),
+        ((observation, action[:, :1], observation), "Actions of 'swimmer3' must be"),
+        ((observation, action, observation[:1]), r"Next observations must be \[4, 13\] as observations, got \[1, 13\]"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            model.update_normalizers(*inputs)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    with pytest.raises(KeyError, match='"action" not found'):
+        model(TensorDict({"observation": observation}, [4]))

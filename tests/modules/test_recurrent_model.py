@@ -50,6 +50,23 @@ def test_the_past_counts_and_nothing_else_is_forgotten(bound, trajectories):
         bound.observe(state[:, :0], action[:, :0])
 
 
+def test_wrong_shapes_are_named(bound, trajectories):
+    state, action = trajectories["state"][:, :3], trajectories["action"][:, :3]
+    wrong = action[..., :1]  # one action, which would be that of both motors
+    with pytest.raises(ValueError, match=r"Action of scene 'swimmer3' must be \[6, 2\]"):
+        bound.delta_and_memory(state[:, 0], wrong[:, 0])
+    with pytest.raises(ValueError, match="Action of scene"):
+        bound.observe(state, wrong)
+    with pytest.raises(ValueError, match="State of scene"):
+        bound.observe(state[..., :12], action)
+    variants = bound.model.bind(bound.scene, static_key="static")
+    sample = {"state": state[:, 0], "action": action[:, 0], "static": variants.own_static().expand(1)}
+    with pytest.raises(ValueError, match=r"no batch or that of the state, \[6\], got \[1\]"):
+        variants(TensorDict({**sample}))
+    with pytest.raises(ValueError, match="Static values must have"):
+        variants.observe(state, action, sample["static"])
+
+
 def test_folded_and_plain_are_the_same(bound, trajectories):
     plain = bound.model.bind(bound.scene, plain=True)
     state, action = trajectories["state"][:, :5], trajectories["action"][:, :5]

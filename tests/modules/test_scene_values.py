@@ -11,6 +11,7 @@ from torchrl_gn.envs import ModelEnv
 from torchrl_gn.modules import FeatureSet, ForwardModel, specialize
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes.scene_values import SceneValues
 
 SIZES = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8, 8), "global_hidden": (8,)}
 
@@ -132,6 +133,18 @@ def test_a_model_of_one_scene_refuses_samples_of_another(variants, samples, mode
     sample.set(("next", "state"), state)
     with pytest.raises(ValueError, match="other static 'nodes'"):
         ForwardModelLoss(bound)(sample)
+
+
+@pytest.mark.parametrize("options", [{"static": "none"}, {"features": FeatureSet(nodes=("mass",))}])
+def test_a_model_of_fewer_features_compares_all_that_samples_bring(variants, samples, options):
+    model = ForwardModel(**{"features": FeatureSet.of(variants[0]), **options}, **SIZES).double()
+    bound = model.bind(variants[0])
+    sample = TensorDict({"state": samples["state"][0, :, 0], "action": samples["action"][0, :, 0]}, [2])
+    sample["static"] = SceneValues.of(variants[0]).tensordict().expand(2)
+    assert ("next", "state") in bound(sample).keys(True)
+    sample["static", "edges"] = sample["static", "edges"] + 1.0
+    with pytest.raises(ValueError, match="other static 'edges' than scene 'arm'"):
+        bound(sample)
 
 
 def test_what_is_no_variant_is_refused(variants, model):

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.evaluation import rollout
 from torchrl_gn.modules import FeatureSet, ForwardModel, UnseenFeatureWarning, specialize
-from torchrl_gn.modules.compiled_step import check_compiler
+from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import SYSTEMS, load_scene
 
@@ -209,6 +209,25 @@ def test_an_unchanged_model_is_folded_once(scenes, make_model, random_states, ra
     assert quick.fold() is folded
 
 
+def test_inference_mode_leaves_nothing_behind(scenes, make_model, random_states, random_actions):
+    """Folded inside, differentiated and folded again outside; and values made inside are never taken for the same."""
+    scene = scenes["swimmer6"]
+    model = make_model(scene).double()
+    bound = model.bind(scene, static_key="static")
+    quick = specialize(bound)
+    state, action = random_states(scene, 3), random_actions(scene, 3)
+    with torch.inference_mode():
+        static = bound.static_of(scene).clone()
+        quick.step(state, action, static)
+        static["nodes"].mul_(1.5)
+        torch.testing.assert_close(quick.step(state, action, static), bound.step(state, action, static))
+    for change in (lambda model: None, change_in_place):
+        change(model)
+        found, expected = (pull(module, state, action) for module in (quick, bound))
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
 def test_bfloat16_is_close_and_keeps_the_states_dtype(scenes, make_model, random_states, random_actions):
     scene = scenes["swimmer6"]
     bound = make_model(scene, latent=64).bind(scene)
@@ -266,6 +285,26 @@ def test_no_second_warning(scenes, make_model):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         specialize(bound)
+
+
+def test_a_compiled_step_is_dropped_where_other_channels_vary(scenes, make_model):
+    """As many as before, so that all tensors have the same shapes: but their places are in a compiled step's code."""
+    scene = scenes["swimmer6"]
+    model = make_model(scene)
+    quick, normalizer = specialize(model.bind(scene)), model.residual_normalizer
+    spread = normalizer.m2.clone()
+
+    def without(channel: int, factor: float = 1.0) -> None:
+        m2 = factor * spread.index_fill(0, torch.tensor(channel), 0.0)
+        normalizer.load_state_dict({"count": normalizer.count, "mean": normalizer.mean, "m2": m2})
+        quick.fold()
+
+    without(0)
+    quick._compiled = compiled = CompiledStep(quick.step, lambda: 0)
+    without(0, factor=2.0)
+    assert quick._compiled is compiled
+    without(1, factor=2.0)
+    assert quick._compiled is None
 
 
 def has_compiler() -> bool:

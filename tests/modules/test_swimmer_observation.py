@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_gn.data import Simulator
 from torchrl_gn.envs import suite_env
@@ -28,3 +29,9 @@ def test_equals_what_the_suite_observes(links: int) -> None:
 def test_refuses_other_scenes() -> None:
     with pytest.raises(ValueError, match="'pendulum' is no swimmer"):
         SwimmerObservation(load_scene("pendulum"))
+
+
+def test_a_missing_entry_is_named() -> None:
+    observe = SwimmerObservation(load_scene("swimmer3"))
+    with pytest.raises(KeyError, match='"target" not found'):
+        observe(TensorDict({"state": torch.zeros(2, 4, 13)}, [2]))

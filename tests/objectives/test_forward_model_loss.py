@@ -33,7 +33,7 @@ def unit_scale(loss: ForwardModelLoss) -> None:
     normalizer = loss.model.model.delta_normalizer
     one = torch.ones(12, dtype=torch.float64)
     normalizer.load_state_dict({"count": one, "mean": 0 * one, "m2": one})
-    loss.error_weight = None
+    loss.error_weight.fill_(-1)
 
 
 def by_hand(loss: ForwardModelLoss, delta: Tensor, target: Tensor) -> dict[str, Tensor]:
@@ -50,6 +50,20 @@ def by_hand(loss: ForwardModelLoss, delta: Tensor, target: Tensor) -> dict[str, 
         scaled = (difference * normalizer.inverse_std[where])[..., counts]
         errors[name] = scaled.square().mean() if counts.any() else torch.zeros((), dtype=torch.float64)
     return errors
+
+
+def test_a_fitted_loss_loads_into_a_fresh_one(make_loss, windows):
+    loss, fresh = make_loss(noise=0.1), make_loss(fitted=False, noise=0.1)
+    fresh.load_state_dict({name: value.clone() for name, value in loss.state_dict().items()})
+    values = []
+    for each in (loss, fresh):
+        torch.manual_seed(0)
+        values.append(each(windows["swimmer6"])["loss_forward_model"])
+    assert torch.equal(*values)
+    unfitted = make_loss(fitted=False)
+    fresh.load_training_state(unfitted.training_state())
+    fresh.load_training_state({**unfitted.training_state(), "error_weight": None})  # as of older files
+    assert torch.equal(fresh.error_weight, unfitted.error_weight)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "swimmer6", "falling"])

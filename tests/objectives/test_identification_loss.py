@@ -93,6 +93,16 @@ def test_what_does_not_fit_is_named(make_loss, trajectories):
         identification_errors(loss.bound, loss.inference, trajectories[:8], trajectories)
 
 
+def test_of_a_model_that_diverged_the_loss_is_nan(make_loss, trajectories):
+    """The samples are not to blame: a trainer says so."""
+    loss = make_loss(phase=6)
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(1, 1), seed=0).sample()
+    with torch.no_grad():
+        for weight in loss.identifying.inference.parameters():
+            weight.fill_(torch.nan)
+    assert loss(batch)["loss_forward_model"].isnan()
+
+
 def test_a_model_that_reads_true_parameters_is_no_part_of_it():
     scene = load_scene("pendulum")
     model = ForwardModel(FeatureSet.of(scene), latent=16, **SMALL)

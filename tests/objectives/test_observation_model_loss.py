@@ -124,3 +124,11 @@ def test_what_is_missing_or_not_finite_is_named_and_changes_nothing(make_loss):
                 call(broken)
             assert str(refused.value).startswith(f"{key!r} has nan at index (4, 0)")
     assert all(torch.equal(value, before[name]) for name, value in loss.state_dict().items())
+
+
+def test_rewards_of_another_shape_are_refused(make_loss):
+    """They would be compared each with every other."""
+    loss, batch = make_loss(rewarded=True), transitions(9)
+    batch["next", "reward"] = batch["next", "reward"].squeeze(-1)
+    with pytest.raises(ValueError, match=r"\('next', 'reward'\) must be \[9, 1\] as the predicted rewards, got \[9\]"):
+        loss(batch)

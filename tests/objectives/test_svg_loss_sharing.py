@@ -54,14 +54,15 @@ def test_statistics_of_a_graph_policy_count_in_the_loss_and_its_targets_at_once(
         torch.testing.assert_close(loss(batch.clone())["target_value"], expected()[1])
 
 
-def test_a_loaded_or_cast_loss_still_shares_statistics():
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16])
+def test_a_loaded_or_cast_loss_still_shares_statistics(dtype):
     torch.manual_seed(0)
     graph = ObservationGraph.swimmer(3)
     agents = [Agent(graph, policy="graph", hidden=(8,), policy_options={"latent": 4, "hidden": [8]}) for _ in range(2)]
     losses = [SVGLoss(agent.policy, agent.value, steps=0, delay_actor=True) for agent in agents]
     agents[0].update_normalizers(torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13))
     losses[1].load_state_dict({name: value.clone() for name, value in losses[0].state_dict().items()})
-    losses[1].double()
+    losses[1].to(dtype)
     agents[1].update_normalizers(1 + torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13))
     policy = agents[1].graph_policy
     assert policy is not None and policy.network.node_normalizer.count[0] == 120
@@ -69,7 +70,12 @@ def test_a_loaded_or_cast_loss_still_shares_statistics():
         flat = parameters.flatten_keys(".")
         for name in ("mean", "std", "inverse_std"):
             key = next(key for key in flat.keys() if str(key).endswith(f"node_normalizer.{name}"))
+            assert flat[key].dtype == torch.float64
             assert torch.equal(flat[key], getattr(policy.network.node_normalizer, name))
+        assert all(weight.dtype == dtype for weight in flat.values() if weight.requires_grad)
+    observation = torch.randn(3, 13, dtype=dtype)
+    acted = agents[1].policy(TensorDict({"observation": observation}, [3]))
+    assert acted["loc"].dtype == dtype and acted["loc"].isfinite().all()
 
 
 def test_targets_share_no_weights():

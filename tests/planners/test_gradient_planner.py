@@ -198,6 +198,29 @@ def test_candidates_find_what_one_sequence_misses():
     assert states[0, -1, 1, 0] > 0.2
 
 
+def test_a_first_plan_is_of_the_best_samples_only(monkeypatch):
+    """None of them starts anew before it was planned; later ones do, close to the best."""
+    env, start = point_env(1.0), at(-0.3, 0.2)
+    planner = GradientPlanner(env, HORIZON, 1, warm_up=0, candidates=4, samples=9, seed=3)
+    drawn, splines = [], planner._splines
+    monkeypatch.setattr(planner, "_splines", lambda *counts: drawn.append(splines(*counts)) or drawn[-1].clone())
+    planner.planning(start)
+    (samples,) = drawn
+    samples[:, 0] = 0
+    returns = planner._imagine(at(-0.3, 0.2).repeat_interleave(9, 0), samples)
+    best = samples.gather(1, returns.argsort(1, descending=True)[:, :4, None, None].expand(-1, -1, HORIZON, 1))
+    torch.testing.assert_close(start["plan", "actions"][:, :, :-1], best[:, :, 1:])
+    planner.planning(start)
+    assert [part.shape[1] for part in drawn] == [9, 2]
+
+
+def test_as_many_samples_as_candidates_are_sorted_too():
+    planner, start = GradientPlanner(point_env(1.0), 4, warm_up=0, candidates=3, samples=3, seed=0), at(1.0)
+    first = planner._first(start)
+    totals = planner._imagine(start.repeat_interleave(3, 0), first)
+    assert (totals.diff(dim=1) <= 0).all() and (first[:, 0] != 0).any()
+
+
 def test_an_episode_that_begins_anew_is_planned_anew(monkeypatch):
     scene = load_scene(POINT.replace("LIMIT", "5"), timestep=STEP)
     planner = GradientPlanner(ModelEnv(Point(scene), quadratic), 4, 1, warm_up=3, samples=3, seed=0)
@@ -315,6 +338,7 @@ def test_bad_input_is_named():
         ({"horizon": 0}, "horizon must be at least 1, got 0"),
         ({"horizon": 3, "iterations": 0}, "iterations must be at least 1"),
         ({"horizon": 3, "candidates": 0}, "candidates must be at least 1"),
+        ({"horizon": 3, "candidates": 3, "samples": 2}, "samples must be at least candidates=3, got 2"),
         ({"horizon": 3, "warm_up": -1}, "warm_up must not be negative"),
         ({"horizon": 3, "noise": 2.0}, "noise must be in"),
     ):

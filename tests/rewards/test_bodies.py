@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.rewards import Bodies, find_body
+from torchrl_gn.rewards import Bodies, find_body, make_reward
 from torchrl_gn.scenes import JointChain, load_scene
 
 # A tip welded askew to the second link of an arm that turns about three axes, on a cart.
@@ -106,3 +106,5 @@ def test_refuses_what_it_cannot_read(arm, steps):
     chain = JointChain("robot", ("a",), 0.1, ((0,),))
     with pytest.raises(TypeError, match="JointChain"):
         Bodies(chain, ["a"])
+    with pytest.raises(TypeError, match="JointChain"):
+        make_reward("reach", chain)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes.contact_points import contact_slots
 
 PLANE = '<geom type="plane" size="9 9 1" pos="0 0 .2" euler="0 20 0"/>'
 
@@ -51,6 +52,14 @@ def test_a_body_touches_where_its_points_do(geom):
             data.qpos[:3] = np.array([0, 0, 2]) - sink * scene.contact_points.normal
             mujoco.mj_forward(model, data)
             assert (data.ncon > 0) == touches
+
+
+def test_a_model_sees_all_sides_of_a_box():
+    box = '<body pos="0 0 2"><freejoint/><geom type="box" size=".1 .2 .3" euler="30 40 50"/></body>'
+    offset, _, there = contact_slots(load_scene(f"<mujoco><worldbody>{PLANE}{box}</worldbody></mujoco>"))
+    assert there[1].all()
+    np.testing.assert_allclose(offset[1].sum(0), 0, atol=1e-9)  # no four corners of a face, nor three of one
+    assert np.linalg.matrix_rank(offset[1]) == 3
 
 
 @pytest.mark.parametrize(

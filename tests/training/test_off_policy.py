@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import gc
 import math
 
 import pytest
@@ -119,6 +120,36 @@ def test_a_stopped_run_goes_on_where_it_was(make_learner, tmp_path, capacity):
     assert again.curve.frames == [0, 100, 200, 300] and rest[-1].updates == again.updates
 
 
+def test_a_run_that_goes_on_begins_other_episodes(make_learner):
+    trainer = make_learner(frames=100)
+    spend(trainer)
+    state = trainer.state_dict()
+    starts = [contents(trainer)[:20:5, 0]]  # four points, five steps of each in a batch
+    for _ in range(2):
+        again = make_learner(frames=200)
+        again.load_state_dict(state)
+        spend(again)
+        starts.append(contents(again)[100:120:5, 0])
+    assert not (starts[0] == starts[1]).any() and torch.equal(starts[1], starts[2])
+
+
+@pytest.mark.parametrize("leave", ["break", "raise"])
+def test_a_run_that_is_left_leaves_the_environment_open(make_learner, monkeypatch, leave):
+    trainer = make_learner(frames=100)
+    trainer.env.is_closed = False  # as those that can be closed say
+    if leave == "break":
+        for _ in trainer.run():
+            break
+    else:
+        with monkeypatch.context() as patch:
+            patch.setattr(trainer, "remember", lambda batch: 1 / 0)
+            with pytest.raises(ZeroDivisionError):
+                spend(trainer)
+    gc.collect()
+    assert not trainer.env.is_closed
+    assert spend(trainer)[-1].frames == 100
+
+
 def test_the_next_update_after_a_stop_is_the_one_that_would_have_been(make_learner):
     trainer = make_learner(frames=200)
     spend(trainer)
@@ -154,6 +185,24 @@ def test_a_finished_run_asked_for_fewer_frames_does_nothing(make_learner):
     again.load_state_dict(trainer.state_dict())
     assert spend(again) == [] and again.frames == 200
     assert torch.equal(contents(again), contents(trainer)[-100:])
+
+
+@pytest.mark.parametrize("key", ["observation", ("next", "observation"), ("next", "reward")])
+def test_experience_that_is_not_finite_is_refused_before_it_is_remembered(make_learner, point_env, key):
+    trainer = make_learner(frames=100)
+    trainer.agent.model = None  # which would look itself
+    batch = point_env().rollout(5)
+    batch[key][1, 3] = math.nan
+    with pytest.raises(ValueError, match="Experience .* has nan at index"):
+        trainer.remember(batch)
+    assert len(trainer.buffer) == trainer.frames == 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_weights_on_a_gpu_learn_from_experience_elsewhere(make_learner, point_env):
+    trainer = make_learner(make_learner().agent.cuda())
+    trainer.remember(point_env().rollout(20))
+    assert all(math.isfinite(value) for value in trainer.update().values())
 
 
 @pytest.mark.parametrize("broken", ["loss", "gradient"])

@@ -170,6 +170,19 @@ def test_resumed_training_is_the_uninterrupted_one(make_trainer, scene, tmp_path
         assert rates[0] == rates[1]
 
 
+def test_a_finished_training_with_a_larger_budget_is_validated_on(make_trainer):
+    first = make_trainer(Budget(steps=8), validate=Errors(5.0, 4.0, 3.0, 2.0), validations=4)
+    for _ in first.run():
+        pass
+    more = make_trainer(Budget(steps=16), first.model, validate=Errors(3.0, 1.0), validations=4)
+    more.load_state_dict(first.state_dict())
+    seen = {p.step: p.validation for p in more.run() if p.validation is not None}
+    assert seen == {12: 3.0, 16: 1.0}
+    trained = weights(more)
+    more.restore_best()
+    assert_same(weights(more), trained)
+
+
 def test_windows_are_unrolled_at_the_end(make_trainer):
     trainer = make_trainer(Budget(steps=10), unroll=0.3)
     shapes, inner = [], trainer.loss.forward

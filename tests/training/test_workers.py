@@ -49,10 +49,19 @@ def test_a_process_alone_needs_no_others():
             workers.wait()
 
 
-def test_a_device_that_is_not_there_is_named():
+def test_a_device_that_is_not_there_is_named(monkeypatch):
     assert Workers().device("cpu") == torch.device("cpu")
     with pytest.raises(ValueError, match="device=gpu is not known; use cpu or cuda"):
         Workers().device("gpu")
+    for name, rank, own in (("cuda:2", "0", 2), ("cuda", "3", 3)):
+        with monkeypatch.context() as patch:
+            patch.setattr(torch.cuda, "is_available", lambda: True)
+            patch.setattr(torch.cuda, "device_count", lambda: 2)
+            patch.setattr(torch.cuda, "set_device", lambda device: None)
+            patch.setenv("LOCAL_RANK", rank)
+            with pytest.raises(ValueError, match=f"device={name} is GPU {own}, but there are 2, counted from 0"):
+                Workers().device(name)
+            assert Workers().device("cuda:1") == torch.device("cuda", 1)
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="device=cuda needs a GPU and a torch built for it; use device=cpu"):
             Workers().device("cuda")

@@ -58,13 +58,15 @@ def collect_trajectories(
         :class:`~torchrl_gn.scenes.SceneValues` that a model bound with ``static_key="static"`` reads.
 
     Raises:
-        ValueError: ``num`` or ``steps`` is below one.
-        UnstableSimulationError: more than a tenth of the simulations become unstable (fewer are
-            drawn again).
+        ValueError: ``num`` or ``steps`` is below one, or ``simulator`` is of another scene.
+        UnstableSimulationError: of up to 250 simulations made together more than a tenth, and more than ten, become
+            unstable (fewer are drawn again).
     """
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
     simulator = simulator or Simulator(scene)
+    if simulator.scenes != ((scene,) if isinstance(scene, Scene) else tuple(scene)):
+        raise ValueError(f"simulator is of another {simulator.scene.name!r} than the scene; give both the same.")
     scenes = len(simulator.scenes)
     chunks = []
     for first in range(0, num, CHUNK):

@@ -84,9 +84,8 @@ class DatasetFiles:
 
     def create(self, manifest: dict) -> None:
         """Make the folder and a manifest without chunks."""
-        for split in SPLITS:
-            for name in manifest["entries"]:
-                self._file(split, name).parent.mkdir(parents=True, exist_ok=True)
+        # Nothing before the manifest, without which the folder would be none of ours.
+        self.root.mkdir(parents=True, exist_ok=True)
         self._write(manifest)
 
     def read(self) -> dict:
@@ -151,7 +150,9 @@ class DatasetFiles:
         done, sums = _rows_done(manifest, split), {}
         for name, array in arrays.items():
             values = np.ascontiguousarray(array, dtype=np.float64)
-            with open(self._file(split, name), "r+b" if done else "wb") as file:
+            path = self._file(split, name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(path, "r+b" if done else "wb") as file:
                 file.seek(done * 8 * math.prod(manifest["entries"][name]))
                 file.truncate()
                 file.write(values.data)

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -82,11 +83,12 @@ def load_robot_log(
 ) -> RobotLog:
     """Read a log of joint angles, velocities and commands.
 
-    ``.npz`` with arrays ``angle`` ``[R, J]``, ``velocity`` ``[R, J]``, ``command`` ``[R, A]``, and possibly ``length``
-    ``[episodes]`` (rows of each; by default all are one episode), ``timestep`` (seconds), and extra channels ``[R, J]``
-    under any other name, or ``[R, k J]``, which become ``name0``, ``name1``, ... with the ``k`` numbers of a joint side
-    by side. ``.csv`` with a header: columns ``angle0``, ``angle1``, ..., ``velocity0``, ..., ``command0``, ..., extra
-    channels likewise, and possibly ``episode`` (a new one where it changes) and ``time`` (seconds).
+    ``.npz`` with arrays ``angle`` ``[R, J]``, ``velocity`` ``[R, J]``, ``command`` ``[R, A]`` (of one joint or command
+    also ``[R]``), and possibly ``length`` ``[episodes]`` (rows of each; by default all are one episode), ``timestep``
+    (seconds), and extra channels ``[R, J]`` under any other name, or ``[R, k J]``, which become ``name0``, ``name1``,
+    ... with the ``k`` numbers of a joint side by side. ``.csv`` with a header: columns ``angle0``, ``angle1``, ...,
+    ``velocity0``, ..., ``command0``, ..., extra channels likewise, and possibly ``episode`` (a new one where it
+    changes) and ``time`` (seconds).
 
     Args:
         path: the file.
@@ -104,7 +106,7 @@ def load_robot_log(
         raise DatasetError(f"{path}: a robot log is a .npz or .csv file.")
     try:
         arrays = _read_npz(path) if path.suffix == ".npz" else _read_csv(path)
-    except (ValueError, OSError, KeyError) as error:
+    except (ValueError, OSError, KeyError, EOFError, BadZipFile) as error:
         raise DatasetError(f"{path} cannot be read as a robot log: {error}") from error
     for here, there in (names or {}).items():
         if there and there not in arrays:
@@ -122,15 +124,19 @@ def load_robot_log(
     timestep = timestep if timestep is not None else None if step is None else float(np.median(step))
     if timestep is None or not 0 < timestep < np.inf:
         raise DatasetError(f"{path} does not say its time step; give timestep=SECONDS.")
-    angle, velocity, command = (np.atleast_2d(arrays.pop(name)).astype(np.float64) for name in _NEEDED)
+    angle, velocity, command = (_columns(arrays.pop(name)).astype(np.float64) for name in _NEEDED)
     length = np.atleast_1d(arrays.pop("length", np.array([len(angle)]))).astype(np.int64)
-    if velocity.shape != angle.shape or len(command) != len(angle):
+    if angle.ndim != 2 or velocity.shape != angle.shape or command.ndim != 2 or len(command) != len(angle):
         raise DatasetError(
             f"{path}: angle {angle.shape}, velocity {velocity.shape} and command {command.shape} do not fit."
         )
     if length.sum() != len(angle) or (length < 1).any():
         raise DatasetError(f"{path}: length adds up to {length.sum()} rows, but there are {len(angle)}.")
     return RobotLog(angle, velocity, command, length, timestep, _extras(arrays, angle, path))
+
+
+def _columns(values: np.ndarray) -> np.ndarray:
+    return values[:, None] if values.ndim == 1 else values
 
 
 def _extras(arrays: dict[str, np.ndarray], angle: np.ndarray, path: Path) -> dict[str, np.ndarray]:
@@ -244,7 +250,7 @@ def log_trajectories(
             states.append(state[window])
             actions.append(command[window[:, :-1]])
             which.append(np.full(len(begin), episode))
-            used += (steps * len(begin) if not overlap else count) * every
+            used += lag + (steps * len(begin) if not overlap else count) * every + 1
     if not states:
         raise ValueError(f"No piece of the log has {steps} transitions of {every} rows; take fewer.")
     data = {"state": np.concatenate(states), "action": np.concatenate(actions), "episode": np.concatenate(which)}
@@ -260,15 +266,17 @@ def log_trajectories(
 
 def _jumps(log: RobotLog, jump: float) -> np.ndarray:
     """``[R - 1]`` bool: whether an angle jumps between two rows of an episode."""
-    change = np.diff(log.angle, axis=0)
+    # Infinities would warn, and explain every jump.
+    angle, velocity = (np.where(np.isfinite(values), values, np.nan) for values in (log.angle, log.velocity))
+    change = np.diff(angle, axis=0)
     turned = (change + np.pi) % (2 * np.pi) - np.pi  # the short way round
-    explained = log.timestep * (log.velocity[:-1] + log.velocity[1:]) / 2
+    explained = log.timestep * (velocity[:-1] + velocity[1:]) / 2
     left = np.abs(turned - explained)
     inside = np.ones(len(left), dtype=bool)
     inside[np.cumsum(log.length)[:-1] - 1] = False
     good = inside & np.isfinite(left).all(1)
     usual = np.quantile(left[good], 0.9, axis=0) if good.any() else np.inf
-    fastest = log.timestep * np.nanmax(np.abs(log.velocity), axis=0)
+    fastest = log.timestep * np.abs(velocity).max(0, where=~np.isnan(velocity), initial=0.0)
     return good & (left > np.maximum(jump * usual, fastest)).any(1)
 
 

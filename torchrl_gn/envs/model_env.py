@@ -95,6 +95,7 @@ class ModelEnv(ModelBasedEnvBase):
         self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
         self.unstable_reward = finite_reward(unstable_reward)
         self.starts = StartSampler(self.scene, start_states, seed)
+        self._simulator: Simulator | None = None
         set_specs(self, self.scene, physics=False)
         if self._static_key is not None:
             self.state_spec[self._static_key] = self._spec_of(cast(Any, model).own_static())
@@ -125,9 +126,11 @@ class ModelEnv(ModelBasedEnvBase):
             state = read(tensordict, "state", self._state_shape, self).to(torch.float64, copy=True)
             require_finite(state, f"{self}: 'state'")
         else:
-            state = self.starts.draw(shape, tensordict.get("_reset", None))
-            if isinstance(self.scene, Scene):
-                state = Simulator(self.scene, num_threads=1).observe(state)
+            if self._simulator is None and isinstance(self.scene, Scene):
+                self._simulator = Simulator(self.scene)
+            state = self.starts.draw(shape, tensordict.get("_reset", None), simulator=self._simulator)
+            if self._simulator is not None:
+                state = self._simulator.observe(state)
         reset = TensorDict({"state": state}, batch_size=shape)
         key = self._static_key
         if key is not None:
@@ -147,6 +150,9 @@ class ModelEnv(ModelBasedEnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
+        model = cast(object, self.world_model)
+        if isinstance(model, BoundForwardModel):
+            model.static_in(tensordict)  # refuses another scene's, which the selection would leave out
         # The model writes into its input: give it a shallow copy.
         predicted = self.world_model(tensordict.select(*self.world_model.in_keys))["next"]
         prediction = predicted["state"]
@@ -219,3 +225,7 @@ class ModelEnv(ModelBasedEnvBase):
 
     def __repr__(self) -> str:
         return f"ModelEnv({self.scene.name!r})"
+
+    def __getstate__(self) -> dict:
+        # Copies and worker processes start threads and MuJoCo data of their own.
+        return {**super().__getstate__(), "_simulator": None}

@@ -100,7 +100,7 @@ class SceneEnv(EnvBase):
         self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
         self.num_threads = num_threads
         self.unstable_reward = finite_reward(unstable_reward)
-        self.starts = StartSampler(self.scenes, start_states, seed)
+        self.starts = StartSampler(self.scene, start_states, seed)
         self._simulator: Simulator | None = None
         set_specs(self, self.scene, physics=True, variants=len(self.scenes))
 
@@ -124,7 +124,7 @@ class SceneEnv(EnvBase):
             require_finite(physics, f"{self}: 'physics'")
             physics = physics.cpu().to(torch.float64, copy=True)
         else:
-            physics = self.starts.draw(shape, tensordict.get("_reset", None), variant)
+            physics = self.starts.draw(shape, tensordict.get("_reset", None), variant, simulator=self.simulator)
         entries = {"state": self.simulator.observe(physics, _each(variant)), "physics": physics}
         if variant is not None:
             entries["variant"] = variant

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import cast
 
 import numpy as np
@@ -22,7 +22,7 @@ class StartSampler:
     """Draw start states of a scene, reproducibly.
 
     Args:
-        scenes: the scene, or variants of it; or a robot that is known by its joints alone.
+        scene: the scene, or the first of its variants; or a robot that is known by its joints alone.
         start_states: ``[M, S]`` full MuJoCo states to choose from, each equally likely,
             or a function ``(n, generator) -> [n, S]``. Default: the system's own
             reset distribution. Of a robot of joints: node states, ``[N, C]`` in place of ``[S]``; it has no default.
@@ -34,13 +34,9 @@ class StartSampler:
     """
 
     def __init__(
-        self,
-        scenes: Scene | JointChain | Sequence[Scene],
-        start_states: StartStates | None = None,
-        seed: int | None = None,
-    ):
-        self.scenes = (scenes,) if isinstance(scenes, (Scene, JointChain)) else tuple(scenes)
-        self.scene = scene = self.scenes[0]
+        self, scene: Scene | JointChain, start_states: StartStates | None = None, seed: int | None = None
+    ) -> None:
+        self.scene = scene
         joints = isinstance(scene, JointChain)
         self.shape = (scene.num_nodes, scene.state_size) if joints else (scene.physics_size,)
         if joints and start_states is None:
@@ -60,7 +56,14 @@ class StartSampler:
         """Start the draws afresh."""
         self._rng = numpy_generator(seed)
 
-    def draw(self, shape: torch.Size, reset: Tensor | None = None, variant: Tensor | None = None) -> Tensor:
+    def draw(
+        self,
+        shape: torch.Size,
+        reset: Tensor | None = None,
+        variant: Tensor | None = None,
+        *,
+        simulator: Simulator | None,
+    ) -> Tensor:
         """Start states for a batch.
 
         Args:
@@ -68,6 +71,7 @@ class StartSampler:
             reset: ``[*B]`` or ``[*B, 1]`` bool, which of them start anew (default all). The
                 others get a copy of one that does, to be overwritten by TorchRL.
             variant: ``[*B, 1]`` which of several variants each of them is of.
+            simulator: of the scene, or its variants; None of a robot of joints.
 
         Returns:
             ``[*B, S]`` float64 full MuJoCo states, or ``[*B, N, C]``, on the CPU.
@@ -77,19 +81,20 @@ class StartSampler:
         states = np.zeros((size, *self.shape))
         count = int(mask.sum())
         if count:
-            drawn = self._sample(count, None if variant is None else variant.reshape(size).cpu().numpy()[mask])
+            which = None if variant is None else variant.reshape(size).cpu().numpy()[mask]
+            drawn = self._sample(count, which, simulator)
             states[:] = drawn[0]
             states[mask] = drawn
         return torch.from_numpy(states).reshape(*shape, *self.shape)
 
-    def _sample(self, count: int, variant: np.ndarray | None) -> np.ndarray:
+    def _sample(self, count: int, variant: np.ndarray | None, simulator: Simulator | None) -> np.ndarray:
         if self._table is not None:
             return self._table[self._rng.integers(len(self._table), size=count)]
         if self._function is not None:
             return self._checked(self._function(count, self._rng), count)
         variant = np.zeros(count, dtype=np.int64) if variant is None else variant
-        scenes = cast("tuple[Scene, ...]", self.scenes)  # a robot of joints has one of the above
-        return draw_start_states(Simulator(scenes), variant, self._rng)[0]
+        # A robot of joints has one of the above.
+        return draw_start_states(cast(Simulator, simulator), variant, self._rng)[0]
 
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:
         if isinstance(states, Tensor):

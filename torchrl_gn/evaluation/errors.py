@@ -9,6 +9,7 @@ of the rotation between prediction and truth.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, cast
@@ -96,7 +97,7 @@ def evaluate_errors(
         batch_size: number of states that the model gets in one call.
         keep: number of predicted rollouts to return in the table.
         scene: which nodes count and which components are live; default ``model.scene``.
-        device: where to run; default where the trajectories are.
+        device: where to run; default where the model is.
 
     Returns:
         Table with ``"one_step_error"``, if asked for, and one ``"rollout_error_<H>"`` for each horizon.
@@ -117,7 +118,9 @@ def evaluate_errors(
         raise ValueError(f"warm_up={warm_up} must not be negative.")
     _check(states, actions, [warm_up + horizon for horizon in horizons], batch_size, scene, layout)
     steps, horizon = actions.shape[1] - warm_up, max(horizons, default=0)
-    predicted = torch.as_tensor(scene.predicted, device=device or states.device)
+    if device is None:
+        device = next(itertools.chain(model.parameters(), model.buffers()), states).device
+    predicted = torch.as_tensor(scene.predicted, device=device)
     single = _Sums(1, layout, predicted)
     rollouts = _Sums(horizon, layout, predicted)
     static = model.static_in(trajectories) if isinstance(model, BoundForwardModel) else None
@@ -220,12 +223,12 @@ def _batches(
     actions: Tensor,
     static: TensorDictBase | None,
     size: int,
-    device: torch.device | str | None,
+    device: torch.device | str,
     layout: StateLayout,
 ) -> Iterator[tuple[Tensor, Tensor, TensorDictBase | None]]:
     for start in range(0, len(states), size):
         rows = slice(start, start + size)
-        state = torch.as_tensor(states[rows]).to(device or states.device)
+        state = torch.as_tensor(states[rows]).to(device)
         action = torch.as_tensor(actions[rows]).to(state.device)
         own = None if static is None else static[rows].to(state.device)
         checks = {

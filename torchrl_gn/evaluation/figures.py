@@ -64,7 +64,7 @@ def plot_rewards(
     axes = figure.subplots()
     colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
     for number, (label, values) in enumerate(rewards.items()):
-        values = values.detach().double().numpy()
+        values = values.detach().double().cpu().numpy()
         time, color = timestep * np.arange(1, values.shape[1] + 1), colors[number % len(colors)]
         axes.fill_between(time, values.min(0), values.max(0), color=color, alpha=0.15, linewidth=0)
         axes.plot(time, values.mean(0), color=color, label=label, linewidth=1.6)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
 
 _BACKENDS = ("egl", "osmesa", "glfw")
+_PATIENCE = 600  # seconds
 _FIELD_OF_VIEW = 45.0  # degrees, MuJoCo's default
 
 
@@ -66,13 +67,17 @@ def _run_worker(folder: str) -> None:
     failures = []
     for backend in (chosen,) if chosen else _BACKENDS:
         environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
-        done = subprocess.run(
-            [sys.executable, str(worker), folder],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=600,
-        )
+        try:
+            done = subprocess.run(
+                [sys.executable, str(worker), folder],
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=_PATIENCE,
+            )
+        except subprocess.TimeoutExpired:
+            failures.append(f"{backend}: nothing within {_PATIENCE} s")
+            continue
         if done.returncode == 0 and Path(folder, "frames.npy").exists():
             return
         failures.append(f"{backend}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")

@@ -50,7 +50,8 @@ def identification_errors(
         raise ValueError("Another system takes at least two trajectories.")
     action = cast(Tensor, observed.get("action"))[:, :steps]
     state = cast(Tensor, observed.get("state"))[:, : action.shape[1] + 1]
-    static = inference.identify(state, action)
+    device = next(inference.parameters()).device
+    static = inference.identify(state.to(device), action.to(device))
     if wrong:
         static = static.apply(lambda value: value.roll(1, 0))
     entries = {key: trajectories.get(key) for key in ("state", "action")}

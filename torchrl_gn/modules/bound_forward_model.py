@@ -99,7 +99,7 @@ class BoundForwardModel(TensorDictModuleBase):
                 f" {scene.num_nodes} and {scene.num_edges}. Train another, or a graph network."
             )
         self.model, self.scene, self.layout = model, scene, model.layout
-        self.timestep, self.plain = float(scene.timestep), plain
+        self.timestep, self.plain, self.strict = float(scene.timestep), plain, strict
 
         ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
         self.register_buffer("live", torch.as_tensor(scene.live, dtype=torch.bool), persistent=False)
@@ -113,9 +113,10 @@ class BoundForwardModel(TensorDictModuleBase):
         self.linking = make_linking(scene) if model.link and pinned and not hidden else None
         self.arm_length = scene.linkage.arm_length
         self.statics = StaticValues(
-            model.values_of(scene), model.static, static_key, linked=self.linking is not None, scene=scene.name
+            model.values_of(scene), model.static, static_key, linked=self.linking is not None, scene=scene
         )
-        check_seen(self, strict)
+        self.to(model.residual_normalizer.mean.device)
+        check_seen(self, self.values, scene.name, stacklevel=4)
 
     @property
     def values(self) -> SceneValues:
@@ -132,7 +133,8 @@ class BoundForwardModel(TensorDictModuleBase):
         Stack those of several variants for a batch.
 
         Raises:
-            ValueError: if it is another scene: other bodies, joints, motors or control step.
+            ValueError: if it is another scene (other bodies, joints, motors or control step), or as :meth:`bind
+                <ForwardModel.bind>` with ``strict``; without, that warns.
         """
         here, there = topology(self.scene), topology(scene)
         differs = [what for what in here if here[what] != there[what]]
@@ -141,7 +143,9 @@ class BoundForwardModel(TensorDictModuleBase):
                 f"Scene {scene.name!r} is no variant of {self.scene.name!r}: {', '.join(differs)} differ."
                 " Bind the model to it instead."
             )
-        return self.model.values_of(scene).tensordict().to(self.live.device)
+        values = self.model.values_of(scene)
+        check_seen(self, values, scene.name, stacklevel=3)
+        return values.tensordict().to(self.live.device)
 
     @property
     def network_dtype(self) -> torch.dtype:

@@ -45,9 +45,9 @@ class BoundRecurrentModel(BoundForwardModel):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the predicted next state and the memory into ``tensordict`` and return it."""
         state, action = (tensordict[key] for key in self.in_keys[:2])
-        folded = self.fold(self.static_in(tensordict))
-        check_shapes(self.scene, state, action)
-        next_state, memory = self._advance(state, action, folded, tensordict.get("memory", None))
+        static = self.static_in(tensordict)
+        check_shapes(self.scene, state, action, static)
+        next_state, memory = self._advance(state, action, self.fold(static), tensordict.get("memory", None))
         tensordict.set(self.out_keys[0], next_state)
         return tensordict.set(self.out_keys[1], memory)
 
@@ -65,7 +65,11 @@ class BoundRecurrentModel(BoundForwardModel):
             action: ``[*B, A]``.
             folded: what :meth:`fold` gave.
             memory: of the states before; by default there were none.
+
+        Raises:
+            ValueError: if a shape does not fit the scene.
         """
+        check_shapes(self.scene, state, action)
         folded = folded or self.fold()
         seen = self.frame.see(state, folded.values)
         dynamic, static = self._dynamic_graph(seen, action, folded.values), self.static_graph(folded.values)
@@ -102,10 +106,11 @@ class BoundRecurrentModel(BoundForwardModel):
             Predictions ``[*B, T, N, 13]`` of the state after each of them, and the memory after the last.
 
         Raises:
-            ValueError: if there is no state.
+            ValueError: if there is no state, or a shape does not fit the scene.
         """
         if states.shape[-3] == 0:
             raise ValueError("There is no state to remember.")
+        check_shapes(self.scene, states[..., 0, :, :], actions[..., 0, :], static)
         folded, memory, predictions = self.fold(static), None, []
         for state, action in zip(states.unbind(-3), actions.unbind(-2), strict=True):
             predicted, memory = self._advance(state, action, folded, memory)

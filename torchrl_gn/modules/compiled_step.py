@@ -27,7 +27,7 @@ class CompiledStep:
             has changed since is refused.
 
     Raises:
-        RuntimeError: without a C++ compiler on a CPU.
+        FileNotFoundError: without a C++ compiler on a CPU.
     """
 
     def __init__(self, step: Step, stamp: Callable[[], int]) -> None:
@@ -94,7 +94,7 @@ def check_compiler() -> None:
     """Refuse to compile for a CPU without a C++ compiler, before anything is waited for.
 
     Raises:
-        RuntimeError: if there is none.
+        FileNotFoundError: if there is none.
     """
     from torch._inductor.cpp_builder import get_cpp_compiler
     from torch._inductor.exc import InvalidCxxCompiler
@@ -102,4 +102,4 @@ def check_compiler() -> None:
     try:
         get_cpp_compiler()
     except InvalidCxxCompiler as error:
-        raise RuntimeError("compile=True needs a C++ compiler: install g++, or leave compile out.") from error
+        raise FileNotFoundError("compile=True needs a C++ compiler: install g++, or leave compile out.") from error

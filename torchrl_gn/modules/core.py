@@ -10,7 +10,6 @@ from torchrl_gn.modules.folded_core import FoldedCore, fold_core
 from torchrl_gn.modules.gn_block import GNBlock, Pool
 from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat
 from torchrl_gn.modules.incidence import Incidence
-from torchrl_gn.modules.linear import ACTIVATIONS
 
 
 class GNCore(nn.Module):
@@ -47,8 +46,6 @@ class GNCore(nn.Module):
         pool: Pool = "sum",
     ) -> None:
         super().__init__()
-        if activation not in ACTIVATIONS:
-            raise ValueError(f"activation={activation!r} is not known; use one of {list(ACTIVATIONS)}.")
         self.activation = activation
         if not (edge_hidden and node_hidden and global_hidden):
             raise ValueError(

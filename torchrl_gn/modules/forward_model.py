@@ -123,7 +123,7 @@ class ForwardModel(nn.Module):
         activation: between the layers: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
 
     Raises:
-        ValueError: if an option is none of its choices, or the rival lacks ``items``.
+        ValueError: if an option is none of its choices, the rival lacks ``items``, or ``skip=False`` means nothing.
     """
 
     def __init__(
@@ -162,6 +162,8 @@ class ForwardModel(nn.Module):
         ):
             if value not in get_args(choices):
                 raise ValueError(f"{name}={value!r} is not known; use one of {list(get_args(choices))}.")
+        if not skip and core in ("recurrent", "mlp"):
+            raise ValueError(f"skip=False is for two graph networks; core={core!r} cannot do without. Leave skip out.")
         self.features = features if static == "scene" else FeatureSet()
         self.static, self.layout = static, layout
         self.encoding: Encoding = encoding

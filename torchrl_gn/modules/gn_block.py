@@ -11,7 +11,7 @@ from torch_geometric.nn import MessagePassing
 from torchrl.modules import MLP
 
 from torchrl_gn.modules.graph import Graph, GraphSize
-from torchrl_gn.modules.linear import ACTIVATIONS
+from torchrl_gn.modules.linear import activation_class
 
 Pool = Literal["sum", "mean"]
 
@@ -38,7 +38,7 @@ class GNBlock(MessagePassing):
             grow with the graph.
 
     Raises:
-        ValueError: if ``pool`` is neither.
+        ValueError: if ``pool`` or the activation is none of these.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class GNBlock(MessagePassing):
 def _mlp(in_features: int, hidden: Sequence[int], out_features: int, activation: str) -> MLP | None:
     if not out_features:
         return None
-    return MLP(in_features, out_features, num_cells=list(hidden), activation_class=ACTIVATIONS[activation])
+    return MLP(in_features, out_features, num_cells=list(hidden), activation_class=activation_class(activation))
 
 
 def _per_item(globals_: Tensor, count: int) -> Tensor:

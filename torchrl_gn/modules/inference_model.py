@@ -69,7 +69,7 @@ class InferenceModel(nn.Module):
             it says after the ``"last"`` (paper).
 
     Raises:
-        ValueError: if ``readout`` is neither.
+        ValueError: if ``readout`` or the activation is not known.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         super().__init__()
         key = (observed_key,) if isinstance(observed_key, str) else tuple(observed_key)
         self.model, self.bound = model, bound
-        self.pins = PinFinder(bound.scene) if bound.linking is not None else None
+        self.pins = PinFinder(bound.scene).to(bound.live.device) if bound.linking is not None else None
         self.in_keys: list[NestedKey] = [(*key, "state"), (*key, "action"), (*key, "next", "state")]
         self.out_keys: list[NestedKey] = [static_key]
 

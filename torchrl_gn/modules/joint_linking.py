@@ -141,8 +141,11 @@ class JointLinking(Linking):
         moving = self.moves(arms) @ turning[..., self.turning, :]
         pull = torch.cat((turning.mT, weight * moving.mT), dim=-1)
         normal = turning.mT @ turning + weight * (moving.mT @ moving)
-        # Two parallel hinges at one place would share their turn: a little of nothing settles it.
-        normal = normal + 1e-12 * torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
+        # Two parallel hinges at one place would share their turn: a little of nothing, but more than is rounded away,
+        # settles it.
+        diagonal = normal.diagonal(dim1=-2, dim2=-1)
+        little = (16 * torch.finfo(normal.dtype).eps * diagonal.amax(-1, keepdim=True)).clamp(min=1e-12)
+        normal = normal + torch.diag_embed(little.expand_as(diagonal))
         wanted = torch.cat((turns.flatten(-2), gaps[..., self.placed]), dim=-1).unsqueeze(-1)
         return torch.linalg.solve_ex(normal, pull @ wanted)[0].squeeze(-1)
 

@@ -16,6 +16,17 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "ge
 _FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {"silu": F.silu, "gelu": F.gelu, "tanh": torch.tanh}
 
 
+def activation_class(name: str) -> type[nn.Module]:
+    """The activation of a name.
+
+    Raises:
+        ValueError: if it is none of :data:`ACTIVATIONS`.
+    """
+    if name not in ACTIVATIONS:
+        raise ValueError(f"activation={name!r} is not known; use one of {list(ACTIVATIONS)}.")
+    return ACTIVATIONS[name]
+
+
 def linear(pairs, table=None, matrix=None, items=None, activation: str | None = None) -> Tensor:
     """``activation(table + matrix @ items + sum_k x_k @ W_k.T)``; any part may be missing.
 

@@ -13,7 +13,7 @@ from torchrl.modules import MLP
 from torchrl_gn.modules.folded_core import Columns
 from torchrl_gn.modules.graph import Graph, GraphSize
 from torchrl_gn.modules.incidence import Incidence
-from torchrl_gn.modules.linear import ACTIVATIONS
+from torchrl_gn.modules.linear import ACTIVATIONS, activation_class
 
 
 class MLPCore(nn.Module):
@@ -43,13 +43,13 @@ class MLPCore(nn.Module):
         activation: str = "relu",
     ) -> None:
         super().__init__()
-        if activation not in ACTIVATIONS:
-            raise ValueError(f"activation={activation!r} is not known; use one of {list(ACTIVATIONS)}.")
         if not hidden:
             raise ValueError("The MLP needs a hidden layer.")
         self.in_size, self.out_nodes, self.items, self.activation = in_size, out_nodes, items, activation
         inputs = items[0] * in_size.nodes + items[1] * in_size.edges + in_size.globals_
-        self.mlp = MLP(inputs, items[0] * out_nodes, num_cells=list(hidden), activation_class=ACTIVATIONS[activation])
+        self.mlp = MLP(
+            inputs, items[0] * out_nodes, num_cells=list(hidden), activation_class=activation_class(activation)
+        )
 
     def forward(self, graph: Graph) -> Graph:
         """Graph with ``in_size`` features in, graph with ``out_nodes`` node features out."""

@@ -78,9 +78,14 @@ class ObservationModel(TensorDictModuleBase):
         """Take transitions, ``[*B, O]``, ``[*B, A]`` and ``[*B, O]``, into the statistics.
 
         Raises:
-            ValueError: if a number is not finite.
+            ValueError: if a shape does not fit the graph or a number is not finite.
         """
         places = self.network.places
+        if next_observation.shape != observation.shape:
+            raise ValueError(
+                f"Next observations must be {list(observation.shape)} as observations, got"
+                f" {list(next_observation.shape)}."
+            )
         self.network.update_normalizers(observation, action)
         change = next_observation - observation
         slots = torch.nn.functional.pad(change, (0, 1))[..., places.slots]
@@ -90,7 +95,7 @@ class ObservationModel(TensorDictModuleBase):
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the predicted next observation into ``tensordict`` and return it."""
-        observation, action = (tensordict.get(key) for key in self.in_keys)
+        observation, action = (tensordict[key] for key in self.in_keys)
         return tensordict.set(self.out_keys[0], self.step(observation, action))
 
     def step(self, observation: Tensor, action: Tensor) -> Tensor:

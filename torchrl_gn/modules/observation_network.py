@@ -106,13 +106,27 @@ class ObservationNetwork(nn.Module):
         """Take observations ``[*B, O]`` and actions ``[*B, A]`` into the statistics.
 
         Raises:
-            ValueError: if a number is not finite.
+            ValueError: if a shape does not fit the graph or a number is not finite.
         """
-        nodes, edges, globals_ = self.places.arrange(observation, action if self.actions else None)
+        nodes, edges, globals_ = self._arrange(observation, action)
         mask_nodes, mask_edges = self._masks()
         self.node_normalizer.update(nodes, mask_nodes)
         self.edge_normalizer.update(edges, mask_edges)
         self.global_normalizer.update(globals_)
+
+    def _arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Features of nodes, edges and globals, of inputs that fit the graph."""
+        graph = self.graph
+        if observation.shape[-1] != graph.num_observations:
+            raise ValueError(
+                f"Observations of {graph.name!r} must be [*B, {graph.num_observations}], got {list(observation.shape)}."
+            )
+        if self.actions and (action is None or action.shape != (*observation.shape[:-1], graph.num_actions)):
+            raise ValueError(
+                f"Actions of {graph.name!r} must be {[*observation.shape[:-1], graph.num_actions]} to go with"
+                f" observations {list(observation.shape)}, got {None if action is None else list(action.shape)}."
+            )
+        return self.places.arrange(observation, action if self.actions else None)
 
     def _masks(self) -> tuple[Tensor, Tensor]:
         places = self.places
@@ -132,18 +146,8 @@ class ObservationNetwork(nn.Module):
         Raises:
             ValueError: if a shape does not fit the graph.
         """
-        graph = self.graph
-        if observation.shape[-1] != graph.num_observations:
-            raise ValueError(
-                f"Observations of {graph.name!r} must be [*B, {graph.num_observations}], got {list(observation.shape)}."
-            )
-        if self.actions and (action is None or action.shape != (*observation.shape[:-1], graph.num_actions)):
-            raise ValueError(
-                f"Actions of {graph.name!r} must be {[*observation.shape[:-1], graph.num_actions]} to go with"
-                f" observations {list(observation.shape)}, got {None if action is None else list(action.shape)}."
-            )
         dtype = self._weight.dtype
-        nodes, edges, globals_ = self.places.arrange(observation, action if self.actions else None)
+        nodes, edges, globals_ = self._arrange(observation, action)
         mask_nodes, mask_edges = self._masks()
         return Graph(
             self.node_normalizer(nodes, dtype) * mask_nodes,

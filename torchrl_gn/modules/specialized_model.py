@@ -30,7 +30,9 @@ class _Source:
         self.owner, self.name, self.tensor = owner, name, owner[name]
         # Sharing the storage keeps it alive: nothing new can come to lie at its address.
         self.kept = None if self.tensor is None else self.tensor.detach()
-        self.address, self.version = (0, 0) if self.kept is None else (self.kept.data_ptr(), self.kept._version)
+        self.address = 0 if self.kept is None else self.kept.data_ptr()
+        # PyTorch counts no changes of what was made in inference mode: it is never the same.
+        self.version = None if self.kept is None or self.kept.is_inference() else self.kept._version
 
     def unchanged(self) -> bool:
         now = self.owner.get(self.name)
@@ -43,6 +45,7 @@ class _Source:
         kept = self.kept
         return (
             kept is not None
+            and not now.is_inference()
             and now.data_ptr() == self.address
             and now._version == self.version
             and (now.shape, now.stride(), now.dtype) == (kept.shape, kept.stride(), kept.dtype)
@@ -72,11 +75,12 @@ class SpecializedForwardModel(BoundForwardModel):
             super().__init__(
                 bound.model, bound.scene, state_key=state_key, action_key=action_key, static_key=bound.static_key
             )
-        self.to(bound.live.device)
+        self.strict = bound.strict
         if compile and bound.live.device.type == "cpu":
             check_compiler()
         self._dtype, self.compile_steps = dtype, compile
         self._folded: Folded | None = None
+        self._runs: list[tuple[bool, slice]] = []
         self._folds = 0
         self._sources: list[_Source] = []
         self._given: dict[str, _Source] = {}
@@ -94,9 +98,13 @@ class SpecializedForwardModel(BoundForwardModel):
     def fold(self, static: TensorDictBase | None = None) -> Folded:
         """The snapshot, made again if anything it came from has changed."""
         if self._folded is None or not self._same(static) or not all(s.unchanged() for s in self._sources):
-            folded = self._fold(self.statics.read(static))
-            if self._folded is None or not copy_into(self._folded, folded):
-                self._folded, self._compiled = folded, None
+            runs = self._runs
+            # What is made in inference mode could be neither overwritten nor differentiated outside.
+            with torch.inference_mode(False), torch.no_grad():
+                folded = self._fold(SceneValues(*(value.detach().clone() for value in self.statics.read(static))))
+                # A compiled step keeps the tensors, but has the runs in its code.
+                if self._folded is None or self._runs != runs or not copy_into(self._folded, folded):
+                    self._folded, self._compiled = folded, None
             self._folds += 1
             owners = [module._parameters for module in self.model.modules()]
             owners += [module._buffers for module in (*self.model.modules(), self, self.statics)]
@@ -120,7 +128,6 @@ class SpecializedForwardModel(BoundForwardModel):
             self._compiled = CompiledStep(lambda state, action: plain(state, action, folded)[0], lambda: self._folds)
         return self._compiled(state, action), None
 
-    @torch.no_grad()
     def _fold(self, values: SceneValues) -> Folded:
         model = self.model
         nodes, edges, residual = model.node_normalizer, model.edge_normalizer, model.residual_normalizer
@@ -139,7 +146,7 @@ class SpecializedForwardModel(BoundForwardModel):
             (self.rows, residual.std[self.rows]),
             residual.mean[self.rows],
         )
-        return Folded(snapshot(small, self.dtype), SceneValues(*(value.detach().clone() for value in values)))
+        return Folded(snapshot(small, self.dtype), values)
 
     def _residual(self, seen: Seen, action: Tensor, folded: Folded) -> Tensor:
         core = folded.core
@@ -216,7 +223,7 @@ def specialize(
         A module with the same keys that shares the weights and folds them again when they change.
 
     Raises:
-        RuntimeError: to compile for a CPU without a C++ compiler.
+        FileNotFoundError: to compile for a CPU without a C++ compiler.
         TypeError: for a recurrent core, or one of the ablation study.
     """
     if isinstance(bound.model.core, (AblatedCore, RecurrentCore)):

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_gn.modules.float64_buffers import Float64Buffers
 from torchrl_gn.scenes.scene_values import SceneValues
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes import Scene
 
 _INFERRED = ("nodes", "edges", "globals_")
 _PINS = ("parent_arm", "arm")
@@ -20,10 +25,10 @@ class StaticValues(Float64Buffers):
         kind: the model's option ``static``: ``"scene"``, ``"none"`` or ``"inferred"``.
         key: where samples bring their own; None: they are the scene's.
         linked: whether the model links bodies, for which it needs their pins.
-        scene: name of the scene, for messages.
+        scene: the scene.
     """
 
-    def __init__(self, own: SceneValues, kind: str, key: NestedKey | None, *, linked: bool, scene: str) -> None:
+    def __init__(self, own: SceneValues, kind: str, key: NestedKey | None, *, linked: bool, scene: Scene) -> None:
         super().__init__()
         self.kind, self.key, self.scene = kind, key, scene
         self.inferred = (*_INFERRED, *_PINS) if linked else _INFERRED
@@ -87,9 +92,14 @@ class StaticValues(Float64Buffers):
     def _refuse_others(self, static: TensorDictBase) -> None:
         for name, own in self.own._asdict().items():
             given = static.get(name, None)
-            if given is None or bool((given.to(own.device) - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
+            if given is None:
+                continue
+            if given.shape[-1] != own.shape[-1]:  # all features of a scene, not only those that the model reads
+                own = getattr(SceneValues.of(self.scene), name).to(own.device)
+            alike = given.shape[-1] == own.shape[-1]
+            if alike and bool((given.to(own.device) - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
                 continue
             raise ValueError(
-                f"Samples have other static {name!r} than scene {self.scene!r}, which the model is bound to."
+                f"Samples have other static {name!r} than scene {self.scene.name!r}, which the model is bound to."
                 " Bind it with static_key='static' to predict variants of the scene."
             )

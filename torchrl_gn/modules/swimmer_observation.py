@@ -42,7 +42,7 @@ class SwimmerObservation(TensorDictModuleBase):
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the observation into ``tensordict`` and return it."""
-        state, target = (tensordict.get(key) for key in self.in_keys)
+        state, target = (tensordict[key] for key in self.in_keys)
         return tensordict.set("observation", self.observe(state, target))
 
     def observe(self, state: Tensor, target: Tensor) -> Tensor:

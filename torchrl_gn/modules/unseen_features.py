@@ -7,25 +7,33 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torchrl_gn.modules.bound_forward_model import BoundForwardModel
+    from torchrl_gn.scenes.scene_values import SceneValues
 
 
 class UnseenFeatureWarning(UserWarning):
     """A scene has a static value that the model never saw vary in training."""
 
 
-def check_seen(bound: BoundForwardModel, strict: bool) -> None:
-    """Warn, or raise if ``strict``, where a scene differs in what was the same in all of a model's training.
+def check_seen(bound: BoundForwardModel, values: SceneValues, name: str, *, stacklevel: int) -> None:
+    """Warn, or raise if bound ``strict``, where a scene differs in what was the same in all of a model's training.
+
+    Args:
+        bound: the model.
+        values: numbers of the scene that it is bound to, or of a variant.
+        name: that scene's.
+        stacklevel: of the warning.
 
     Raises:
         ValueError: if it does and ``strict``; the message names the features.
     """
     model, unseen = bound.model, []
     for part, normalizer in model.static_normalizers.items() if model.static == "scene" else ():
-        values, seen = getattr(bound.values, part), normalizer.mean
-        if values.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
+        seen = normalizer.mean
+        given = getattr(values, part).to(seen.device)
+        if given.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
             continue
         # 1e-6: the same model compiled on another machine may differ in the last digits.
-        differs = ((values - seen).abs() > 1e-6 * seen.abs().clamp(min=1e-12)).reshape(-1, values.shape[-1]).any(0)
+        differs = ((given - seen).abs() > 1e-6 * seen.abs().clamp(min=1e-12)).reshape(-1, given.shape[-1]).any(0)
         for index in (normalizer.constant & differs).nonzero().flatten().tolist():
             unseen.append(getattr(model.features, part)[index])
     residual = model.residual_normalizer
@@ -35,9 +43,9 @@ def check_seen(bound: BoundForwardModel, strict: bool) -> None:
     if not unseen:
         return
     message = (
-        f"Scene {bound.scene.name!r} has values that the model never saw, in features that never varied in its"
+        f"Scene {name!r} has values that the model never saw, in features that never varied in its"
         f" training: {', '.join(unseen)}. They are ignored and predictions may be wrong."
     )
-    if strict:
+    if bound.strict:
         raise ValueError(message)
-    warnings.warn(message, UnseenFeatureWarning, stacklevel=4)
+    warnings.warn(message, UnseenFeatureWarning, stacklevel=stacklevel)

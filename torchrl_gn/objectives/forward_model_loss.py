@@ -75,7 +75,7 @@ class ForwardModelLoss(LossModule):
 
     model: BoundForwardModel
     noise_scale: Tensor
-    error_weight: Tensor | None
+    error_weight: Tensor
 
     def __init__(
         self,
@@ -96,8 +96,9 @@ class ForwardModelLoss(LossModule):
         if forced < 1:
             raise ValueError(f"forced={forced} must be at least 1: the first state is always a true one.")
         self.forced = forced
-        self.register_buffer("noise_scale", torch.zeros(model.layout.delta_size, dtype=torch.float64))
-        self.register_buffer("error_weight", None)
+        scale = torch.zeros(model.layout.delta_size, dtype=torch.float64, device=model.live.device)
+        self.register_buffer("noise_scale", scale)
+        self.register_buffer("error_weight", scale - 1)  # negative: not fitted (of None load_state_dict knows nothing)
 
     @property
     def trained(self) -> ForwardModel:
@@ -129,11 +130,11 @@ class ForwardModelLoss(LossModule):
         state, action, next_state = self._read(tensordict)
         static = self._read_static(tensordict) if model.model.static == "scene" else None
         clean = Normalizer(layout.size, floor=1e-9)
-        clean.update(self.model.frame.recentered(state)[..., model.incidence.predicted, :])
+        clean.update(self.model.frame.recentered(state)[..., model.incidence.predicted, :].cpu())
         scale = torch.ones(layout.delta_size, dtype=torch.float64)
         for component in layout.components:
             if component.kind == "add":
-                scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]].cpu()
+                scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]]
         self.noise_scale.copy_(scale)
         noisy = self._perturb(state)
         model.update_static_normalizers(static)
@@ -141,7 +142,7 @@ class ForwardModelLoss(LossModule):
         # The model's statistics are of all scenes that share it, and would make light of errors in slow ones.
         change = Normalizer(layout.delta_size, floor=1e-9)
         change.update(layout.delta(noisy, next_state).cpu(), model.live.cpu())
-        self.error_weight = change.inverse_std.to(self.noise_scale.device)
+        self.error_weight.copy_(change.inverse_std)
 
     def training_state(self) -> dict:
         """What a training that goes on later needs of this loss."""
@@ -151,8 +152,8 @@ class ForwardModelLoss(LossModule):
     def load_training_state(self, state: dict) -> None:
         """Go on from what :meth:`training_state` gave."""
         self.noise_scale.copy_(state["noise_scale"])
-        weight = state["error_weight"]
-        self.error_weight = None if weight is None else weight.to(self.noise_scale.device)
+        weight = state["error_weight"]  # of older files None, if it was not fitted
+        self.error_weight.copy_(torch.tensor(-1.0) if weight is None else weight)
         if self.generator is not None and state["generator"] is not None:
             self.generator.set_state(state["generator"])
 
@@ -206,6 +207,8 @@ class ForwardModelLoss(LossModule):
         static = self.model.static_in(tensordict)
         if static is not None:
             static = static[:, 0] if windows else static
+        # Inferred ones come from a network that is trained too: if it diverges, the loss says so.
+        if static is not None and self.trained.static != "inferred":
             require_finite(static, f"{self.model.static_key!r} of the batch")
         return static
 
@@ -221,7 +224,7 @@ class ForwardModelLoss(LossModule):
 
     def _scale(self, like: Tensor) -> Tensor:
         """``[N, 12]`` weights: one over the spread of each live channel, 0 for dead ones."""
-        weight = self.trained.delta_normalizer.inverse_std if self.error_weight is None else self.error_weight
+        weight = torch.where(self.error_weight < 0, self.trained.delta_normalizer.inverse_std, self.error_weight)
         return (weight * self.model.live).to(like.dtype)
 
     def _live_components(self) -> Tensor:

@@ -92,7 +92,7 @@ class ObservationModelLoss(LossModule):
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if a number is not finite.
+            ValueError: if a number is not finite, or rewards have another shape than those predicted.
         """
         observation, action, next_observation, *rewards = self._read(tensordict)
         inverse = torch.where(self.model.change_std > 0, 1 / self.model.change_std, 0).to(observation.dtype)
@@ -102,5 +102,10 @@ class ObservationModelLoss(LossModule):
         losses = {"loss_model": error.square().sum(-1).mean() / count}
         if self.reward is not None:
             predicted = self.reward(observation, action, next_observation)
+            if rewards[0].shape != predicted.shape:
+                raise ValueError(
+                    f"{self.in_keys[-1]!r} must be {list(predicted.shape)} as the predicted rewards, got"
+                    f" {list(rewards[0].shape)}."
+                )
             losses["loss_reward"] = (predicted - rewards[0]).square().mean()
         return TensorDict(losses, [])

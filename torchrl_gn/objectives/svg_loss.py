@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any, cast
 
-import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import DDPGLoss
+
+from torchrl_gn.modules.weights import frozen, with_weights
 
 ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Reward ``[*B, 1]`` of observations, actions and next observations."""
@@ -93,6 +94,16 @@ class SVGLoss(DDPGLoss):
                     key = tuple(buffer.split("."))
                     target.set(key, own.get(key))
 
+    def _apply(self, fn, recurse: bool = True):
+        # TorchRL casts and moves copies of the networks' buffers: let them have the networks' own again.
+        super()._apply(fn)
+        for name in ("actor_network", "value_network"):
+            own = cast(TensorDictBase, self._modules[f"{name}_params"])
+            for buffer, tensor in getattr(self, name)._apply(fn).named_buffers(remove_duplicate=False):
+                own.set(tuple(buffer.split(".")), tensor)
+        self._share_statistics()
+        return self
+
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
         """Loss of the policy, and nothing more to read along."""
         weights = self._maybe_get_priority_weight(tensordict)
@@ -105,10 +116,10 @@ class SVGLoss(DDPGLoss):
                 (self.actor_network, self.actor_network_params),
                 (self.value_network, self._cached_detached_value_params),
             ):
-                stack.enter_context(_with_weights(module, parameters))
+                stack.enter_context(with_weights(module, parameters))
             for module in (self.model, self.reward):
                 if isinstance(module, nn.Module):
-                    stack.enter_context(_frozen(module))
+                    stack.enter_context(frozen(module))
             for _ in range(self.steps):
                 now = self.actor_network(now)
                 now, reward = self._imagine(now)
@@ -141,31 +152,3 @@ class SVGLoss(DDPGLoss):
         next_observation = cast(Tensor, predicted.get(self.model.in_keys[0]))
         reward = self.reward(observation, action, next_observation)
         return now.select(*self.value_exclusive_keys, *self._carried, strict=False).update(predicted), reward
-
-
-@contextmanager
-def _with_weights(module: nn.Module, weights: TensorDictBase) -> Iterator[None]:
-    # A TensorDict's own exit leaves the weights in the module if there was an error.
-    swapped = weights.to_module(module, preserve_module_state=False)
-    swapped.__enter__()
-    try:
-        yield
-    finally:
-        swapped.__exit__(None, None, None)
-
-
-@contextmanager
-def _frozen(module: nn.Module) -> Iterator[None]:
-    """Cut a network's weights from gradients."""
-    if torch.compiler.is_compiling():  # where what requires gradients cannot be changed
-        with _with_weights(module, cast(TensorDictBase, TensorDict.from_module(module)).detach()):
-            yield
-        return
-    trained = [weight for weight in module.parameters() if weight.requires_grad]
-    try:
-        for weight in trained:
-            weight.requires_grad_(False)
-        yield
-    finally:
-        for weight in trained:
-            weight.requires_grad_(True)

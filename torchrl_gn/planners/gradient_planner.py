@@ -16,6 +16,8 @@ from torchrl.modules.planners.common import MPCPlannerBase
 from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.envs.model_env import ModelEnv
+from torchrl_gn.modules import BoundForwardModel
+from torchrl_gn.modules.weights import frozen
 from torchrl_gn.planners.plan import check_plannable, plan_primer, read_plan, write_plan
 
 OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
@@ -44,8 +46,8 @@ class GradientPlanner(MPCPlannerBase):
         iterations: changes of the plan at each control step (paper: 3 to 51).
         warm_up: changes of a first plan. Default: ``iterations * horizon`` (paper), at most 200.
         candidates: sequences that are improved at a time, each on its own; the best one acts.
-        samples: random sequences of which a first plan takes the best ones; at least ``candidates``. At every control
-            step half of the candidates, the worst ones, start anew close to the best.
+        samples: random sequences of which a first plan takes the best ones; at least ``candidates``. At every later
+            control step half of the candidates, the worst ones, start anew close to the best.
         noise: how far from the best, as a share of the actions' range.
         optimizer: makes the optimiser of the actions, which it sees in units of half their range.
             Default: Adam with a rate of 0.1.
@@ -79,7 +81,8 @@ class GradientPlanner(MPCPlannerBase):
                 " On the true physics use ILQGPlanner."
             )
         check_plannable(env, horizon=horizon, iterations=iterations, candidates=candidates)
-        samples = max(samples, candidates)
+        if samples < candidates:
+            raise ValueError(f"samples must be at least candidates={candidates}, got {samples}")
         if warm_up is not None and warm_up < 0:
             raise ValueError(f"warm_up must not be negative, got {warm_up}")
         if not 0 <= noise <= 1 or not action_cost >= 0:
@@ -117,15 +120,16 @@ class GradientPlanner(MPCPlannerBase):
         return plan_primer(self.plan_shape, torch.float32, self.imagined.device, memory)
 
     def planning(self, td: TensorDictBase) -> Tensor:
-        """The action to take now, ``[*B, A]``; the rest of the plan is written to ``td``."""
+        """The action to take now, ``[*B, A]``, where the states are; the rest of the plan is written to ``td``."""
         if torch.is_inference_mode_enabled():
             raise RuntimeError(
                 "GradientPlanner needs gradients, which torch.inference_mode() rules out; use torch.no_grad() there."
             )
-        batch = td.shape
+        batch, device = td.shape, self.imagined.device
         flat = td.reshape(-1)
         plan, planned = read_plan(flat, self.plan_shape, torch.float32)
-        plan, planned = self._scaled(plan), planned.flatten()
+        states_at = cast(Tensor, td.get("state", plan)).device
+        plan, planned = self._scaled(plan.to(device)), planned.flatten().to(device)
         entries = self._entries(flat)
         if self._remembers and "memory" not in entries.keys() and bool(planned.any()):
             raise KeyError(
@@ -133,18 +137,19 @@ class GradientPlanner(MPCPlannerBase):
                 " the planner's make_tensordict_primer() to the environment that is acted in."
             )
         best = plan.clone()
-        for rows, iterations in ((~planned, self.warm_up), (planned, self.iterations)):
-            where = rows.nonzero().flatten()
-            if len(where) == 0:
-                continue
-            some = entries if len(where) == len(flat) else cast(TensorDictBase, entries[where])
-            begin = plan[where] if bool(planned[where[0]]) else self._first(some)
-            best[where] = self._improve(some, begin, iterations)
+        with frozen(self.imagined):
+            for rows, iterations in ((~planned, self.warm_up), (planned, self.iterations)):
+                where = rows.nonzero().flatten()
+                if len(where) == 0:
+                    continue
+                some = entries if len(where) == len(flat) else cast(TensorDictBase, entries[where])
+                begin = self._renewed(plan[where]) if bool(planned[where[0]]) else self._first(some)
+                best[where] = self._improve(some, begin, iterations)
         actions = self._actions(best)
-        write_plan(td, actions.reshape(*batch, *self.plan_shape))
+        write_plan(td, actions.reshape(*batch, *self.plan_shape).to(states_at))
         if self._remembers:
-            td.set(("next", "memory"), self._remember(entries, actions[:, 0, 0]).reshape(batch))
-        return actions[:, 0, 0].reshape(*batch, -1)
+            td.set(("next", "memory"), self._remember(entries, actions[:, 0, 0]).reshape(batch).to(states_at))
+        return actions[:, 0, 0].reshape(*batch, -1).to(states_at)
 
     def _scaled(self, actions: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in units of half their range, from -1 to 1 around its middle."""
@@ -166,6 +171,9 @@ class GradientPlanner(MPCPlannerBase):
 
     def _entries(self, flat: TensorDictBase) -> TensorDictBase:
         """What imagining reads, detached."""
+        model = cast(object, self.imagined.world_model)
+        if isinstance(model, BoundForwardModel):
+            model.static_in(flat)  # refuses other variants, of which the entries below tell nothing any more
         keys = [key for key in (*self.imagined.world_model.in_keys, "task") if key != "action"]
         return flat.select(*keys, strict=False).detach().to(self.imagined.device)
 
@@ -180,8 +188,6 @@ class GradientPlanner(MPCPlannerBase):
         rows = len(entries)
         drawn = self._splines(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
-        if self.samples == self.candidates:
-            return drawn
         # A compiled model is compiled for every number of rows, in minutes: give it the one that it gets later.
         size = self.candidates if getattr(self.imagined.world_model, "compile_steps", False) else self.samples
         drawn = drawn[:, : self.samples // size * size]
@@ -197,12 +203,16 @@ class GradientPlanner(MPCPlannerBase):
         controls = torch.from_numpy(drawn).float().to(self.half_range.device)
         return self._scaled(controls).reshape(rows, count, self.horizon, -1)
 
+    def _renewed(self, plan: Tensor) -> Tensor:
+        """Sequences ``[B, K, H, A]``, of which the worse half starts anew close to the first, the best."""
+        renewed = self.candidates // 2
+        if not renewed:
+            return plan
+        noise = self.noise * self._splines(len(plan), renewed)
+        return torch.cat([plan[:, : self.candidates - renewed], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
+
     def _improve(self, entries: TensorDictBase, plan: Tensor, iterations: int) -> Tensor:
         """Sequences ``[B, K, H, A]`` improved, the best one first."""
-        renewed = self.candidates // 2
-        if renewed:
-            noise = self.noise * self._splines(len(plan), renewed)
-            plan = torch.cat([plan[:, : self.candidates - renewed], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
         # The same tensors in every iteration: what the model folds of them is folded once.
         many = _repeated(entries, self.candidates)
         best, record = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)

@@ -16,6 +16,16 @@ _POSITION, _ORIENTATION = BODY_STATE.slices["position"], BODY_STATE.slices["orie
 _LINEAR, _ANGULAR = BODY_STATE.slices["linear_velocity"], BODY_STATE.slices["angular_velocity"]
 
 
+def require_bodies(scene: Scene) -> None:
+    """Refuse a robot that is known by its joints alone.
+
+    Raises:
+        TypeError: it is no :class:`~torchrl_gn.scenes.Scene`.
+    """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"rewards read the states of a Scene's bodies, which {type(scene).__name__} has not got")
+
+
 def find_body(scene: Scene, name: str) -> Attachment:
     """Node that carries a named body, and the body's fixed offset from the node's frame.
 
@@ -31,8 +41,7 @@ def find_body(scene: Scene, name: str) -> Attachment:
             no body states to read.
         ValueError: the scene has no body of this name.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"rewards read the states of a Scene's bodies, which {type(scene).__name__} has not got")
+    require_bodies(scene)
     if name in scene.node_names:
         return Attachment(scene.node_names.index(name), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     if name in scene.attachments:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from types import MappingProxyType
 
 from torchrl_gn.rewards.balance import Balance
+from torchrl_gn.rewards.bodies import require_bodies
 from torchrl_gn.rewards.imitate_pose import ImitatePose
 from torchrl_gn.rewards.motion import AngularSpeed, Position, Velocity, VerticalDistance
 from torchrl_gn.rewards.reach import Reach
@@ -59,6 +60,7 @@ def make_reward(task: str, scene: Scene) -> Reward:
         The reward, bound to the scene's bodies.
 
     Raises:
+        TypeError: it is no scene but a robot known by its joints alone.
         ValueError: no such task for this system (the message lists those there are), or
             the scene lacks a body that the task needs.
 
@@ -69,6 +71,7 @@ def make_reward(task: str, scene: Scene) -> Reward:
         >>> make_reward("reach", load_scene("swimmer3"))
         Reach(scene='swimmer3', body='head', shaping=0.01)
     """
+    require_bodies(scene)
     system = scene.origin.get("system", scene.name)
     family = "swimmerN" if re.fullmatch(r"swimmer\d+", system) else system
     builder = _REWARDS.get((family, task))

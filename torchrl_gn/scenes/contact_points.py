@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -79,7 +80,9 @@ def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
     if kind == _GEOM.mjGEOM_CAPSULE:
         return [(np.array([0.0, 0.0, sign * size[1]]), float(size[0])) for sign in (1, -1)]
     if kind == _GEOM.mjGEOM_BOX:
-        return [(np.array(signs) * size, 0.0) for signs in itertools.product((1, -1), repeat=3)]
+        # A tetrahedron first: of corners equally far out those are shown, and one face would hide the others.
+        corners = sorted(itertools.product((1, -1), repeat=3), key=math.prod, reverse=True)
+        return [(np.array(signs) * size, 0.0) for signs in corners]
     if kind == _GEOM.mjGEOM_ELLIPSOID:
         return [(sign * size * axis, 0.0) for axis in np.eye(3) for sign in (1, -1)]
     return []

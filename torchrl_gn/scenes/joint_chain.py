@@ -34,7 +34,8 @@ class JointChain:
         carried_by: for each joint the one before it, -1 for the base; by default each is carried by the last: an arm.
 
     Raises:
-        ValueError: if there is no joint, they have different numbers of commands, or a number does not fit.
+        ValueError: if there is no joint, they have different numbers of commands, bounds are not as many, or a number
+            does not fit.
     """
 
     name: str
@@ -50,6 +51,10 @@ class JointChain:
     contact_points = None
 
     def __post_init__(self) -> None:
+        # NumPy's numbers could not be saved.
+        object.__setattr__(self, "timestep", float(self.timestep))
+        object.__setattr__(self, "commands", tuple(tuple(map(int, indices)) for indices in self.commands))
+        object.__setattr__(self, "carried_by", tuple(map(int, self.carried_by)))
         if not self.joint_names or len(self.commands) != len(self.joint_names):
             raise ValueError(
                 f"Robot {self.name!r} needs joints, and commands for each; got {len(self.commands)} of"
@@ -70,6 +75,11 @@ class JointChain:
         for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
             if not len(getattr(self, which)):
                 object.__setattr__(self, which, np.full(self.num_actions, infinite))
+            if len(getattr(self, which)) != self.num_actions:
+                raise ValueError(
+                    f"{which} of {self.name!r} must be of its {self.num_actions} commands, got"
+                    f" {len(getattr(self, which))} numbers."
+                )
 
     @property
     def num_joints(self) -> int:

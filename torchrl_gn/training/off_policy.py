@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -18,6 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import HardUpdate, LossModule
 
+from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import Agent
 from torchrl_gn.modules.compiled_step import check_compiler
 
@@ -78,11 +80,12 @@ class OffPolicyTrainer:
         max_norm: norm that the gradient of all weights together is clipped to.
         compile: compile the losses and their gradients with ``torch.compile`` from the second update on, which takes
             some minutes: 1.6 to 1.9 times as many updates a second then.
-        seed: of the replay buffer.
+        seed: of the replay buffer, and of the environments of a run that goes on: else the same episodes would begin it
+            again.
 
     Raises:
         ValueError: if a number of frames does not fit the environments.
-        RuntimeError: with ``compile``, without a C++ compiler on a CPU.
+        FileNotFoundError: with ``compile``, without a C++ compiler on a CPU.
     """
 
     def __init__(
@@ -125,6 +128,7 @@ class OffPolicyTrainer:
         )
         self.frames, self.updates, self.seconds, self.owed = 0, 0, 0.0, 0.0
         self.curve = LearningCurve()
+        self.seed = seed
         self._weights = [p for group in optimizer.param_groups for p in group["params"]]
         if compile and self._weights[0].device.type == "cpu":
             check_compiler()
@@ -141,6 +145,13 @@ class OffPolicyTrainer:
         if self.frames >= self.total:
             return
         collector = self._collector()
+        try:
+            yield from self._learn(collector)
+        finally:
+            # Left to itself it would close an environment that is the caller's, and leave processes of a cluster.
+            collector.shutdown(**({"close_env": False} if isinstance(self.env, EnvBase) else {}))
+
+    def _learn(self, collector: BaseCollector) -> Iterator[LearningProgress]:
         start = time.perf_counter()
         for batch in collector:
             self.remember(batch)
@@ -161,7 +172,6 @@ class OffPolicyTrainer:
             means = {name: sum(values) / len(values) for name, values in losses.items()}
             yield LearningProgress(self.frames, self.updates, self.seconds, means, evaluation)
             start = time.perf_counter()
-        collector.shutdown(**({"close_env": False} if isinstance(self.env, EnvBase) else {}))
 
     def _collector(self) -> BaseCollector:
         common: dict[str, Any] = {
@@ -172,10 +182,15 @@ class OffPolicyTrainer:
         }
         options: dict[str, Any] = {"track_traj_ids": False, "auto_register_policy_transforms": False}
         if isinstance(self.env, EnvBase):
+            if self.frames:
+                self.env.set_seed(self.seed + self.frames)
             return Collector(self.env, self.explore, **common, **options)
+        makers = list(self.env)
+        if self.frames:
+            makers = [partial(_seeded, make, self.seed + self.frames + index) for index, make in enumerate(makers)]
         resources = {"num_cpus": 1, "num_gpus": 0}
         collector = Collector(
-            list(self.env),
+            makers,
             self.explore,
             backend="ray",
             sync=True,
@@ -191,7 +206,8 @@ class OffPolicyTrainer:
         Raises:
             ValueError: if a number is not finite.
         """
-        steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1)
+        steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1).to(self._weights[0].device)
+        require_finite(steps, "Experience")
         self.agent.update_normalizers(steps["observation"], steps["action"], steps["next", "observation"])
         self.buffer.extend(steps)
         self.frames += len(steps)
@@ -204,7 +220,7 @@ class OffPolicyTrainer:
         Raises:
             FloatingPointError: if a loss or a gradient is not finite; no weight is changed.
         """
-        total, each = self._loss(self.buffer.sample())
+        total, each = self._loss(self.buffer.sample().to(self._weights[0].device))
         values = {name: float(value) for name, value in each.items()}
         if not math.isfinite(sum(values.values())):
             raise FloatingPointError(f"Losses are {values} at update {self.updates}; lower the learning rate.")
@@ -277,6 +293,12 @@ class OffPolicyTrainer:
         self.curve = LearningCurve(**{name: list(values) for name, values in state["curve"].items()})
         for name, value in state["progress"].items():
             setattr(self, name, value)
+
+
+def _seeded(make: Callable[[], EnvBase], seed: int) -> EnvBase:
+    env = make()
+    env.set_seed(seed)
+    return env
 
 
 def _leaves(tensordict: TensorDictBase) -> Iterator[tuple[tuple[str, ...], torch.Tensor]]:

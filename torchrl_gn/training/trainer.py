@@ -203,4 +203,6 @@ class Trainer:
         progress = state["progress"]
         self.step, self.seconds, self.spent = progress["step"], progress["seconds"], dict(progress["spent"])
         self.best = math.inf if progress["best"] is None else progress["best"]
-        self.since_best, self.validated = progress["since_best"], progress["validated"]
+        self.since_best = progress["since_best"]
+        # Of a larger budget less is spent: its own validations are still to come.
+        self.validated = min(progress["validated"], math.floor(self.fraction * self.validations))

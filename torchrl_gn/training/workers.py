@@ -72,6 +72,12 @@ class Workers:
             if not torch.cuda.is_available():
                 raise ValueError(f"device={name} needs a GPU and a torch built for it; use device=cpu.")
             local = int(os.environ.get("LOCAL_RANK", "0")) if device.index is None else device.index
+            count = torch.cuda.device_count()
+            if local >= count:
+                raise ValueError(
+                    f"device={name} is GPU {local}, but there are {count}, counted from 0; use one of these, and as"
+                    " many processes at most."
+                )
             device = torch.device("cuda", local)
             torch.cuda.set_device(device)
         return device
