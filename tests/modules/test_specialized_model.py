@@ -310,7 +310,7 @@ def test_a_compiled_step_is_dropped_where_other_channels_vary(scenes, make_model
 def has_compiler() -> bool:
     try:
         check_compiler()
-    except RuntimeError:
+    except FileNotFoundError:
         return False
     return True
 
@@ -352,5 +352,5 @@ def test_compiling_without_a_compiler_is_refused(scenes, make_model, monkeypatch
     from torch._inductor import cpp_builder
 
     getattr(cpp_builder.get_cpp_compiler, "cache_clear", lambda: None)()
-    with pytest.raises(RuntimeError, match="compile=True needs a C\\+\\+ compiler: install g\\+\\+"):
+    with pytest.raises(FileNotFoundError, match="compile=True needs a C\\+\\+ compiler: install g\\+\\+"):
         specialize(make_model(scenes["swimmer6"]).bind(scenes["swimmer6"]), compile=True)
