@@ -35,7 +35,7 @@ def plot_loglog(
         The written path.
     """
     figure = new_figure((4.2 * len(panels) + 0.6, 3.8))
-    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    colors = palette.SERIES
     for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for number, (label, (x, y)) in enumerate(lines.items()):
             axes.loglog(x, y, color=colors[number % len(colors)], label=label, linewidth=1.6, marker="o", markersize=4)
@@ -62,7 +62,7 @@ def plot_rewards(
     """
     figure = new_figure((6.4, 3.8))
     axes = figure.subplots()
-    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    colors = palette.SERIES
     for number, (label, values) in enumerate(rewards.items()):
         values = values.detach().double().cpu().numpy()
         time, color = timestep * np.arange(1, values.shape[1] + 1), colors[number % len(colors)]
@@ -92,7 +92,7 @@ def plot_learning_curves(
     """
     figure = new_figure((6.4, 3.8))
     axes = figure.subplots()
-    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    colors = palette.SERIES
     for number, (label, (frames, returns)) in enumerate(curves.items()):
         if any(len(of) != len(frames) for of in returns):
             raise ValueError(
@@ -143,7 +143,7 @@ def plot_training_curve(
 
     figure = new_figure((7.0, 4.2))
     axes = figure.subplots()
-    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    colors = palette.SERIES
     for number, (label, (x, y)) in enumerate(kept.items()):
         marker = "o" if len(x) <= 60 else None
         axes.plot(
@@ -274,7 +274,7 @@ def plot_bars(
     beside = wide * len(panels) <= _WIDEST
     rows, columns = (1, len(panels)) if beside else (len(panels), 1)
     figure = new_figure((max(6.0, wide * columns), 2.6 * rows + 0.1 * len(models) + 0.4))
-    colors = (palette.TRUTH, palette.PREDICTION, *palette.AXES)
+    colors = palette.SERIES
     width = 0.84 / len(models)
     for axes, (title, panel) in zip(figure.subplots(rows, columns, squeeze=False).flat, panels.items(), strict=True):
         for number, model in enumerate(models):
