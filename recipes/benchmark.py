@@ -38,7 +38,7 @@ from torchrl_gn.modules import fast_matmul, specialize
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.systems import find_system
 from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
-from torchrl_gn.training.sweep import Run, run_all
+from torchrl_gn.training.sweep import Run, refuse_failures, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 
@@ -67,8 +67,7 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[Path]:
     shared = [f"system={cfg.system}", f"data.folder={run.data}", f"seed={cfg.seed}", f"threads={cfg.threads}"]
     shared += [f"minutes={cfg.minutes}", "clock=processor", *cfg.training]
     runs = [Run(RECIPE, run.path / "models" / name, (*shared, *sizes), name) for name, sizes in variants.items()]
-    if run_all(runs, 1):
-        raise ValueError("Not all models could be trained; see their log.txt. Start again to go on.")
+    refuse_failures(run_all(runs, 1))
     return [each.folder for each in runs]
 
 

@@ -60,7 +60,7 @@ from torchrl_gn.training import (
     make_optimizer,
 )
 from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
-from torchrl_gn.training.sweep import Run, run_all
+from torchrl_gn.training.sweep import Run, refuse_failures, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 # A run may go on with these changed, and nothing else.
@@ -188,9 +188,7 @@ def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, s
         shared += [f"data.{key}={cfg.data[key]}" for key in ("train", "validation", "test", "length", "seed")]
         shared += [f"noise={cfg.noise}", *model, f"model.static={static}"]
         runs[name] = Run(RECIPE, folder / name.replace(" ", "_"), tuple(shared), name)
-    failed = run_all(runs.values(), cfg.jobs, desc="training baselines")
-    if failed:
-        raise ValueError(f"{len(failed)} baselines failed; see their log.txt. Start again to go on.")
+    refuse_failures(run_all(runs.values(), cfg.jobs, desc="training baselines"))
     models = {name: load_checkpoint(run.folder).model.bind(scene, static_key="static") for name, run in runs.items()}
     return {name: evaluate_errors(bound, systems.predicted) for name, bound in models.items()}
 

@@ -44,7 +44,7 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import Scene, has_variants, load_scene, make_variants, parameter_ranges
 from torchrl_gn.training import RunFolder, clean_exit
-from torchrl_gn.training.sweep import Run, run_all
+from torchrl_gn.training.sweep import Run, refuse_failures, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
@@ -338,8 +338,7 @@ def main(cfg: DictConfig) -> None:
     checkpoint = cfg.checkpoint or run.path / "model"
     if not cfg.checkpoint:
         options = (f"system={cfg.system}", f"minutes={cfg.minutes}", f"seed={cfg.seed}", f"threads={cfg.threads}")
-        if run_all([Run(RECIPE, run.path / "model", options, cfg.system)], 1):
-            raise ValueError(f"The model could not be trained; see {run.path / 'model' / 'log.txt'}.")
+        refuse_failures(run_all([Run(RECIPE, run.path / "model", options, cfg.system)], 1))
     prepared = settings(cfg, checkpoint)
 
     metrics: dict[str, float | int] = {}

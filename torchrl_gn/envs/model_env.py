@@ -150,11 +150,8 @@ class ModelEnv(ModelBasedEnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
-        model = cast(object, self.world_model)
-        if isinstance(model, BoundForwardModel):
-            model.static_in(tensordict)  # refuses another scene's, which the selection would leave out
-        # The model writes into its input: give it a shallow copy.
-        predicted = self.world_model(tensordict.select(*self.world_model.in_keys))["next"]
+        # The model writes into its input: give it a shallow copy. Of all that samples bring, for it may refuse some.
+        predicted = self.world_model(tensordict.exclude("next"))["next"]
         prediction = predicted["state"]
         stable = prediction.isfinite().flatten(-2).all(-1, keepdim=True)
         next_state = torch.where(stable.unsqueeze(-1), prediction, state)

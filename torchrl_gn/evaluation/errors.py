@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 # Mean squared changes below this are rounding of positions of the order of metres, not motion.
 _ROUNDING = 1e-24
 
+HORIZONS = (20, 100)
+"""Steps of the rollouts that are measured where nothing else is asked for."""
+
 
 def squared_errors(prediction: Tensor, truth: Tensor, layout: StateLayout = BODY_STATE) -> Tensor:
     """Squared error of every component of a state, in float64.
@@ -64,7 +67,7 @@ def evaluate_errors(
     model: TensorDictModuleBase,
     trajectories: TensorDictBase,
     *,
-    horizons: Sequence[int] = (20, 100),
+    horizons: Sequence[int] = HORIZONS,
     one_step: bool = True,
     warm_up: int = 0,
     batch_size: int = 1000,

@@ -9,12 +9,10 @@ from tensordict import TensorDictBase
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.evaluation.error_table import ErrorTable
-from torchrl_gn.evaluation.errors import evaluate_errors
+from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.evaluation.identification import identification_errors
 from torchrl_gn.modules import ForwardModel, IdentifyingModel
 from torchrl_gn.scenes import Scene, sample_variants
-
-_HORIZONS = (20, 100)
 
 
 def fresh_errors(
@@ -37,13 +35,13 @@ def fresh_errors(
         ValueError: if trajectories are shorter than the longest rollouts to measure, 100 steps, or the model identifies
             and the scene is no system of the paper with variants.
     """
-    if length < max(_HORIZONS):
-        raise ValueError(f"length={length} is too short: errors are measured over rollouts of {max(_HORIZONS)} steps.")
+    if length < max(HORIZONS):
+        raise ValueError(f"length={length} is too short: errors are measured over rollouts of {max(HORIZONS)} steps.")
     if isinstance(model, ForwardModel):
         trajectories = collect_trajectories(scene, sequences, length, seed, split=3)
-        return evaluate_errors(model.bind(scene), trajectories, horizons=_HORIZONS)
+        return evaluate_errors(model.bind(scene), trajectories)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
     variants = sample_variants(scene.origin.get("system", scene.name), sequences, rng)
     both = collect_trajectories(variants, 2 * sequences, length, seed, split=4)
     observed, predicted = (cast(TensorDictBase, half) for half in (both[:sequences], both[sequences:]))
-    return identification_errors(*model.bind(scene), observed, predicted, steps=phase, horizons=_HORIZONS)
+    return identification_errors(*model.bind(scene), observed, predicted, steps=phase)

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.evaluation.error_table import ErrorTable
-from torchrl_gn.evaluation.errors import evaluate_errors
+from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.modules import BoundForwardModel, BoundInferenceModel
 
 _PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # on squared weights, as shares of the number of samples
@@ -25,7 +25,7 @@ def identification_errors(
     *,
     steps: int | None = None,
     wrong: bool = False,
-    horizons: Sequence[int] = (20, 100),
+    horizons: Sequence[int] = HORIZONS,
     one_step: bool = True,
 ) -> ErrorTable:
     """Errors of predictions with what was inferred from other trajectories of the same systems.

@@ -8,7 +8,7 @@ from pathlib import Path
 from tensordict import TensorDictBase
 
 from torchrl_gn.evaluation.error_table import ErrorTable
-from torchrl_gn.evaluation.errors import evaluate_errors
+from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.evaluation.figures import plot_errors
 from torchrl_gn.evaluation.motion_figures import plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
@@ -21,7 +21,7 @@ def report(
     trajectories: TensorDictBase,
     folder: str | os.PathLike,
     *,
-    horizons: tuple[int, ...] = (20, 100),
+    horizons: tuple[int, ...] = HORIZONS,
     scene: Scene | None = None,
 ) -> tuple[ErrorTable, list[Path]]:
     """Evaluate a model on test trajectories and draw what it does.

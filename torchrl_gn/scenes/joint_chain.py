@@ -73,12 +73,12 @@ class JointChain:
                 f"carried_by={self.carried_by} of {self.name!r} must name an earlier joint, or -1, for each."
             )
         for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
-            if not len(getattr(self, which)):
+            count = len(getattr(self, which))
+            if count == 0:
                 object.__setattr__(self, which, np.full(self.num_actions, infinite))
-            if len(getattr(self, which)) != self.num_actions:
+            elif count != self.num_actions:
                 raise ValueError(
-                    f"{which} of {self.name!r} must be of its {self.num_actions} commands, got"
-                    f" {len(getattr(self, which))} numbers."
+                    f"{which} of {self.name!r} must be of its {self.num_actions} commands, got {count} numbers."
                 )
 
     @property

@@ -10,13 +10,14 @@ from typing import Any
 from tqdm import tqdm
 
 from torchrl_gn.data import TrajectoryDataset, create_dataset
+from torchrl_gn.evaluation.errors import HORIZONS
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
 from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
 
-HORIZON = 100
+HORIZON = max(HORIZONS)
 """Steps of the longest rollouts that recipes measure."""
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import time
@@ -126,14 +125,14 @@ class RunFolder:
 def _new_folder(parent: Path) -> Path:
     """A folder named by the time; of two that begin in one second, the later is the next one."""
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    for number in itertools.count(1):
-        path = parent / (name if number == 1 else f"{name}_{number}")
+    path, number = parent / name, 1
+    while True:
         try:
             path.mkdir(parents=True)
+            return path
         except FileExistsError:
-            continue
-        return path
-    raise AssertionError
+            number += 1
+            path = parent / f"{name}_{number}"
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -48,13 +48,13 @@ class Run:
         return json.loads(path.read_text()) if path.exists() else None
 
     def refuse_changes(self) -> None:
-        """Refuse to take what was measured with other options for this run.
+        """Refuse to take what was measured with other options for this run, which is done.
 
         Raises:
             ValueError: naming the options that differ.
         """
         path = self.folder / OPTIONS_FILE
-        if self.metrics is None or not path.exists():
+        if not path.exists():
             return
         both = json.loads(path.read_text()), self.overrides
         before, now = ({option for option in options if not option.startswith(MAY_DIFFER)} for options in both)
@@ -86,10 +86,12 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
     Raises:
         ValueError: if a finished run was made with other options.
     """
-    runs, failed = list(dict.fromkeys(runs)), []
+    runs, left, failed = list(dict.fromkeys(runs)), [], []
     for run in runs:
-        run.refuse_changes()
-    left = [run for run in runs if run.metrics is None]
+        if run.metrics is None:
+            left.append(run)
+        else:
+            run.refuse_changes()
     if not left:
         return []  # without starting a cluster
     pool = _Threads(jobs) if isinstance(jobs, int) else _OnRay(jobs)
@@ -106,6 +108,16 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
             pool.stop()
             raise
     return failed
+
+
+def refuse_failures(failed: Sequence[Run]) -> None:
+    """End where runs failed, whose logs say why.
+
+    Raises:
+        ValueError: if any did.
+    """
+    if failed:
+        raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
 
 
 def report_sweep(
@@ -138,8 +150,7 @@ def report_sweep(
     tqdm.write("\n".join(lines))
     for path in folder.written:
         tqdm.write(str(path))
-    if failed:
-        raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
+    refuse_failures(failed)
 
 
 def _start(run: Run, folder: Path) -> subprocess.Popen:

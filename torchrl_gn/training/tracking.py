@@ -101,8 +101,8 @@ class Tracker:
 
     def _tag(self, path: Path) -> str:
         """Name of a figure; of several systems each has a folder of its own."""
-        inside = path.resolve().is_relative_to(self._run.resolve())
-        return str(path.resolve().relative_to(self._run.resolve()).with_suffix("")) if inside else path.stem
+        path, run = path.resolve(), self._run.resolve()
+        return str(path.relative_to(run).with_suffix("")) if path.is_relative_to(run) else path.stem
 
     def log_table(self, name: str, rows: Sequence[Sequence[Any]]) -> None:
         """Log a table whose first row holds the titles; csv takes none."""
