@@ -4,9 +4,9 @@
 
 Reads angles, velocities and commands of the joints (docs/data.md says in what form), cuts them where they break and
 says what was dropped, and trains a feed-forward and a recurrent graph network for equal time (paper, "Real robot data";
-SM "Recurrent one-step predictions"). Both are compared on episodes never trained on, from a short warm-up on. Without a
-log it makes one: of the simulated JACO arm, with lagging motors, play, and noisy, coarse encoders. Ctrl-C saves
-everything; the same `run_dir` goes on.
+SM "Recurrent one-step predictions"). Both are compared on episodes never trained on (of a log with few episodes: on its
+last part), from a short warm-up on. Without a log it makes one: of the simulated JACO arm, with lagging motors, play,
+and noisy, coarse encoders. Ctrl-C saves everything; the same `run_dir` goes on.
 
 Leaves config.yaml, metrics.json, a checkpoint of each model, and figures of measured and predicted joint angles
 (joints.png) and of the errors (errors.png) in its run folder. All options: recipes/config/real_robot.yaml. What
@@ -31,12 +31,14 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import JointChain, load_scene
 from torchrl_gn.training import (
     Budget,
+    Checkpoint,
     RunFolder,
     Tracker,
     Trainer,
     clean_exit,
     load_checkpoint,
     make_optimizer,
+    with_help,
 )
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 from torchrl_gn.training.progress import train_with_progress
@@ -58,29 +60,33 @@ def read(cfg: DictConfig) -> tuple[RobotLog, JointChain]:
         log = load_robot_log(cfg.log, timestep=cfg.timestep, names=options(cfg)["names"])
         name, carried_by = Path(cfg.log).stem, cfg.carried_by or ()
     else:
-        scene = load_scene("jaco", timestep=cfg.simulated.timestep)
-        log = simulate_log(
-            scene, cfg.simulated.episodes, cfg.simulated.steps, cfg.seed, **options(cfg.simulated.faults)
-        )
+        own = cfg.simulated
+        scene = load_scene("jaco", timestep=own.timestep)
+        log = simulate_log(scene, own.episodes, own.steps, cfg.seed, **options(own.faults))
         name, carried_by = "simulated jaco", [-1, 0, 1, 2, 3, 4, 5, 5, 5]
-    return log, log_chain(log, name, every=cfg.every, commands=commands, carried_by=carried_by)
+    return log, log_chain(log, name, resample=cfg.resample, commands=commands, carried_by=carried_by)
 
 
 def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
-    """Trajectories of training, validation and test episodes, with what was dropped printed."""
-    order = np.random.default_rng(cfg.data_seed).permutation(len(log.length))
-    counts = [int(share * len(order)) for share in (cfg.share.validation, cfg.share.test)]
-    if min(counts) < 1 or sum(counts) >= len(order):
+    """Trajectories to train, validate and test with: of whole episodes, or where these are few in blocks of time."""
+    data, report = log_trajectories(log, cfg.length, resample=cfg.resample, lag=cfg.lag, jump=cfg.jump)
+    print(report)
+    shares, which = (cfg.share.validation, cfg.share.test), data["episode"]
+    order = torch.from_numpy(np.random.default_rng(cfg.data_seed).permutation(len(log.length)))
+    counts = [int(share * len(order)) for share in shares]
+    if min(counts) < 1:
+        print(f"{len(order)} episodes are too few to share out: split in time, the last part is for the test")
+        which = torch.arange(len(data))
+        counts = [max(1, int(share * len(data))) for share in shares]
+        order = which.roll(sum(counts))  # validation and test begin it
+    parts = dict(zip(("validation", "test", "train"), order.tensor_split(np.cumsum(counts).tolist()), strict=True))
+    found = {part: data[torch.isin(which, members)] for part, members in parts.items()}
+    print(", ".join(f"{part}: {len(trajectories):,} trajectories" for part, trajectories in found.items()))
+    if min(shares) <= 0 or not all(map(len, found.values())):
         raise ValueError(
-            f"{len(order)} episodes cannot be split by share={options(cfg.share)}; give more, or other shares."
+            f"{len(log.length)} episodes cannot be split by share={options(cfg.share)}, data_seed={cfg.data_seed};"
+            f" give more, other shares, or a smaller length than {cfg.length}."
         )
-    parts = {"validation": order[: counts[0]], "test": order[counts[0] : sum(counts)], "train": order[sum(counts) :]}
-    found = {}
-    for part, episodes in parts.items():
-        found[part], report = log_trajectories(
-            log, cfg.length, every=cfg.every, lag=cfg.lag, jump=cfg.jump, episodes=np.sort(episodes)
-        )
-        print(f"{part}: {report}")
     return found
 
 
@@ -118,12 +124,11 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, chain: JointChain, data: 
     )
 
 
-def train(cfg: DictConfig, name: str, run: RunFolder, chain: JointChain, data: dict, tracker: Tracker):
-    """Train one of the models, or go on with it; the model, its trainer and its checkpoint."""
-    path = run.path / name / CHECKPOINT_FILE
-    begun = load_checkpoint(path) if path.exists() else None
+def train(
+    cfg: DictConfig, name: str, path: Path, begun: Checkpoint | None, chain: JointChain, data: dict, tracker: Tracker
+):
+    """Train one of the models, or go on with it; the model and its trainer."""
     if begun:
-        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
         model = begun.model
     else:
         torch.manual_seed(cfg.seed)
@@ -140,9 +145,10 @@ def train(cfg: DictConfig, name: str, run: RunFolder, chain: JointChain, data: d
     if not begun:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
     train_with_progress(trainer, path, begun, tracker, scene=cast(Any, chain), config=options(cfg), name=name)
-    return model, trainer, path
+    return model, trainer
 
 
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="real_robot")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -158,13 +164,16 @@ def main(cfg: DictConfig) -> None:
     print(chain)
     data = split(cfg, log)
     run = RunFolder(cfg.run_dir, "real_robot")
+    paths = {name: run.path / name / CHECKPOINT_FILE for name in MODELS}
+    begun = {name: load_checkpoint(path) for name, path in paths.items() if path.exists()}
+    for checkpoint in begun.values():
+        run.refuse_changes(checkpoint.config, options(cfg), free=MAY_CHANGE)
     run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"real_robot-{chain.name}", config=options(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"real_robot-{chain.name}", config=cfg)
     tables: dict[str, ErrorTable] = {}
     metrics: dict[str, float] = {}
-    files = []
-    for name in MODELS:
-        model, trainer, path = train(cfg, name, run, chain, data, tracker)
+    for name, path in paths.items():
+        model, trainer = train(cfg, name, path, begun.get(name), chain, data, tracker)
         tables[name] = evaluate_errors(
             model.bind(cast(Any, chain)),
             data["test"],
@@ -174,19 +183,16 @@ def main(cfg: DictConfig) -> None:
         )
         metrics |= {f"{name}/{key}": value for key, value in tables[name].to_metrics().items()}
         metrics |= {f"{name}/steps": trainer.step, f"{name}/training_seconds": trainer.seconds}
-        files.append(path)
     predictions = {name: table.rollouts[0] for name, table in tables.items()}
     pictures = [
         plot_joints(cast(Any, data["test"]["state"])[0], predictions, chain, run.path / "joints.png"),
         plot_errors(tables, run.path / "errors.png"),
     ]
-    tracker.log(run.write_metrics(metrics, seed=cfg.seed), trainer.step)
-    tracker.log_files([*pictures, *files])
-    tracker.close()
+    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), [*pictures, *paths.values()], trainer.step)
     print(summary(tables))
     for name, table in tables.items():
         print(f"\n{name}\n{table}")
-    for path in [*pictures, run.path / "metrics.json", *files]:
+    for path in [*pictures, run.path / "metrics.json", *paths.values()]:
         print(path)
 
 

@@ -78,7 +78,7 @@ def test_trajectories_hold_the_rows_and_cross_no_episode():
     late, _ = log_trajectories(log, 12, lag=3)
     assert late["action"][0, 0, 0] == 0  # the command of row 0 goes with the state of row 3
     torch.testing.assert_close(late["state"][0, 0, 1, 1], torch.tensor(np.sin(log.angle[3, 0])))
-    coarse, _ = log_trajectories(log, 12, every=2)
+    coarse, _ = log_trajectories(log, 12, resample=0.02)
     torch.testing.assert_close(coarse["state"][0, 1, 1, 1], torch.tensor(np.sin(log.angle[2, 0])))
     assert coarse["action"][0, :2, 0].tolist() == [0.5, 2.5]
     every, _ = log_trajectories(log, 12, overlap=True)
@@ -113,7 +113,7 @@ def test_an_infinity_hides_no_jump(channel):
 
 def test_rows_that_a_trajectory_holds_are_not_left_over():
     log = smooth_log((25, 3))
-    for options, short in (({}, 3), ({"every": 2}, 3), ({"lag": 4}, 3 + 8), ({"overlap": True}, 3)):
+    for options, short in (({}, 3), ({"resample": 0.02}, 3), ({"lag": 4}, 3 + 8), ({"overlap": True}, 3)):
         assert log_trajectories(log, 12, **options)[1].short == short
 
 
@@ -134,6 +134,10 @@ def test_an_angle_that_turns_over_does_not_jump():
         ({"velocity": np.zeros((79, 2))}, "do not fit"),
         ({"load": np.zeros((80, 3))}, "'load' has 3 columns, which is no multiple of the 2 joints"),
         ({"timestep": np.array(-1.0)}, "does not say its time step"),
+        (
+            {"time": np.arange(80) * 0.02},
+            r"0.01 \(its timestep\) but 0.02 \(its time stamps\); leave what is wrong out",
+        ),
     ],
 )
 def test_bad_files_are_refused(tmp_path, change, message):
@@ -160,6 +164,58 @@ def test_a_single_joint_needs_no_second_axis(tmp_path):
     assert read.length.tolist() == [80]
 
 
+def test_a_further_channel_of_a_single_joint_needs_none_either(tmp_path):
+    log, load = smooth_log(joints=1), np.arange(80.0)
+    np.savez(tmp_path / "log.npz", angle=log.angle, velocity=log.velocity, command=log.command, load=load)
+    read = load_robot_log(tmp_path / "log.npz", timestep=0.01)
+    np.testing.assert_array_equal(read.extra["load"], load[:, None])
+
+
+def test_what_is_not_read_is_said(tmp_path):
+    log = smooth_log()
+    others = {
+        "name": np.array(["a", "b"]),
+        "mass": np.array(3.0),
+        "late": np.zeros((79, 2)),
+        "heat": np.zeros(80),
+        "command": log.velocity,
+        "u": log.command,
+    }
+    np.savez(tmp_path / "log.npz", **(arrays_of(log) | others))
+    read = load_robot_log(tmp_path / "log.npz", timestep=0.01, names={"command": "u"})
+    np.testing.assert_array_equal(read.command, log.command)
+    assert list(read.extra) == ["load"] and set(read.unread) == {"name", "mass", "late", "heat", "command"}
+    told = str(log_trajectories(read, 5)[1])
+    assert "not read: 'name', not numbers" in told and "not read: 'mass', of shape [] and not [80, 2]" in told
+    assert "not read: 'late', of shape [79, 2]" in told and "not read: 'heat', of shape [80]" in told
+    assert "not read: 'command', 'u' was named for it" in told
+
+
+def test_episodes_may_be_told_row_by_row(tmp_path):
+    arrays = arrays_of(smooth_log())
+    del arrays["length"]
+    np.savez(tmp_path / "log.npz", **arrays, timestep=0.01, trial=np.repeat(["first", "second"], [30, 50]))
+    assert load_robot_log(tmp_path / "log.npz", names={"episode": "trial"}).length.tolist() == [30, 50]
+
+
+def test_a_robot_without_motors_says_so(tmp_path):
+    arrays = arrays_of(smooth_log())
+    del arrays["command"]
+    np.savez(tmp_path / "log.npz", **arrays)
+    with pytest.raises(DatasetError, match=r"lacks \['command'\].* without motors"):
+        load_robot_log(tmp_path / "log.npz", timestep=0.01)
+    read = load_robot_log(tmp_path / "log.npz", timestep=0.01, names={"command": ""})
+    assert log_trajectories(read, 12)[0]["action"].shape == (6, 12, 0)
+    assert log_chain(read, "swing").num_actions == 0
+
+
+def test_a_time_step_does_not_contradict_the_log(tmp_path):
+    np.savez(tmp_path / "log.npz", **arrays_of(smooth_log()), timestep=0.01)
+    with pytest.raises(DatasetError, match=r"0.02 \(timestep=\) but 0.01 \(its timestep\).* resample="):
+        load_robot_log(tmp_path / "log.npz", timestep=0.02)
+    assert load_robot_log(tmp_path / "log.npz", timestep=0.02, names={"timestep": ""}).timestep == 0.02
+
+
 def test_other_bad_input_is_named(tmp_path):
     with pytest.raises(DatasetError, match="No robot log at"):
         load_robot_log(tmp_path / "none.npz")
@@ -173,7 +229,9 @@ def test_other_bad_input_is_named(tmp_path):
         log_trajectories(smooth_log(), 70)
     with pytest.raises(ValueError, match="lag=-1"):
         log_trajectories(smooth_log(), 5, lag=-1)
-    with pytest.raises(ValueError, match="2 commands cannot be dealt out evenly to 3 joints|cannot be dealt out"):
+    with pytest.raises(
+        ValueError, match=r"2 commands cannot be dealt out evenly to 3 joints; .* commands=\[\[0\], \[\]\]"
+    ):
         log = smooth_log(joints=3)
         log_chain(RobotLog(log.angle, log.velocity, log.command[:, :2], log.length, 0.01), "arm")
     with pytest.raises(DatasetError, match="has no 'q'"):

@@ -84,8 +84,8 @@ def test_starts_are_of_the_variants_own_model() -> None:
 
 
 def test_variants_are_stable() -> None:
-    for system in SYSTEMS[:-1]:
-        scenes = sample_variants(system, 60, 5)
+    for system in SYSTEMS:
+        scenes = sample_variants(system, 12 if system == "jaco" else 60, 5)  # an arm takes its time
         rng = np.random.default_rng(0)
         starts = np.concatenate([sample_start_states(scene, 1, rng) for scene in scenes])
         played = Simulator(scenes).rollout(starts, spline_controls(scenes[0], 60, 30, rng))

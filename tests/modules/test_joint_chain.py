@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -112,3 +114,53 @@ def test_several_commands_a_joint(robot):
     assert controls[0].tolist() == [[2 * (e // 2), 2 * (e // 2) + 1] for e in range(18)]
     with pytest.raises(ValueError, match="controls=2"):
         ForwardModel(FeatureSet.of(doubled), controls=2)
+
+
+def test_joints_with_fewer_commands_or_none(robot):
+    chain, data = robot
+    commands = ((0, 1), (), (2,), *[()] * 6)
+    some = JointChain("jaco", chain.joint_names, chain.timestep, commands, carried_by=chain.carried_by)
+    options = {"layout": joint_layout(), "joint_axes": False, "contacts": False, **SMALL}
+    bound = ForwardModel(FeatureSet.of(some), controls=2, **options).bind(some)
+    action = torch.tensor([5.0, 6.0, 7.0]).expand(len(data), 3)
+    _, controls = bound.frame.features(bound.frame.see(data["state"][:, 0], bound.values), action, bound.values)
+    assert controls[0].tolist() == [[5, 6]] * 2 + [[0, 0]] * 2 + [[7, 0]] * 2 + [[0, 0]] * 12
+    with pytest.raises(ValueError, match="counted from 0"):
+        JointChain("jaco", ("a", "b"), 0.01, ((0,), (-1,)))
+
+
+@pytest.mark.parametrize("core", ["gn", "recurrent"])
+@pytest.mark.parametrize("motors", [1, 0])
+def test_a_double_pendulum_with_one_motor_or_none(core, motors):
+    log = simulate_log(load_scene("acrobot"), 10, 42, 0)
+    log = dataclasses.replace(log, command=log.command[:, :motors])
+    chain, data = log_chain(log, "double", commands=[[0], []] if motors else None), log_trajectories(log, 40)[0]
+    assert chain.num_actions == motors and chain.edge_action[:, 0].tolist() == [motors - 1] * 2 + [-1] * 2
+    torch.manual_seed(0)
+    options = {"layout": joint_layout(), "joint_axes": False, "contacts": False, "core": core}
+    model = ForwardModel(FeatureSet.of(chain), **options, **SMALL)
+    bound = model.bind(chain)
+    loss = ForwardModelLoss(bound, forced=5)
+    loss.fit_normalizers(trajectory_buffer(data, batch_size=300, seed=0).sample())
+    batch = trajectory_buffer(data, batch_size=16, window=5 if core == "recurrent" else 1, seed=0).sample()
+    loss(batch)["loss_forward_model"].backward()
+    assert evaluate_errors(bound, data, horizons=(5,), warm_up=5)["rollout_error_5"].total > 0
+    # What the motor does is seen, and nothing else.
+    state, action = data["state"][:, 3], data["action"][:, 3]
+    assert torch.equal(bound.step(state, action), bound.step(state, action + 1)) == (motors == 0)
+    env = ModelEnv(bound, start_states=data["state"].flatten(0, 1), seed=0)
+    check_env_specs(env)
+
+
+def test_a_command_that_never_varied_is_held_in_plans(robot):
+    chain, data = robot
+    low, high = chain.action_low.copy(), chain.action_high.copy()
+    low[2] = high[2] = 0.25
+    fixed = dataclasses.replace(chain, action_low=low, action_high=high)
+    options = {"layout": joint_layout(), "joint_axes": False, "contacts": False}
+    torch.manual_seed(0)
+    bound = ForwardModel(FeatureSet.of(fixed), **options, **SMALL).bind(fixed)
+    ForwardModelLoss(bound).fit_normalizers(trajectory_buffer(data, batch_size=500, seed=0).sample())
+    env = ModelEnv(bound, angles_near(torch.zeros(9)), start_states=data["state"].flatten(0, 1), seed=0)
+    planned = GradientPlanner(env, 3, 2, seed=0)(env.reset())["action"]
+    assert planned.isfinite().all() and planned[2] == 0.25

@@ -27,15 +27,15 @@ class JointChain:
         name: name of the robot.
         joint_names: names of its ``J`` joints, from the base on.
         timestep: control time step, seconds.
-        commands: for each joint the indices of the commands that act on it, as many for each.
+        commands: for each joint the indices of the commands that act on it, none of a joint without motor.
         extras: names of what else is logged of every joint, each one channel.
         action_low: ``[A]`` lower bounds of the commands; by default there are none.
         action_high: ``[A]`` upper bounds.
         carried_by: for each joint the one before it, -1 for the base; by default each is carried by the last: an arm.
 
     Raises:
-        ValueError: if there is no joint, they have different numbers of commands, bounds are not as many, or a number
-            does not fit.
+        ValueError: if there is no joint, commands are not given for each, bounds are not as many, or a number does not
+            fit.
     """
 
     name: str
@@ -60,8 +60,8 @@ class JointChain:
                 f"Robot {self.name!r} needs joints, and commands for each; got {len(self.commands)} of"
                 f" {len(self.joint_names)}."
             )
-        if len({len(indices) for indices in self.commands}) > 1:
-            raise ValueError(f"Joints of {self.name!r} must have as many commands each, got {self.commands}.")
+        if any(index < 0 for indices in self.commands for index in indices):
+            raise ValueError(f"commands={self.commands} of {self.name!r} must be counted from 0.")
         if not 0 < self.timestep < np.inf:
             raise ValueError(f"timestep={self.timestep} of {self.name!r} must be positive.")
         if not self.carried_by:
@@ -128,8 +128,10 @@ class JointChain:
 
     @property
     def edge_action(self) -> np.ndarray:
-        """``[E, C]`` commands at each edge's joint."""
-        return np.repeat(np.array(self.commands, dtype=np.int64).reshape(self.num_joints, -1), 2, axis=0)
+        """``[E, C]`` commands at each edge's joint, C the most that a joint has (or 1); -1 where one has fewer."""
+        most = max(1, *map(len, self.commands))
+        padded = [[*indices, *[-1] * (most - len(indices))] for indices in self.commands]
+        return np.repeat(np.array(padded, dtype=np.int64), 2, axis=0)
 
     @property
     def live(self) -> np.ndarray:

@@ -1,0 +1,172 @@
+"""Trajectories of robot logs: what ends them, and where steps fall between rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_gn.data import RobotLog, load_robot_log, log_chain, log_trajectories
+
+STEP = 0.01
+
+
+def turning_log(time: np.ndarray, *, joints: int = 2, commands: int = 2, length=None) -> RobotLog:
+    """Joints that turn over and over, each at its rate; velocities and loads that are linear; commands of each row."""
+    rate = 4.0 + np.arange(joints)
+    angle = (time[:, None] * rate + np.pi) % (2 * np.pi) - np.pi
+    velocity = np.broadcast_to(rate, angle.shape) + 0.1 * time[:, None]
+    command = np.random.default_rng(0).normal(size=(len(time), commands))
+    length = np.array([len(time)] if length is None else length)
+    return RobotLog(angle, velocity, command, length, STEP, {"load": time[:, None] * rate}, time)
+
+
+def test_rows_that_are_missing_end_a_trajectory(tmp_path):
+    # A swing, a pause, and a swing; commands tell their row.
+    time = np.arange(500) * STEP
+    phase = np.r_[np.arange(150), np.full(200, 150), np.arange(150, 300)] * STEP * 10
+    moves = np.r_[np.ones(150), np.zeros(200), np.ones(150)]
+    table = np.column_stack((time, np.sin(phase), 10 * moves * np.cos(phase), np.arange(500)))
+    table = np.delete(table, [60, *range(200, 280)], axis=0)  # mid-motion, and in the pause
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="time,angle,velocity,command", comments="")
+    read = load_robot_log(tmp_path / "log.csv")
+    trajectories, report = log_trajectories(read, 10)
+    assert read.timestep == pytest.approx(STEP)
+    assert report.gaps == ((0, 59), (0, 198)) and report.jumps == () and not report.interpolated
+    assert "cut at 2 gaps, the first at row 59 of episode 0" in str(report)
+    assert trajectories["action"].diff(dim=1).eq(1).all()  # none has rows on both sides
+    unstamped = load_robot_log(tmp_path / "log.csv", timestep=STEP, names={"time": ""})
+    trajectories, report = log_trajectories(unstamped, 10)
+    assert report.gaps is None and "no time stamps" in str(report)
+    assert not trajectories["action"].diff(dim=1).eq(1).all()
+
+
+def test_times_that_are_not_later_end_a_trajectory(tmp_path):
+    time = np.r_[np.arange(40), np.arange(30), 29, np.arange(30, 59)] * STEP  # begins anew; one twice
+    log = turning_log(np.arange(100) * STEP)
+    np.savez(tmp_path / "log.npz", angle=log.angle, velocity=log.velocity, command=log.command, time=time)
+    read = load_robot_log(tmp_path / "log.npz")
+    assert log_trajectories(read, 20)[1].gaps == ((0, 39), (0, 69))
+    # Where an episode ends time may do what it likes.
+    ended = RobotLog(read.angle, read.velocity, read.command, np.array([40, 60]), STEP, {}, time)
+    assert log_trajectories(ended, 20)[1].gaps == ((1, 29),) and ended.gaps.sum() == 1
+
+
+def test_a_row_without_a_time_is_dropped():
+    log = turning_log(np.arange(60) * STEP)
+    assert log.time is not None
+    log.time[30] = np.nan
+    _, report = log_trajectories(log, 29)
+    assert (report.not_finite, report.gaps, report.trajectories) == (1, (), 1)
+
+
+@pytest.mark.parametrize("every", [1, 2, 7, 10])  # 0.07 is not 7 of 0.01
+@pytest.mark.parametrize("commands", [1, 3])
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_multiple_of_the_step_keeps_rows_as_they_are(every, commands, stamped):
+    log = turning_log(np.arange(100) * STEP, commands=commands)
+    if not stamped:
+        log = RobotLog(log.angle, log.velocity, log.command, log.length, STEP, log.extra)
+    trajectories, report = log_trajectories(log, 9, resample=every * STEP)
+    count = (99 // every) // 9 * 9
+    for index, channel in enumerate((np.cos(log.angle), np.sin(log.angle), log.velocity, log.extra["load"])):
+        rows = torch.from_numpy(channel[: count * every : every]).unflatten(0, (-1, 9))
+        assert torch.equal(trajectories["state"][:, :-1, 1:, index], rows)
+    mean = log.command[: count * every].reshape(count, every, commands).mean(1)
+    assert torch.equal(trajectories["action"].flatten(0, 1), torch.from_numpy(mean))
+    assert not report.interpolated and report.timestep == pytest.approx(every * STEP)
+
+
+def held(log: RobotLog, begin: float, end: float) -> np.ndarray:
+    """Mean of the commands in force between two times, by brute force."""
+    assert log.time is not None
+    moments = begin + (np.arange(20_000) + 0.5) / 20_000 * (end - begin)
+    return log.command[np.searchsorted(log.time, moments, side="right") - 1].mean(0)
+
+
+@pytest.mark.parametrize("step", [0.4, 1.5, 2.7])
+@pytest.mark.parametrize("even", [True, False])
+def test_steps_between_rows_are_interpolated(step, even):
+    time = np.arange(200) * STEP
+    if not even:
+        time[1:-1] += STEP * np.random.default_rng(1).uniform(-0.2, 0.2, 198)
+    log = turning_log(time)
+    trajectories, report = log_trajectories(log, 30, resample=step * STEP)
+    state, action = trajectories["state"][0], trajectories["action"][0]
+    assert report.interpolated and f"at steps of {10 * step:g} ms" in str(report)
+    moments = torch.arange(31, dtype=torch.float64)[:, None] * step * STEP
+    rate = torch.tensor([4.0, 5.0], dtype=torch.float64)
+    torch.testing.assert_close(state[:, 1:, 0], (moments * rate).cos())
+    torch.testing.assert_close(state[:, 1:, 1], (moments * rate).sin())
+    torch.testing.assert_close(state[:, 1:, 2], rate + 0.1 * moments)
+    torch.testing.assert_close(state[:, 1:, 3], moments * rate)
+    for index in (0, 7, 29):
+        mean = held(log, index * step * STEP, (index + 1) * step * STEP)
+        np.testing.assert_allclose(action[index], mean, atol=1e-3)
+
+
+def test_rows_that_are_not_even_are_put_on_even_steps():
+    time = (np.arange(100) + np.random.default_rng(0).uniform(-0.2, 0.2, 100)) * STEP
+    log = turning_log(time)
+    trajectories, report = log_trajectories(log, 40)
+    moments = time[0] + torch.arange(41, dtype=torch.float64) * STEP
+    torch.testing.assert_close(trajectories["state"][0, :, 1, 0], (4 * moments).cos())
+    assert report.interpolated and report.timestep == STEP and report.gaps == ()
+
+
+def test_a_jump_between_uneven_rows_is_seen():
+    time = (np.arange(100) + np.random.default_rng(0).uniform(-0.2, 0.2, 100)) * STEP
+    log = turning_log(time)
+    log.angle[50:] += 0.3  # no more than uneven rows would hide if they were taken for even
+    assert log_trajectories(log, 40)[1].jumps == ((0, 49),)
+
+
+def test_the_last_row_is_a_step_in_spite_of_rounding():
+    log, step = turning_log(np.arange(10) * STEP), 9 * 0.001
+    assert 9 / (step / STEP) < 10
+    trajectories, report = log_trajectories(log, 10, resample=step)
+    torch.testing.assert_close(trajectories["state"][0, -1, 1, 0], torch.tensor(np.cos(log.angle[9, 0])))
+    assert report.short == 0
+
+
+def test_nothing_is_interpolated_across_a_break():
+    # The angle is what the piece is of: 0 before a jump, 2 behind it, 0.3 behind a gap, and 1 in the next episode.
+    angle = np.repeat([0.0, 2.0, 0.3, 1.0], 25)[:, None]
+    time = np.r_[np.arange(50), np.arange(60, 85), np.arange(25)] * STEP
+    log = RobotLog(angle, 0.0 * angle, angle, np.array([75, 25]), STEP, {}, time)
+    trajectories, report = log_trajectories(log, 7, resample=1.5 * STEP, overlap=True)
+    assert (report.jumps, report.gaps) == (((0, 24),), ((0, 49),))
+    cosine = trajectories["state"][:, :, 1, 0]
+    assert torch.equal(cosine, cosine[:, :1].expand(-1, 8))
+    assert set(trajectories["action"].unique().tolist()) == {0.0, 2.0, 0.3, 1.0}
+    torch.testing.assert_close(cosine[:, :7], trajectories["action"][..., 0].cos())
+
+
+def test_a_delay_is_in_rows_whatever_the_step():
+    log = turning_log(np.arange(60) * STEP)
+    late, _ = log_trajectories(log, 10, resample=1.5 * STEP, lag=4)
+    torch.testing.assert_close(late["state"][0, 0, 1, 0], torch.tensor(np.cos(log.angle[4, 0])))
+    np.testing.assert_allclose(late["action"][0, 0], (log.command[0] + log.command[1] / 2) / 1.5)
+
+
+def test_a_step_that_is_none_is_refused():
+    for step in (0.0, -0.01, np.nan, np.inf):
+        with pytest.raises(ValueError, match="resample="):
+            log_trajectories(turning_log(np.arange(60) * STEP), 10, resample=step)
+
+
+def test_where_nothing_is_left_the_report_says_why():
+    log = turning_log(np.r_[np.arange(10), np.arange(20, 30)] * STEP)
+    with pytest.raises(
+        ValueError, match="No piece of the log has 15 transitions of 10 ms; take fewer.\n.*\n.*\n.* 1 gaps"
+    ):
+        log_trajectories(log, 15)
+
+
+def test_a_command_that_never_varies_is_named():
+    log = turning_log(np.arange(60) * STEP)
+    log.command[:, 1] = 3.0
+    report = log_trajectories(log, 10)[1]
+    assert report.constant == (1,) and "commands that never vary: 1;" in str(report)
+    chain = log_chain(log, "arm")
+    assert chain.action_low[1] == chain.action_high[1] == 3 and chain.action_low[0] < chain.action_high[0]

@@ -1,0 +1,103 @@
+"""Forward models of a robot's logs, as a user trains them: of any robot, from options alone."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_gn.data import simulate_log
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import load_checkpoint
+
+SMALL = (
+    "minutes=null",
+    "steps=2",
+    "length=12",
+    "warm_up=4",
+    "validation_steps=6",
+    "unroll_steps=3",
+    "batch_size=16",
+    "sequence_batch_size=4",
+    "model={memory: [4, 4, 4], latent: 8, edge_hidden: [8], node_hidden: [8], global_hidden: [8]}",
+)
+
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "real_robot.py"
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    spec = importlib.util.spec_from_file_location("recipe_real_robot", RECIPE)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory):
+    """One episode of a double pendulum with one motor."""
+    log = simulate_log(load_scene("acrobot"), 1, 400, 0)
+    path = tmp_path_factory.mktemp("log") / "double.npz"
+    time = np.arange(len(log.angle)) * log.timestep
+    np.savez(path, q=log.angle, dq=log.velocity, u=log.command, time=time, motor=np.array(2))
+    return path
+
+
+def test_a_double_pendulum_needs_options_alone(pendulum, call, tmp_path):
+    names, run = "names={angle: q, velocity: dq, command: u}", tmp_path / "run"
+    code, output, errors = call(f"log={pendulum}", names, f"run_dir={run}", *SMALL, recipe="real_robot")
+    assert code != 0 and "commands=[[0], []]" in output + errors
+    options = (f"log={pendulum}", names, "commands=[[0], []]", f"run_dir={run}", *SMALL)
+    code, output, errors = call(*options, recipe="real_robot")
+    assert code == 0, errors
+    assert "1 episodes are too few" in output and "cut at 0 gaps" in output and "not read: 'motor'" in output
+    # 398 transitions are 33 trajectories.
+    assert "validation: 1 trajectories, test: 3 trajectories, train: 29 trajectories" in output
+    chain = load_checkpoint(run / "recurrent").scene()
+    assert chain.num_actions == 1 and chain.edge_action[:, 0].tolist() == [0, 0, -1, -1]
+    before = (run / "config.yaml").read_text()
+    # Other options, with which the folder must stay as it is: of the first model, and of one that was not begun.
+    (run / "feed-forward" / "checkpoint" / "checkpoint.safetensors").unlink()
+    code, output, errors = call(*options, "lr=0.5", recipe="real_robot")
+    assert code != 0 and "lr=0.5 (was None)" in output + errors
+    assert (run / "config.yaml").read_text() == before and not any((run / "feed-forward" / "checkpoint").iterdir())
+
+
+def test_a_robot_without_motors_at_other_steps(pendulum, call, tmp_path):
+    names = "names={angle: q, velocity: dq, command: '', u: ''}"
+    run = tmp_path / "run"
+    code, output, errors = call(
+        f"log={pendulum}", names, "resample=0.015", f"run_dir={run}", *SMALL, recipe="real_robot"
+    )
+    assert code == 0, errors
+    assert "0 commands, step 15 ms" in output and "interpolated between rows, at steps of 15 ms" in output
+
+
+@pytest.mark.parametrize(
+    ("share", "episodes"), [("{validation: 0.4, test: 0.4}", 5), ("{validation: 0.2, test: 0.2}", 4)]
+)
+def test_episodes_stay_whole_where_there_are_enough(share, episodes, recipe):
+    log = simulate_log(load_scene("acrobot"), episodes, 62, 0)
+    cfg = OmegaConf.create(
+        {"length": 10, "resample": None, "lag": 0, "jump": 50.0, "data_seed": 0, "share": OmegaConf.create(share)}
+    )
+    parts = recipe.split(cfg, log)
+    which = {part: set(data["episode"].tolist()) for part, data in parts.items()}
+    if episodes == 5:
+        assert sorted(map(len, which.values())) == [1, 2, 2] and set.union(*which.values()) == set(range(5))
+    else:  # 24 trajectories in time: of the first episodes to train with, of the last to test
+        assert {part: len(data) for part, data in parts.items()} == {"validation": 4, "test": 4, "train": 16}
+        assert which == {"train": {0, 1, 2}, "validation": {2, 3}, "test": {3}}
+
+
+def test_shares_that_leave_nothing_are_refused(recipe):
+    log = simulate_log(load_scene("acrobot"), 1, 62, 0)
+    for share in ({"validation": 0.6, "test": 0.6}, {"validation": 0.0, "test": 0.5}):
+        cfg = OmegaConf.create({"length": 10, "resample": None, "lag": 0, "jump": 50.0, "data_seed": 0, "share": share})
+        with pytest.raises(ValueError, match="1 episodes cannot be split by share="):
+            recipe.split(cfg, log)

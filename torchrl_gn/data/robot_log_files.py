@@ -1,0 +1,177 @@
+"""Reading robot logs from .npz and .csv files."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from torchrl_gn.data.errors import DatasetError
+from torchrl_gn.data.robot_log import RobotLog
+
+_Arrays = dict[str, np.ndarray]
+
+
+def load_robot_log(
+    path: str | os.PathLike, *, timestep: float | None = None, names: Mapping[str, str] | None = None
+) -> RobotLog:
+    """Read a log of joint angles, velocities and commands.
+
+    ``.npz`` with arrays ``angle`` ``[R, J]``, ``velocity`` ``[R, J]``, ``command`` ``[R, A]`` (of one joint or command
+    also ``[R]``), and possibly
+
+    - ``length`` ``[episodes]`` (rows of each), or ``episode`` ``[R]`` (a new one begins where it changes); by default
+      all rows are one episode,
+    - ``time`` ``[R]`` (time stamps, seconds), or ``timestep`` (seconds between rows),
+    - extra channels ``[R, J]`` under any other name (of one joint also ``[R]``), or ``[R, k J]``, which become
+      ``name0``, ``name1``, ... with the ``k`` numbers of a joint side by side.
+
+    ``.csv`` with a header: columns ``angle0``, ``angle1``, ..., ``velocity0``, ..., ``command0``, ..., extra channels
+    likewise, and possibly ``episode`` and ``time``.
+
+    Other arrays are not read, and listed in :attr:`RobotLog.unread`.
+
+    Args:
+        path: the file.
+        timestep: time between rows, seconds, where the file does not say it.
+        names: what the file calls things, by what they are called here: ``{"angle": "q", "velocity": "dq"}``; map
+            what is to be left out to ``""``. ``{"command": ""}``: a robot without motors.
+
+    Raises:
+        DatasetError: if the file is missing, of another kind, lacks something, contradicts itself or ``timestep``, or
+            shapes do not fit.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DatasetError(f"No robot log at {path}.")
+    if path.suffix not in (".npz", ".csv"):
+        raise DatasetError(f"{path}: a robot log is a .npz or .csv file.")
+    try:
+        arrays = _read_npz(path) if path.suffix == ".npz" else _read_csv(path)
+    except (ValueError, OSError, KeyError, EOFError, BadZipFile) as error:
+        raise DatasetError(f"{path} cannot be read as a robot log: {error}") from error
+    names = dict(names or {})
+    arrays, unread = _renamed(arrays, names, path)
+    passive = "command" in names and not names["command"]
+    needed = ("angle", "velocity") if passive else ("angle", "velocity", "command")
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        raise DatasetError(
+            f"{path} lacks {missing}; it has {sorted(arrays)}. Say what they are called with names={{...}}; of a robot"
+            ' without motors, names={command: ""}.'
+        )
+    if passive:
+        arrays["command"] = np.zeros((len(arrays["angle"]), 0))
+    angle, velocity, command = (_columns(arrays.pop(name)) for name in ("angle", "velocity", "command"))
+    if angle.ndim != 2 or velocity.shape != angle.shape or command.ndim != 2 or len(command) != len(angle):
+        raise DatasetError(
+            f"{path}: angle {angle.shape}, velocity {velocity.shape} and command {command.shape} do not fit."
+        )
+    length, time = _length(arrays, len(angle), path), _of_every_row(arrays, "time", len(angle), number=True)
+    timestep = _timestep(arrays.pop("timestep", None), time, length, timestep, path)
+    extra, more = _extras(arrays, angle.shape, path)
+    return RobotLog(angle, velocity, command, length, timestep, extra, time, unread | more)
+
+
+def _read_npz(path: Path) -> _Arrays:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def _read_csv(path: Path) -> _Arrays:
+    with path.open() as file:
+        header = [name.strip() for name in file.readline().split(",")]
+    table = np.atleast_2d(np.loadtxt(path, delimiter=",", skiprows=1, dtype=np.float64))
+    if table.shape[1] != len(header):
+        raise ValueError(f"{len(header)} names for {table.shape[1]} columns")
+    columns: dict[str, list[tuple[int, int]]] = {}
+    for index, name in enumerate(header):
+        base, number = re.fullmatch(r"(.*?)(\d*)", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        columns.setdefault(base, []).append((int(number or 0), index))
+    return {base: table[:, [index for _, index in sorted(entries)]] for base, entries in columns.items()}
+
+
+def _renamed(arrays: _Arrays, names: Mapping[str, str], path: Path) -> tuple[_Arrays, dict[str, str]]:
+    """Arrays as they are called here, and those that another one took the name of."""
+    for here, there in names.items():
+        if there and there not in arrays:
+            raise DatasetError(f"{path} has no {there!r} (for {here!r}); it has {sorted(arrays)}.")
+    taken = {here: arrays[there] for here, there in names.items() if there}
+    rest = {name: values for name, values in arrays.items() if name not in names.values()}
+    unread = {name: f"{names[name]!r} was named for it" for name in rest if names.get(name)}
+    return {name: values for name, values in rest.items() if name not in names} | taken, unread
+
+
+def _columns(values: np.ndarray) -> np.ndarray:
+    return (values[:, None] if values.ndim == 1 else values).astype(np.float64)
+
+
+def _of_every_row(arrays: _Arrays, name: str, rows: int, *, number: bool) -> np.ndarray | None:
+    """Take out an array ``[R]``; one that is something else stays, to be listed as not read."""
+    values = arrays.get(name, np.zeros(0))
+    if values.shape not in ((rows,), (rows, 1)) or (number and not np.issubdtype(values.dtype, np.number)):
+        return None
+    values = arrays.pop(name).reshape(rows)
+    return values.astype(np.float64) if number else values
+
+
+def _length(arrays: _Arrays, rows: int, path: Path) -> np.ndarray:
+    """Rows of each episode."""
+    episode = _of_every_row(arrays, "episode", rows, number=False)
+    begins = [0] if episode is None else np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
+    length = np.atleast_1d(arrays.pop("length", np.diff(np.r_[begins, rows]))).astype(np.int64)
+    if length.sum() != rows or (length < 1).any():
+        raise DatasetError(f"{path}: length adds up to {length.sum()} rows, but there are {rows}.")
+    return length
+
+
+def _timestep(
+    own: np.ndarray | None, time: np.ndarray | None, length: np.ndarray, given: float | None, path: Path
+) -> float:
+    """Seconds between rows, which file, time stamps and caller must agree about."""
+    steps = np.zeros(0)
+    if time is not None:
+        steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)  # within episodes
+        steps = steps[steps > 0]
+    said = {
+        "timestep=": given,
+        "its timestep": None if own is None else float(np.median(own)),
+        "its time stamps": float(np.median(steps)) if len(steps) else None,
+    }
+    said = {who: step for who, step in said.items() if step is not None}
+    if not said or not all(0 < step < np.inf for step in said.values()):
+        raise DatasetError(f"{path} does not say its time step; give timestep=SECONDS.")
+    if max(said.values()) > 1.01 * min(said.values()):
+        raise DatasetError(
+            f"{path}: seconds between rows are {' but '.join(f'{step:g} ({who})' for who, step in said.items())}; leave"
+            ' what is wrong out, with names={time: ""} or names={timestep: ""}. For other steps than the log\'s own,'
+            " resample= its trajectories."
+        )
+    return next(iter(said.values()))
+
+
+def _extras(arrays: _Arrays, shape: tuple[int, int], path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Further channels of every joint, and why other arrays are none."""
+    extra, unread, (rows, joints) = {}, {}, shape
+    for name, values in arrays.items():
+        if joints == 1 and values.shape == (rows,):
+            values = values[:, None]
+        if not np.issubdtype(values.dtype, np.number):
+            unread[name] = "not numbers"
+            continue
+        if values.ndim != 2 or len(values) != rows:
+            unread[name] = f"of shape {list(values.shape)} and not {[rows, joints]}"
+            continue
+        count, rest = divmod(values.shape[1], joints)
+        if rest:
+            raise DatasetError(
+                f"{path}: {name!r} has {values.shape[1]} columns, which is no multiple of the {joints} joints;"
+                f' leave it out with names={{{name!r}: ""}}.'
+            )
+        for index in range(count):
+            extra[name if count == 1 else f"{name}{index}"] = values[:, index::count].astype(np.float64)
+    return extra, unread
