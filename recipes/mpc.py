@@ -10,9 +10,13 @@ checkpoint of an inference model first identifies the system from random control
 variant of the system in every episode, with a checkpoint that was trained on such (those that come with the package
 identify pendulums and cheetahs). What was played is kept: the same `run_dir` goes on, with more steps or planners too.
 
+Where MuJoCo's simulation becomes unstable an episode is over: its states and rewards are NaN from there on and count in
+no number, and the table says of how many episodes. With a recurrent model only gn remembers what was played; cem and
+mppi plan as if nothing had been.
+
 Leaves config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
-a video of the first episode, beside what the plan said before (<planner>.gif). All options: recipes/config/mpc.yaml.
-What came out: docs/results.md.
+a video of the first episode (<planner>.gif), with gn and ilqg beside what the plan said a horizon before, if it is
+longer than that. All options: recipes/config/mpc.yaml. What came out: docs/results.md.
 """
 
 from __future__ import annotations
@@ -36,19 +40,21 @@ from torchrl.modules import CEMPlanner, MPPIPlanner
 from tqdm import tqdm
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.data import Simulator, sample_start_states, spline_controls
+from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states, spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards, rollout_video
-from torchrl_gn.modules import IdentifyingModel, specialize
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner
+from torchrl_gn.modules import BoundForwardModel, IdentifyingModel, specialize
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo
+from torchrl_gn.planners.plan import check_count
 from torchrl_gn.pretrained import load_model, pretrained_names
 from torchrl_gn.rewards import FixTask, Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
-from torchrl_gn.training import RunFolder, Tracker, clean_exit
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 
 ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
 SAVE_SECONDS = 60
-MAY_CHANGE = ("planner", "steps", "compile", "threads", "video", "logger", "run_dir")  # when a run goes on
+# Options that may be others when a run goes on.
+MAY_CHANGE = ("planner", "steps", "compile", "threads", "simulation_threads", "video", "logger", "run_dir")
 
 
 class RandomControl(TensorDictModuleBase):
@@ -65,21 +71,6 @@ class RandomControl(TensorDictModuleBase):
         action = self.controls[:, self.step].float()
         self.step += 1
         return tensordict.set("action", action)
-
-
-class ReturnToGo(TensorDictModuleBase):
-    """Scores sequences ``[*B, K, H]`` for MPPI: returns from each step on, in their spread over the candidates."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.in_keys: list[NestedKey] = [("next", "reward")]
-        self.out_keys: list[NestedKey] = ["advantage"]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        reward = cast(Tensor, tensordict.get(("next", "reward")))
-        returns = reward.flip(-2).cumsum(-2).flip(-2)
-        best, spread = returns.amax(-3, keepdim=True), returns.std(-3, keepdim=True)
-        return tensordict.set("advantage", (returns - best) / spread.clamp(min=1e-12))
 
 
 class Episodes:
@@ -113,6 +104,11 @@ class Episodes:
             return torch.zeros(0)
         return torch.stack(record, dim=0 if name in ("seconds", "foreseen") else 1)
 
+    @property
+    def over(self) -> Tensor:
+        """Which episodes ``[B]`` ended early, as their simulation became unstable."""
+        return self.records["state"][-1].isnan().flatten(1).any(1)
+
     def save(self) -> None:
         """Write everything, atomically."""
         if not len(self):
@@ -130,9 +126,15 @@ def options(cfg: DictConfig) -> dict[str, Any]:
 
 
 def fill_in(cfg: DictConfig) -> None:
-    """The paper's task of the system, where options are left open."""
+    """The paper's task of the system, where options are left open; refuses what is none."""
     name = re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system
-    task = cfg.tasks.get(name, {"rewards": [None], "horizon": None, "steps": 200})
+    if name not in cfg.tasks:
+        raise ValueError(
+            f"{cfg.system!r} is no system of the paper; this recipe has rewards of {list(cfg.tasks)} alone. With a"
+            " reward and a model of your own it takes a few lines of Python: 'Plan with a model of your own' in"
+            " docs/planning.md and docs/guides/write-a-reward.md."
+        )
+    task = cfg.tasks[name]
     defaults = [
         (cfg, "reward", task["rewards"][0]),
         (cfg, "horizon", task["horizon"]),
@@ -140,9 +142,10 @@ def fill_in(cfg: DictConfig) -> None:
         (cfg.gn, "iterations", task.get("iterations", 3)),
     ]
     for part, key, value in defaults:
-        if part[key] is None and value is None:
-            raise ValueError(f"{cfg.system!r} is no system of the paper; those with rewards are {list(cfg.tasks)}.")
-        part[key] = value if part[key] is None else part[key]
+        if part[key] is None:
+            part[key] = value
+    for key in ("horizon", "steps", "episodes", "phase", "threads"):
+        check_count(key, cfg[key], 1)
     with open_dict(cfg):  # what other systems get is none of this run's business
         del cfg.tasks
     if not isinstance(cfg.planner, ListConfig):
@@ -173,11 +176,21 @@ def bind_model(cfg: DictConfig, scene: Scene):
     checkpoint = load_model(cfg.checkpoint or names[0])
     if isinstance(checkpoint.trained, IdentifyingModel):
         bound, inference = checkpoint.trained.bind(scene)
-        return specialize(bound, compile=cfg.compile), inference
+        return made_quick(bound, cfg.compile), inference
     if cfg.variants and not checkpoint.config.get("parametrized"):
         raise ValueError("The model was trained on one system, not on variants: give checkpoint=PATH of one that was.")
     bound = checkpoint.model.bind(scene, static_key="static" if cfg.variants else None)
-    return specialize(bound, compile=cfg.compile), None
+    return made_quick(bound, cfg.compile), None
+
+
+def made_quick(bound: BoundForwardModel, compile: bool) -> BoundForwardModel:
+    """The model specialised, or as it is where it has a core that cannot be."""
+    try:
+        return specialize(bound, compile=compile)
+    except TypeError:
+        core = bound.model.options["core"]
+        print(f"Planning through the bound model, more slowly: core={core} can be neither specialised nor compiled.")
+        return bound
 
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:
@@ -220,6 +233,12 @@ def begin(cfg: DictConfig, env: SceneEnv, bound, inference) -> TensorDictBase:
     if inference is not None:
         controls = torch.from_numpy(spline_controls(env.scene, cfg.episodes, cfg.phase, cfg.seed + 1))
         simulated = env.simulator.rollout(now["physics"], controls)  # its scenes in turn, as reset has them
+        unstable = int((~simulated["stable"]).sum())
+        if unstable:
+            raise UnstableSimulationError(
+                f"{unstable} of {cfg.episodes} simulations became unstable under the {cfg.phase} random controls that a"
+                " system is identified from; try another seed, or a shorter phase."
+            )
         now.update({key: simulated[key][:, -1] for key in ("state", "physics")})
         with torch.no_grad():
             now["static"] = inference.identify(simulated["state"], controls)
@@ -237,16 +256,19 @@ def play(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv |
                 started = time.perf_counter()
                 now = policy(played.now.copy())
                 seconds = time.perf_counter() - started
-                if name == "gn" and imagined is not None:
-                    played.records["foreseen"].append(foresee(imagined, now))
+                if name in ("gn", "ilqg"):
+                    played.records["foreseen"].append(foresee(env, imagined if name == "gn" else None, now))
                 stepped = env.step(now)
                 played.now = stepped.exclude("next", "action", "done", "terminated")
                 played.now.update(stepped["next"].exclude("reward", "done", "terminated"))
-                reward = stepped["next", "reward"].squeeze(-1)
-                for key, value in (("state", played.now["state"]), ("action", now["action"]), ("reward", reward)):
+                # Such a simulation goes on from its last good state, but only for the others to be stepped beside it.
+                over = stepped["next", "terminated"].squeeze(-1) | played.over
+                reward = stepped["next", "reward"].squeeze(-1).masked_fill(over, torch.nan)
+                state = played.now["state"].masked_fill(over[:, None, None], torch.nan)
+                for key, value in (("state", state), ("action", now["action"]), ("reward", reward)):
                     played.records[key].append(value)
                 played.records["seconds"].append(torch.tensor(seconds))
-                bar.set_postfix(reward=f"{float(reward.mean()):.3g}", refresh=False)
+                bar.set_postfix(reward=f"{float(reward.nanmean()):.3g}", refresh=False)
                 bar.update()
                 if time.monotonic() - last > SAVE_SECONDS:
                     played.save()
@@ -255,10 +277,15 @@ def play(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv |
         played.save()
 
 
-def foresee(imagined: ModelEnv, now: TensorDictBase) -> Tensor:
-    """The last state of the first episode's plan."""
+def foresee(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase) -> Tensor:
+    """The last state of the first episode's plan, imagined or, without a model, simulated."""
+    left = cast(Tensor, now["plan", "actions"])
+    left = left if left.ndim == 3 else left[:, 0]  # of candidates the best
+    actions = torch.cat((now["action"].unsqueeze(1), left[:, :-1]), dim=1)
+    if imagined is None:
+        ahead = env.simulator.rollout(now["physics"][:1], actions[:1])
+        return ahead["state"][0, -1].where(ahead["stable"][0], torch.nan)
     # All episodes, as the planner has them: a compiled model is compiled for every number of rows.
-    actions = torch.cat((now["action"].unsqueeze(1), cast(Tensor, now["plan", "actions"])[:, 0, :-1]), dim=1)
     return imagined.imagine(now, actions)[0][0, -1].detach()
 
 
@@ -268,6 +295,29 @@ def distance_left(played: Episodes, target: Tensor) -> Tensor:
     return away[:, 1] / away[:, 0]
 
 
+def summarize(cfg: DictConfig, played: Episodes, target: Tensor | None) -> dict[str, float]:
+    """Numbers of a planner's episodes; ``target`` of those that have a place to get to."""
+    rewards, seconds = played["reward"], played["seconds"]
+    of = {
+        "mean_reward": rewards.nanmean().item(),
+        "mean_reward_std": spread(rewards.nanmean(1)),
+        "last_tenth_reward": rewards[:, -max(1, cfg.steps // 10) :].nanmean().item(),
+        "unstable": played.over.sum().item(),
+        "planning_ms": 1e3 * seconds.median().item(),
+        "planning_ms_first": 1e3 * seconds[0].item(),
+    }
+    if target is not None:
+        left = distance_left(played, target)
+        of |= {"distance_left": left.nanmean().item(), "distance_left_std": spread(left)}
+    return of
+
+
+def spread(values: Tensor) -> float:
+    """Standard deviation of those that are numbers."""
+    return (values - values.nanmean()).square().nanmean().sqrt().item()
+
+
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="mpc")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -276,7 +326,7 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     scene, scenes = make_scenes(cfg)
     reward = make_reward(cfg.reward, scene)
-    env = SceneEnv(scenes, reward, seed=cfg.seed)
+    env = SceneEnv(scenes, reward, num_threads=cfg.simulation_threads, seed=cfg.seed)
     bound, inference = bind_model(cfg, scene) if set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint else (None, None)
     imagined = None if bound is None else ModelEnv(bound, reward)
     run = RunFolder(cfg.run_dir, "mpc")
@@ -284,14 +334,14 @@ def main(cfg: DictConfig) -> None:
         before = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.load(run.path / "config.yaml")))
         run.refuse_changes(before, options(cfg), free=MAY_CHANGE)
     run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"mpc-{scene.name}-{cfg.reward}", config=options(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"mpc-{scene.name}-{cfg.reward}", config=cfg)
     start = begin(cfg, env, bound, inference)
     target = draw_targets(cfg, reward, scene, start["state"])
     if target is not None:
         start["target"] = target
 
     metrics: dict[str, Any] = {"horizon": cfg.horizon, "steps": cfg.steps, "episodes": cfg.episodes}
-    rows = [["planner", "mean reward", "spread", "last tenth", "way left", "ms a step"]]
+    rows = [["planner", "mean reward", "spread", "last tenth", "way left", "became unstable", "ms a step"]]
     curves: dict[str, Tensor] = {}
     for name in cfg.planner:
         played = Episodes(run.file(f"{name}.safetensors"), start.copy())
@@ -300,31 +350,18 @@ def main(cfg: DictConfig) -> None:
         planner = make_planner(name, cfg, env, imagined, len(played))
         policy = planner if target is None else TensorDictSequential([FixTask(reward), planner])
         play(cfg, name, policy, env, imagined, played)
-        rewards, seconds = played["reward"], played["seconds"]
-        last = rewards[:, -max(1, cfg.steps // 10) :].mean()
-        of = {
-            "mean_reward": rewards.mean().item(),
-            "mean_reward_std": rewards.mean(1).std(correction=0).item(),
-            "last_tenth_reward": last.item(),
-            "planning_ms": 1e3 * seconds.median().item(),
-            "planning_ms_first": 1e3 * seconds[0].item(),
-        }
-        if target is not None and reward.target_shape == (3,):
-            left = distance_left(played, target)
-            of |= {"distance_left": left.mean().item(), "distance_left_std": left.std(correction=0).item()}
+        of = summarize(cfg, played, target if reward.target_shape == (3,) else None)
         metrics |= {f"{name}/{key}": value for key, value in of.items()}
         left_text = f"{100 * of['distance_left']:.0f} %" if "distance_left" in of else ""
         numbers = [f"{of[key]:.4g}" for key in ("mean_reward", "mean_reward_std", "last_tenth_reward")]
-        rows.append([name, *numbers, left_text, f"{of['planning_ms']:.0f}"])
-        curves[name] = rewards
-        tracker.log({f"{name}/{key}": value for key, value in of.items()}, len(played))
+        ended = f"{of['unstable']} of {cfg.episodes} episodes" if of["unstable"] else ""
+        rows.append([name, *numbers, left_text, ended, f"{of['planning_ms']:.0f}"])
+        curves[name] = played["reward"]
         if cfg.video:
             film(played, scenes[0], cfg, run.file(f"{name}.gif"))
-    run.write_metrics(metrics, seed=cfg.seed)
     plot_rewards(curves, run.file("rewards.png"), timestep=scene.timestep, ylabel=f"{cfg.reward} reward")
-    tracker.log_files(run.written)
-    tracker.close()
-    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]  # "way left" only where there is a way
+    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), run.written, cfg.steps)
+    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]  # only where there is something to say
     rows, widths = list(zip(*columns, strict=True)), [max(map(len, column)) for column in columns]
     for row in rows:
         print("  ".join(map(str.ljust, row, widths)).rstrip())
@@ -335,13 +372,11 @@ def main(cfg: DictConfig) -> None:
 def film(played: Episodes, scene: Scene, cfg: DictConfig, path: Path) -> None:
     """The first episode, beside what its plan foresaw a horizon ago."""
     states, foreseen = played["state"][0], played["foreseen"]
-    speed = min(1.0, scene.timestep / 0.01)
-    if len(foreseen) > cfg.horizon:
-        first = states[: cfg.horizon]
-        prediction = torch.cat((first, foreseen))[: len(states)]
-        rollout_video(scene, states, prediction, path, speed=speed, labels=("played", "planned a horizon before"))
-    else:
-        rollout_video(scene, states, None, path, speed=speed, labels=("played", ""))
+    states = states[states.isfinite().flatten(1).all(1)]  # until its simulation became unstable
+    speed, prediction = min(1.0, scene.timestep / 0.01), None
+    if len(played) == len(foreseen) and len(states) > cfg.horizon + 1:  # older runs kept no plans of ilqg
+        prediction = torch.cat((states[: cfg.horizon], foreseen))[: len(states)]
+    rollout_video(scene, states, prediction, path, speed=speed, labels=("played", "planned a horizon before"))
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from torchrl_gn.evaluation import (
     plot_errors,
     plot_learning_curves,
     plot_motions,
+    plot_rewards,
     plot_training_curve,
     summary,
 )
@@ -107,6 +108,16 @@ def test_training_curve_and_errors(tmp_path):
         ["constant", "prediction", "1.000", "1.000"],
         *([["b,", "rollout_error_100:", *row.split()[2:]] for row in rows[6:]]),
     ]
+
+
+def test_rewards_of_episodes_that_ended_early(tmp_path):
+    rewards = torch.rand(3, 50, generator=torch.Generator().manual_seed(0))
+    rewards[1, 20:] = rewards[:, 40:] = torch.nan
+    assert is_picture(plot_rewards({"a": rewards, "b": rewards + 1}, tmp_path / "rewards.png", timestep=0.1))
+    plot_rewards({"a": rewards[:, :40], "b": rewards[:, :40] + 1}, tmp_path / "same.png", timestep=0.1)
+    assert (tmp_path / "rewards.png").read_bytes() == (tmp_path / "same.png").read_bytes()
+    every = torch.full((2, 5), torch.nan)
+    assert is_picture(plot_rewards({"none": every}, tmp_path / "none.png", timestep=0.1))
 
 
 def test_learning_curves_of_one_or_several_seeds(tmp_path):

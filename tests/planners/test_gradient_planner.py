@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -254,49 +255,6 @@ def test_a_task_is_fixed_when_planning_starts():
     assert (played["next", "reward"] != 0).any()
 
 
-def test_a_recurrent_model_remembers_what_was_played():
-    scene = load_scene("pendulum")
-    bound = trained(scene, core="recurrent", memory=[4, 4, 4], **SMALL)
-    reward = make_reward("balance", scene)
-    planner = GradientPlanner(ModelEnv(bound, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
-    acted = SceneEnv(scene, reward, seed=0)
-    start = acted.reset(TensorDict(batch_size=[2]))
-    with pytest.raises(KeyError, match="make_tensordict_primer"):
-        acted.rollout(2, planner, tensordict=start.clone(), auto_reset=False)
-    primed = batched(acted, 2).append_transform(planner.make_tensordict_primer())
-    played = primed.rollout(4, planner)
-    _, memory = bound.observe(played["state"], played["action"])
-    for key, value in memory.items():
-        torch.testing.assert_close(played["next", "memory", key][:, -1], value)
-        assert (played["memory", key][:, 0] == 0).all()
-
-
-def test_what_an_inference_model_wrote_is_planned_with():
-    scene = load_scene("pendulum")
-    torch.manual_seed(0)
-    model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=[3, 3, 3], link=False, **SMALL).double()
-    bound = model.bind(scene, static_key="static")
-    seen = collect_trajectories(scene, 5, 20, seed=0)
-    bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
-    reward = make_reward("balance", scene)
-    special = specialize(bound)
-    planner = GradientPlanner(ModelEnv(special, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
-    start = SceneEnv(scene, reward, seed=0).reset(TensorDict(batch_size=[2]))
-    static = bound.own_static().expand(2).apply(torch.randn_like)
-    start["static"] = static
-    planner(start)
-    total = planner._imagine(start.select("state", "static"), torch.zeros(2, 1, 3, 1))
-    for row in range(2):
-        other = static.clone()
-        other["nodes"][1 - row] += 1
-        changed = planner._imagine(start.select("state").set("static", other), torch.zeros(2, 1, 3, 1))
-        assert changed[row] == pytest.approx(total[row].item(), rel=1e-6)
-        assert changed[1 - row] != pytest.approx(total[1 - row].item(), rel=1e-6)
-    folds = special._folds
-    planner(start)
-    assert special._folds - folds <= 2  # of the candidates' values, not of every iteration's
-
-
 def test_what_is_not_finite_keeps_the_last_good_plan_and_says_so():
     class Exploding(Point):
         def forward(self, tensordict):
@@ -319,6 +277,61 @@ def test_what_is_not_finite_keeps_the_last_good_plan_and_says_so():
     torch.testing.assert_close(action[1], plan[1, 0, 0])
 
 
+class Exploding(Point):
+    """Predicts a sideways velocity that is no number where it is pushed too hard, or everywhere."""
+
+    def __init__(self, scene, strongest: float):
+        super().__init__(scene)
+        self.strongest = strongest
+
+    def forward(self, tensordict):
+        out = super().forward(tensordict)
+        state = out["next", "state"].clone()
+        state[..., 1, 8] = torch.where(tensordict["action"][..., 0] > self.strongest, torch.nan, state[..., 1, 8])
+        return out.set(("next", "state"), state)
+
+
+@pytest.mark.parametrize("what", ["rewards", "predictions"])
+def test_a_plan_that_diverges_upwards_never_wins(what):
+    """Float32 rewards overflow to infinity, more than any other; and a reward may not see which body is lost."""
+
+    def strongest(state, action, next_state, task):
+        reward = action.double()
+        return torch.where(action > 1.5, 1e200, reward) if what == "rewards" else reward
+
+    model = Exploding(load_scene(POINT.replace("LIMIT", "2"), timestep=STEP), 1.5 if what == "predictions" else 9.0)
+    planner = GradientPlanner(ModelEnv(model, strongest), 4, 5, warm_up=60, candidates=2, samples=6, seed=0)
+    start = at(1.0, 0.5)
+    for _ in range(2):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            action = planner.planning(start)
+        assert (action <= 1.5).all() and 1.3 < start["plan", "actions"][:, 0].max() <= 1.5
+
+
+@pytest.mark.parametrize("reward", [quadratic, lambda *step: 1e200 * (1 + quadratic(*step).square())])
+def test_where_nothing_is_finite_a_first_plan_is_to_rest_and_the_next_is_kept(reward):
+    scene = load_scene(POINT.replace("LIMIT", "2"), timestep=STEP)
+    env = ModelEnv(Exploding(scene, -9.0) if reward is quadratic else Point(scene), reward)
+    planner = GradientPlanner(env, 4, 2, warm_up=5, candidates=2, samples=40, seed=0)
+    start = at(1.0, 0.5)
+    with pytest.warns(RuntimeWarning, match="of 2 of 2 states .* there is no plan yet, and nothing is done"):
+        assert (planner.planning(start) == 0).all()
+    assert (start["plan", "actions"][:, 0] == 0).all()
+    start["plan", "actions"][:, 0] = 0.25
+    with pytest.warns(RuntimeWarning, match="their last plan is kept"):
+        torch.testing.assert_close(planner.planning(start), torch.full((2, 1), 0.25))
+
+
+def test_equal_bounds_fix_an_action():
+    env = point_env(2.0)
+    env.world_model.scene = env.scene = replace(env.scene, action_low=np.array([1.5]), action_high=np.array([1.5]))
+    planner, start = GradientPlanner(env, 4, 2, warm_up=3, candidates=2, samples=4, action_cost=1.0, seed=0), at(1.0)
+    for _ in range(2):
+        assert planner.planning(start).item() == 1.5
+        assert (start["plan", "actions"] == 1.5).all()
+
+
 def test_gradients_are_opened_under_no_grad_and_refused_in_inference_mode():
     planner = GradientPlanner(point_env(2.0), 3, 1, warm_up=2, samples=2, seed=0)
     with torch.no_grad():
@@ -339,8 +352,12 @@ def test_bad_input_is_named():
         ({"horizon": 3, "iterations": 0}, "iterations must be at least 1"),
         ({"horizon": 3, "candidates": 0}, "candidates must be at least 1"),
         ({"horizon": 3, "candidates": 3, "samples": 2}, "samples must be at least candidates=3, got 2"),
-        ({"horizon": 3, "warm_up": -1}, "warm_up must not be negative"),
+        ({"horizon": 2.5}, "horizon must be a whole number, got 2.5"),
+        ({"horizon": 3, "samples": 4.0}, "samples must be a whole number"),
+        ({"horizon": 3, "warm_up": -1}, "warm_up must be at least 0"),
+        ({"horizon": 3, "warm_up": 2.5}, "warm_up must be a whole number"),
         ({"horizon": 3, "noise": 2.0}, "noise must be in"),
+        ({"horizon": 3, "action_cost": float("inf")}, "action_cost finite"),
     ):
         with pytest.raises(ValueError, match=message):
             GradientPlanner(env, **options)
@@ -348,6 +365,10 @@ def test_bad_input_is_named():
         GradientPlanner(SceneEnv(env.scene, quadratic), 3)
     with pytest.raises(ValueError, match="no reward to plan for"):
         GradientPlanner(ModelEnv(Point(env.scene)), 3)
+    crossed = point_env(2.0)
+    crossed.scene = replace(env.scene, action_high=np.array([-3.0]))
+    with pytest.raises(ValueError, match="action 0 between -2 and -3: action_low must not be above"):
+        GradientPlanner(crossed, 3)
     still = load_scene('<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
     with pytest.raises(ValueError, match="no actions to plan"):
         GradientPlanner(ModelEnv(Point(still), quadratic), 3)

@@ -7,19 +7,20 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.envs import ModelEnv, SceneEnv
-from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel
+from torchrl_gn.envs import ModelEnv, SceneEnv, batched
+from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, specialize
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.scene_values import SceneValues
 
+SMALL = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
 
-def trained(scene: Scene) -> BoundForwardModel:
+
+def trained(scene: Scene, **options) -> BoundForwardModel:
     """A small model with random weights and true statistics."""
     torch.manual_seed(0)
-    sizes = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
-    bound = ForwardModel(FeatureSet.of(scene), **sizes).bind(scene)
+    bound = ForwardModel(FeatureSet.of(scene), **SMALL, **options).bind(scene)
     seen = collect_trajectories(scene, 5, 20, seed=0)
     bound.update_static_normalizers()
     bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
@@ -51,6 +52,49 @@ def test_samples_of_other_variants_are_refused():
     static = SceneValues.of(other).tensordict().expand(2)
     with pytest.raises(ValueError, match="other static 'globals_' than scene 'pendulum'"):
         planner.planning(start.set("static", static))
+
+
+def test_a_recurrent_model_remembers_what_was_played():
+    scene = load_scene("pendulum")
+    bound = trained(scene, core="recurrent", memory=[4, 4, 4])
+    reward = make_reward("balance", scene)
+    planner = GradientPlanner(ModelEnv(bound, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
+    acted = SceneEnv(scene, reward, seed=0)
+    start = acted.reset(TensorDict(batch_size=[2]))
+    with pytest.raises(KeyError, match="make_tensordict_primer"):
+        acted.rollout(2, planner, tensordict=start.clone(), auto_reset=False)
+    primed = batched(acted, 2).append_transform(planner.make_tensordict_primer())
+    played = primed.rollout(4, planner)
+    _, memory = bound.observe(played["state"], played["action"])
+    for key, value in memory.items():
+        torch.testing.assert_close(played["next", "memory", key][:, -1], value)
+        assert (played["memory", key][:, 0] == 0).all()
+
+
+def test_what_an_inference_model_wrote_is_planned_with():
+    scene = load_scene("pendulum")
+    torch.manual_seed(0)
+    model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=[3, 3, 3], link=False, **SMALL).double()
+    bound = model.bind(scene, static_key="static")
+    seen = collect_trajectories(scene, 5, 20, seed=0)
+    bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
+    reward = make_reward("balance", scene)
+    special = specialize(bound)
+    planner = GradientPlanner(ModelEnv(special, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
+    start = SceneEnv(scene, reward, seed=0).reset(TensorDict(batch_size=[2]))
+    static = bound.own_static().expand(2).apply(torch.randn_like)
+    start["static"] = static
+    planner(start)
+    total = planner._imagine(start.select("state", "static"), torch.zeros(2, 1, 3, 1))
+    for row in range(2):
+        other = static.clone()
+        other["nodes"][1 - row] += 1
+        changed = planner._imagine(start.select("state").set("static", other), torch.zeros(2, 1, 3, 1))
+        assert changed[row] == pytest.approx(total[row].item(), rel=1e-6)
+        assert changed[1 - row] != pytest.approx(total[1 - row].item(), rel=1e-6)
+    folds = special._folds
+    planner(start)
+    assert special._folds - folds <= 2  # of the candidates' values, not of every iteration's
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

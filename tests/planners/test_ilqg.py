@@ -17,7 +17,6 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from torchrl_gn.data import sample_start_states
 from torchrl_gn.envs import ModelEnv, SceneEnv
-from torchrl_gn.planners.ddp import QuadraticModel, backward_pass
 from torchrl_gn.planners.ilqg import ILQGPlanner
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import Scene, load_scene
@@ -277,18 +276,6 @@ def test_task_may_be_a_tensordict():
     assert torch.equal(point_planner(point_env(5.0, reward))(given)["action"], wanted["action"])
 
 
-def test_controls_that_do_the_same_share_the_work():
-    # One state, pushed by two controls alike, without any cost of them.
-    dynamics = np.tile(np.array([[1.0, 1.0, 1.0]]), (3, 1, 1))
-    by_all = np.ones((3, 3))
-    model = QuadraticModel(dynamics, np.ones((3, 3)), np.tile(by_all, (3, 1, 1)), -np.ones((3, 2)), np.ones((3, 2)))
-    changes, gains = backward_pass(model, np.array([0.0, 1e-20]), np.zeros(2))
-    assert np.isfinite(changes).all() and np.isfinite(gains).all()
-    np.testing.assert_allclose(changes[..., 0], changes[..., 1], atol=1e-6)
-    np.testing.assert_allclose(changes.sum(-1), -1, atol=1e-6)
-    np.testing.assert_allclose(gains.sum(-2), -1, atol=1e-6)
-
-
 def test_controls_are_costly():
     env = point_env(5.0)
     start = TensorDict({"physics": physics_of(env, [0.5, 0, 0, 0])}, [1])
@@ -313,7 +300,9 @@ def test_unstable_states_keep_their_plan_and_warn_once():
     plan = {"actions": actions.clone(), "planned": torch.ones(2, 1, dtype=torch.bool)}
     given = TensorDict({"physics": physics, "plan": plan}, [2])
     physics[1, 1:] = torch.tensor([1e10, 1e10])
-    with pytest.warns(RuntimeWarning, match="unstable whatever is done") as caught:
+    with pytest.warns(
+        RuntimeWarning, match="unstable whatever is done.* last plan, or rest if they have none"
+    ) as caught:
         planned = planner.plan(given)
         planner.plan(given)
         rest = planner.plan(given.exclude("plan"))
@@ -355,9 +344,21 @@ def test_copies_and_pickles_plan_alike():
         assert torch.equal(other(start.clone())["action"], wanted)
 
 
+def test_equal_bounds_fix_an_action():
+    free, fixed = point_env(2.0), point_env(2.0)
+    low, high = free.scene.action_low, free.scene.action_high
+    scene = replace(fixed.scene, action_low=np.array([low[0], 0.5]), action_high=np.array([high[0], 0.5]))
+    fixed = SceneEnv(scene, quadratic, num_threads=1, seed=0)
+    given = TensorDict({"physics": physics_of(free, [0.5, -0.3, 0.2, 0.4])}, [1])
+    wanted, found = (point_planner(env, warm_up=10).plan(given)[0] for env in (free, fixed))
+    assert (found[:, 1] == 0.5).all()
+    torch.testing.assert_close(found[:, 0], wanted[:, 0], rtol=0, atol=1e-5)  # the two directions do not mix
+
+
 def test_refuses_what_it_cannot_plan():
     env = point_env(5.0)
-    for name, value in (("horizon", 0), ("iterations", 0), ("warm_up", -1), ("control_cost", -1.0)):
+    refused = (("horizon", 0), ("horizon", 2.5), ("iterations", 0), ("iterations", 1.0), ("warm_up", -1))
+    for name, value in (*refused, ("warm_up", 0.5), ("control_cost", -1.0), ("num_threads", 0), ("num_threads", 1.5)):
         with pytest.raises(ValueError, match=f"{name} must be"):
             ILQGPlanner(env, **{"horizon": 3, name: value})
     with pytest.raises(TypeError, match="SceneEnv, got TransformedEnv"):
@@ -371,6 +372,9 @@ def test_refuses_what_it_cannot_plan():
     unlimited = SceneEnv(env.scene, quadratic)
     unlimited.scene = replace(env.scene, action_high=np.array([np.inf, 1.0]))
     with pytest.raises(ValueError, match="without bounds"):
+        ILQGPlanner(unlimited, 3)
+    unlimited.scene = replace(env.scene, action_low=np.array([-1.0, 6.0]))
+    with pytest.raises(ValueError, match="action 1 between 6 and 5"):
         ILQGPlanner(unlimited, 3)
     planner = ILQGPlanner(env, 3, 1)
     start = env.reset()

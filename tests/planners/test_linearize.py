@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -110,6 +112,17 @@ def test_controls_at_bounds_are_perturbed_inwards(central):
     bounds = np.array([scene.action_low, scene.action_high, scene.action_low])
     at_bounds = linearize(simulator, physics, bounds, central=central).dynamics[..., -1]
     np.testing.assert_allclose(at_bounds, inside, rtol=1e-3, atol=1e-6 * np.abs(inside).max())
+
+
+@pytest.mark.parametrize("central", [False, True])
+def test_fixed_controls_change_nothing(central):
+    scene = load_scene("swimmer6")
+    fixed = np.arange(scene.num_actions) == 1
+    low, high = (np.where(fixed, 0.25, bound) for bound in (scene.action_low, scene.action_high))
+    simulator, physics, actions = trajectory(replace(scene, action_low=low, action_high=high), 3)
+    actions[:, fixed] = 0.25
+    found = linearize(simulator, physics, actions, central=central).dynamics[..., -scene.num_actions :]
+    assert (found[..., fixed] == 0).all() and (np.abs(found[..., ~fixed]).max(axis=1) > 0).all()
 
 
 def test_tangent_is_its_own_inverse():

@@ -5,11 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file
 
-from torchrl_gn.data import spline_controls
+from torchrl_gn.data import Simulator, collect_trajectories, spline_controls
+from torchrl_gn.envs import SceneEnv
+from torchrl_gn.modules import FeatureSet, ForwardModel
 from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import save_checkpoint
 
 SMALL = ("episodes=2", "horizon=4", "gn.warm_up=2", "gn.samples=3", "gn.iterations=1", "ilqg.iterations=1")
 SAMPLED = ("cem.iterations=1", "cem.candidates=4", "cem.top_k=2", "mppi.iterations=1", "mppi.candidates=4")
@@ -50,10 +55,84 @@ def test_targets_that_are_poses(tmp_path, call):
         assert kept["now.target"].shape == (2, 10, 13) and kept["state"].shape[1] == steps + 1
 
 
+def test_an_episode_ends_where_its_simulation_becomes_unstable(tmp_path, call, monkeypatch):
+    """Instead of standing still for a million each step; the others go on."""
+    step, threads = SceneEnv._step, []
+
+    def explodes(env, tensordict):
+        threads.append(env.num_threads)
+        out = step(env, tensordict)
+        if len(threads) == 4:
+            out["terminated"][0], out["reward"][0] = True, env.unstable_reward
+        return out
+
+    monkeypatch.setattr(SceneEnv, "_step", explodes)
+    options = (*SMALL, "planner=random", "simulation_threads=1", f"run_dir={tmp_path}")
+    for steps in (6, 8):  # the second goes on from what the first saved
+        code, output, errors = call(*options, f"steps={steps}", recipe="mpc")
+        assert code == 0 and "warning" not in errors.lower(), errors
+        assert "1 of 2 episodes" in output and "became unstable" in output
+        kept = load_file(tmp_path / "random.safetensors")
+        assert kept["reward"].isnan().tolist() == [[False] * 3 + [True] * (steps - 3), [False] * steps]
+        assert (kept["state"].isnan().flatten(2).any(2).sum(1) == torch.tensor([steps - 3, 0])).all()
+        metrics = json.loads((tmp_path / "metrics.json").read_text())
+        played = kept["reward"][~kept["reward"].isnan()]
+        assert metrics["random/unstable"] == 1
+        assert metrics["random/mean_reward"] == pytest.approx(played.mean().item())
+    assert set(threads) == {1} and len(threads) == 8
+
+
+def test_a_system_that_explodes_is_not_identified(tmp_path, call, monkeypatch):
+    rollout = Simulator.rollout
+
+    def explodes(*inputs):
+        out = rollout(*inputs)
+        out["stable"][0], out["state"][0] = False, torch.nan
+        return out
+
+    monkeypatch.setattr(Simulator, "rollout", explodes)
+    code, _, errors = call(*SMALL, "variants=true", "steps=1", f"run_dir={tmp_path}", recipe="mpc")
+    assert code == 1 and "1 of 2 simulations became unstable under the 20 random controls" in errors
+
+
+def test_a_recurrent_model_plans_too_and_videos_show_plans(tmp_path, call):
+    torch.manual_seed(0)
+    scene = load_scene("pendulum")
+    sizes = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8], "memory": [4, 4, 4]}
+    model = ForwardModel(FeatureSet.of(scene), core="recurrent", **sizes)
+    bound, seen = model.bind(scene), collect_trajectories(scene, 5, 20, seed=0)
+    bound.update_static_normalizers()
+    bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
+    save_checkpoint(tmp_path / "model.safetensors", model, scene=scene)
+    options = (
+        f"checkpoint={tmp_path / 'model.safetensors'}",
+        "planner=[gn,ilqg,random]",
+        f"run_dir={tmp_path / 'run'}",
+    )
+    code, output, errors = call(*SMALL, *options, "horizon=1", "steps=4", recipe="mpc")
+    assert code == 0, errors
+    assert "through the bound model, more slowly: core=recurrent" in output
+    kept = load_file(tmp_path / "run" / "gn.safetensors")
+    _, memory = bound.observe(kept["state"][:, :-1], kept["action"])
+    torch.testing.assert_close(kept["now.memory.nodes"], memory["nodes"])
+    widths = {}
+    for name in ("gn", "ilqg", "random"):
+        with Image.open(tmp_path / "run" / f"{name}.gif") as film:
+            widths[name] = film.width
+    assert widths["gn"] == widths["ilqg"] > 1.8 * widths["random"]
+    kept = load_file(tmp_path / "run" / "ilqg.safetensors")
+    assert torch.equal(kept["foreseen"], kept["state"][0, 1:])  # of one step on the true physics, that comes true
+
+
 def test_bad_options_are_named(tmp_path, call):
     for option, message in (
         ("planner=gradient", "There is no planner 'gradient'"),
-        ("system=two_poles", "'two_poles' is no system of the paper; those with rewards are ['pendulum', "),
+        ("system=two_poles", "'two_poles' is no system of the paper; this recipe has rewards of ['pendulum', "),
+        ("system=my.xml", "'Plan with a model of your own' in docs/planning.md"),
+        ("steps=0", "steps must be at least 1, got 0"),
+        ("steps=2.5", "steps must be a whole number, got 2.5"),
+        ("horizon=0", "horizon must be at least 1"),
+        ("episodes=-1", "episodes must be at least 1"),
     ):
         code, _, errors = call(*SMALL[:1], option, f"run_dir={tmp_path / option.split(chr(61))[0]}", recipe="mpc")
         assert code == 1 and message in errors and "Traceback" not in errors, errors

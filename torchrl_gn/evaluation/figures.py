@@ -52,7 +52,7 @@ def plot_rewards(
     """Reward over time, a line for every planner or policy: the mean of its episodes, and pale from worst to best.
 
     Args:
-        rewards: ``[B, T]`` by label.
+        rewards: ``[B, T]`` by label; NaN where an episode was over.
         path: file to write; its suffix is the format.
         timestep: seconds of a control step.
         ylabel: name of the vertical axis.
@@ -66,8 +66,11 @@ def plot_rewards(
     for number, (label, values) in enumerate(rewards.items()):
         values = values.detach().double().cpu().numpy()
         time, color = timestep * np.arange(1, values.shape[1] + 1), colors[number % len(colors)]
-        axes.fill_between(time, values.min(0), values.max(0), color=color, alpha=0.15, linewidth=0)
-        axes.plot(time, values.mean(0), color=color, label=label, linewidth=1.6)
+        going = np.isfinite(values).any(0)  # while there is one to draw
+        time, values = time[going], values[:, going]
+        low, high, middle = np.nanmin(values, 0), np.nanmax(values, 0), np.nanmean(values, 0)
+        axes.fill_between(time, low, high, color=color, alpha=0.15, linewidth=0)
+        axes.plot(time, middle, color=color, label=label, linewidth=1.6)
     axes.set_xlabel("time [s]")
     axes.set_ylabel(ylabel)
     axes.legend(frameon=False, fontsize=9)

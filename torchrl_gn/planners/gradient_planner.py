@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -18,7 +19,7 @@ from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.modules import BoundForwardModel
 from torchrl_gn.modules.weights import frozen
-from torchrl_gn.planners.plan import check_plannable, plan_primer, read_plan, write_plan
+from torchrl_gn.planners.plan import check_count, check_plannable, plan_primer, read_plan, write_plan
 
 OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
 
@@ -36,6 +37,9 @@ class GradientPlanner(MPCPlannerBase):
     first call is one without that entry. It then draws smooth random sequences and improves the best ones for
     ``warm_up`` iterations. Where episodes end and begin anew inside one rollout, :meth:`make_tensordict_primer` clears
     the plan; ``Collector(..., auto_register_policy_transforms=True)`` appends it to the environment by itself.
+
+    A sequence whose predictions or rewards are not finite (float32 rewards overflow above 3e38) never gets into a plan.
+    Where all are, the last plan is kept, or nothing is done if there is none, with a warning.
 
     Plan with a specialised model, ``ModelEnv(specialize(bound, compile=True), reward)``: several times as fast.
     Works under ``no_grad`` and not under ``inference_mode``, where nothing has a gradient.
@@ -80,16 +84,17 @@ class GradientPlanner(MPCPlannerBase):
                 f"GradientPlanner plans through a ModelEnv, which has gradients; got {type(env).__name__}."
                 " On the true physics use ILQGPlanner."
             )
-        check_plannable(env, horizon=horizon, iterations=iterations, candidates=candidates)
+        check_plannable(env, horizon=horizon, iterations=iterations, candidates=candidates, samples=samples)
         if samples < candidates:
             raise ValueError(f"samples must be at least candidates={candidates}, got {samples}")
-        if warm_up is not None and warm_up < 0:
-            raise ValueError(f"warm_up must not be negative, got {warm_up}")
-        if not 0 <= noise <= 1 or not action_cost >= 0:
-            raise ValueError(f"noise must be in [0, 1] and action_cost not negative, got {noise} and {action_cost}")
+        warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
+        check_count("warm_up", warm_up, 0)
+        if not 0 <= noise <= 1 or not 0 <= action_cost < math.inf:
+            raise ValueError(
+                f"noise must be in [0, 1] and action_cost finite and not negative, got {noise} and {action_cost}"
+            )
         super().__init__(env)
-        self.horizon, self.iterations = horizon, iterations
-        self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
+        self.horizon, self.iterations, self.warm_up = horizon, iterations, warm_up
         self.candidates, self.samples, self.noise, self.action_cost = candidates, samples, noise, action_cost
         self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)
         low, high = torch.as_tensor(env.scene.action_low), torch.as_tensor(env.scene.action_high)
@@ -138,13 +143,14 @@ class GradientPlanner(MPCPlannerBase):
             )
         best = plan.clone()
         with frozen(self.imagined):
-            for rows, iterations in ((~planned, self.warm_up), (planned, self.iterations)):
+            first = (~planned, self.warm_up, "there is no plan yet, and nothing is done")
+            for rows, iterations, otherwise in (first, (planned, self.iterations, "their last plan is kept")):
                 where = rows.nonzero().flatten()
                 if len(where) == 0:
                     continue
                 some = entries if len(where) == len(flat) else cast(TensorDictBase, entries[where])
                 begin = self._renewed(plan[where]) if bool(planned[where[0]]) else self._first(some)
-                best[where] = self._improve(some, begin, iterations)
+                best[where] = self._improve(some, begin, iterations, otherwise)
         actions = self._actions(best)
         write_plan(td, actions.reshape(*batch, *self.plan_shape).to(states_at))
         if self._remembers:
@@ -152,8 +158,8 @@ class GradientPlanner(MPCPlannerBase):
         return actions[:, 0, 0].reshape(*batch, -1).to(states_at)
 
     def _scaled(self, actions: Tensor) -> Tensor:
-        """Actions ``[*B, A]`` in units of half their range, from -1 to 1 around its middle."""
-        return (actions - self.middle) / self.half_range
+        """Actions ``[*B, A]`` in units of half their range, from -1 to 1 around its middle; 0 where they are fixed."""
+        return torch.where(self.half_range > 0, (actions - self.middle) / self.half_range, 0.0)
 
     def _actions(self, scaled: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in the actuators' units."""
@@ -178,13 +184,17 @@ class GradientPlanner(MPCPlannerBase):
         return flat.select(*keys, strict=False).detach().to(self.imagined.device)
 
     def _imagine(self, many: TensorDictBase, plan: Tensor) -> Tensor:
-        """Returns ``[B, K]`` of sequences ``[B, K, H, A]`` in units of half their range, from ``[B K]`` states."""
-        _, rewards = self.imagined.imagine(many, self._actions(plan).flatten(0, 1))
-        total = rewards.sum((-2, -1)).reshape(plan.shape[:2])
+        """Returns ``[B, K]`` of sequences ``[B, K, H, A]`` in units of half their range, from ``[B K]`` states.
+
+        Minus infinity where a prediction is not finite: a reward may look at another body.
+        """
+        states, rewards = self.imagined.imagine(many, self._actions(plan).flatten(0, 1))
+        finite = states.isfinite().flatten(1).all(1)
+        total = torch.where(finite, rewards.sum((-2, -1)), -torch.inf).reshape(plan.shape[:2])
         return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
 
     def _first(self, entries: TensorDictBase) -> Tensor:
-        """The best of random sequences ``[B, K, H, A]``; and doing nothing is among them."""
+        """The best of random sequences ``[B, K, H, A]``; doing nothing is among them, and first if none is finite."""
         rows = len(entries)
         drawn = self._splines(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
@@ -195,7 +205,7 @@ class GradientPlanner(MPCPlannerBase):
         with torch.no_grad():
             total = torch.cat([self._imagine(many, part) for part in drawn.split(size, dim=1)], dim=1)
         total = total.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
-        best = total.topk(self.candidates, dim=1).indices
+        best = total.argsort(dim=1, descending=True, stable=True)[:, : self.candidates]
         return drawn.gather(1, best[..., None, None].expand(-1, -1, *drawn.shape[2:]))
 
     def _splines(self, rows: int, count: int) -> Tensor:
@@ -211,8 +221,8 @@ class GradientPlanner(MPCPlannerBase):
         noise = self.noise * self._splines(len(plan), renewed)
         return torch.cat([plan[:, : self.candidates - renewed], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
 
-    def _improve(self, entries: TensorDictBase, plan: Tensor, iterations: int) -> Tensor:
-        """Sequences ``[B, K, H, A]`` improved, the best one first."""
+    def _improve(self, entries: TensorDictBase, plan: Tensor, iterations: int, otherwise: str) -> Tensor:
+        """Sequences ``[B, K, H, A]`` improved, the best one first; as given, and a warning, where none is finite."""
         # The same tensors in every iteration: what the model folds of them is folded once.
         many = _repeated(entries, self.candidates)
         best, record = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
@@ -240,7 +250,7 @@ class GradientPlanner(MPCPlannerBase):
         if lost:
             warnings.warn(
                 f"{self.imagined}: every imagined rollout of {lost} of {len(plan)} states has predictions or rewards"
-                " that are not finite; their last plan is kept.",
+                f" that are not finite; {otherwise}.",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -255,5 +265,5 @@ def _repeated(entries: TensorDictBase, count: int) -> TensorDictBase:
 def _keep_better(best: Tensor, record: Tensor, actions: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
     """The better of sequences seen before and now, each by its return; one that is not finite is never better."""
     total = total.detach()
-    better = total > record  # False for NaN
+    better = total.isfinite() & (total > record)
     return torch.where(better[..., None, None], actions.detach(), best), torch.where(better, total, record)

@@ -18,7 +18,7 @@ from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
-from torchrl_gn.planners.plan import check_plannable, plan_primer, read_plan, write_plan
+from torchrl_gn.planners.plan import check_count, check_plannable, plan_primer, read_plan, write_plan
 from torchrl_gn.planners.reward_expansion import RewardExpansion
 
 _STARTS = 16  # random sequences of which a first plan starts from the best
@@ -98,10 +98,11 @@ class ILQGPlanner(MPCPlannerBase):
                 " of a transformed environment give its base_env."
             )
         warm_up = 10 * iterations if warm_up is None else warm_up
-        check_plannable(env, horizon=horizon, iterations=iterations)
-        for name, value in (("warm_up", warm_up), ("control_cost", control_cost)):
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} must be finite and not negative, got {value}")
+        threads = 1 if num_threads is None else num_threads
+        check_plannable(env, horizon=horizon, iterations=iterations, num_threads=threads)
+        check_count("warm_up", warm_up, 0)
+        if not 0 <= control_cost < math.inf:
+            raise ValueError(f"control_cost must be finite and not negative, got {control_cost}")
         super().__init__(env)
         self.horizon, self.iterations, self.warm_up = horizon, iterations, warm_up
         self.control_cost, self.central, self.num_threads = control_cost, central, num_threads
@@ -189,8 +190,8 @@ class ILQGPlanner(MPCPlannerBase):
         warnings.warn(
             f"ILQGPlanner found no sequence of {self.horizon} actions for {self._scene_env.scene.name!r} that can be"
             " simulated from a given state with a finite reward: the simulation becomes unstable whatever is done, or"
-            " the reward is not finite. Such states keep their last plan. A smaller physics step in the model may"
-            " help. (Said once.)",
+            " the reward is not finite. Such states keep their last plan, or rest if they have none. A smaller physics"
+            " step in the model may help. (Said once.)",
             RuntimeWarning,
             stacklevel=2,
         )

@@ -69,8 +69,9 @@ class ILQGSolver:
         self._half = 0.5 * (self.scene.action_high - self.scene.action_low)
 
     def controls(self, actions: np.ndarray) -> np.ndarray:
-        """Controls in units of half their range, from -1 to 1, of actions in the actuators' units."""
-        return np.clip((actions - self._middle) / self._half, -1.0, 1.0)
+        """Controls in units of half their range, from -1 to 1, of actions in the actuators' units; 0 where fixed."""
+        off = actions - self._middle
+        return np.clip(np.divide(off, self._half, out=np.zeros_like(off), where=self._half > 0), -1.0, 1.0)
 
     def actions(self, controls: np.ndarray) -> np.ndarray:
         """Actions in the actuators' units."""

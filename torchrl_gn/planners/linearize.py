@@ -126,14 +126,17 @@ def linearize(
 def _perturb_controls(
     low: np.ndarray, high: np.ndarray, controls: np.ndarray, epsilon: float, central: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Controls ``[T, A]`` moved up, moved down, and what lies between; from a bound inwards only."""
+    """Controls ``[T, A]`` moved up, moved down, and what lies between; from a bound inwards only.
+
+    What lies between is 1 where the bounds are equal: a fixed control changes nothing, and that over 1 is 0.
+    """
     step = 0.5 * epsilon * (high - low)
     above = np.minimum(controls + step, high)
     below = np.maximum(controls - step, low)
     if not central:
         above = np.where(controls + step <= high, controls + step, controls - step)
         below = controls
-    return above, below, above - below
+    return above, below, np.where(high > low, above - below, 1.0)
 
 
 def _one_changed(controls: np.ndarray, before: int, changed: np.ndarray) -> np.ndarray:

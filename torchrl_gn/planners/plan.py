@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import cast
 
 import numpy as np
@@ -23,15 +24,14 @@ def check_plannable(env: ModelEnv | SceneEnv, **counts: int) -> None:
     """Refuse what no planner can plan with.
 
     Args:
-        env: the environment to plan in; it needs a reward and actions with bounds.
+        env: the environment to plan in; it needs a reward and actions with bounds. Equal ones fix an action.
         **counts: what must be at least 1, by name.
 
     Raises:
         ValueError: naming what is wrong.
     """
     for name, value in counts.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+        check_count(name, value, 1)
     scene = env.scene
     if env.reward is None:
         raise ValueError(f"{env} has no reward to plan for; give it one, as make_reward(task, scene).")
@@ -39,6 +39,29 @@ def check_plannable(env: ModelEnv | SceneEnv, **counts: int) -> None:
         raise ValueError(f"Scene {scene.name!r} has no actions to plan.")
     if not (np.isfinite(scene.action_low) & np.isfinite(scene.action_high)).all():
         raise ValueError(f"Scene {scene.name!r} has actions without bounds; give its motors a ctrlrange.")
+    if (scene.action_low > scene.action_high).any():
+        worst = int((scene.action_low - scene.action_high).argmax())
+        raise ValueError(
+            f"Scene {scene.name!r} has its action {worst} between {scene.action_low[worst]:g} and"
+            f" {scene.action_high[worst]:g}: action_low must not be above action_high."
+        )
+
+
+def check_count(name: str, value: int, least: int) -> None:
+    """Refuse what is no count, before a plan trips over it.
+
+    Args:
+        name: of the argument, for the message.
+        value: what was given.
+        least: the lowest that will do.
+
+    Raises:
+        ValueError: it is no whole number, or below the least.
+    """
+    if not isinstance(value, Integral):
+        raise ValueError(f"{name} must be a whole number, got {value!r}")
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
 
 
 def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,30 @@
+"""What MPPI weighs its candidates by."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.planners import ReturnToGo
+
+
+def advantage(reward: torch.Tensor) -> torch.Tensor:
+    """Of rewards ``[K, H]``."""
+    given = TensorDict({"next": {"reward": reward[..., None]}}, reward.shape)
+    return ReturnToGo()(given)["advantage"].squeeze(-1)
+
+
+def test_it_is_the_return_from_each_step_on_less_the_best_in_the_spread():
+    reward = torch.tensor([[1.0, 2.0, 3.0], [4.0, 0.0, 1.0]])
+    returns = torch.tensor([[6.0, 5.0, 3.0], [5.0, 1.0, 1.0]])
+    spread = (returns[0] - returns[1]).abs() / 2**0.5  # of two
+    torch.testing.assert_close(advantage(reward), (returns - returns.amax(0)) / spread)
+
+
+def test_it_does_not_depend_on_how_large_rewards_are():
+    reward = torch.randn(2, 5, 4, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(advantage(1e3 * reward - 7), advantage(reward), rtol=1e-3, atol=1e-3)
+
+
+def test_candidates_that_are_alike_score_alike():
+    assert (advantage(torch.ones(4, 3)) == 0).all()
