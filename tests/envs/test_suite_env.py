@@ -20,11 +20,11 @@ def own_env(monkeypatch):
     from dm_control.rl import control
     from dm_control.suite import swimmer
 
-    def make(task: str, seed: int, timestep: float) -> control.Environment:
-        if task == "run":
-            loaded = suite.load("cheetah", "run", {"random": seed})
-        else:
+    def make(domain: str, task: str, seed: int, timestep: float) -> control.Environment:
+        if domain == "swimmer":
             loaded = swimmer.swimmer(int(task.removeprefix("swimmer")), random=seed)
+        else:
+            loaded = suite.load(domain, task, {"random": seed})
         return control.Environment(loaded.physics, loaded.task, control_timestep=timestep)
 
     return make
@@ -32,14 +32,19 @@ def own_env(monkeypatch):
 
 @pytest.mark.parametrize(
     ("domain", "task", "timestep"),
-    [("swimmer", "swimmer6", 0.02), ("swimmer", "swimmer4", 0.01), ("cheetah", "run", 0.03)],
+    [
+        ("swimmer", "swimmer6", 0.02),
+        ("swimmer", "swimmer4", 0.01),
+        ("cheetah", "run", 0.03),
+        ("manipulator", "bring_ball", 0.01),  # has an observation of two axes
+    ],
 )
 def test_physics_observations_and_rewards_are_dm_controls(own_env, domain, task, timestep):
     seeds = np.random.SeedSequence(5).generate_state(2).tolist()
     env = suite_env(domain, task, num_envs=2, timestep=timestep, seed=5)
     actions = 2 * torch.rand(2, 8, env.action_spec.shape[-1], generator=torch.Generator().manual_seed(0)) - 1
     td = env.reset()
-    owns = [own_env(task, int(seed), timestep) for seed in seeds]
+    owns = [own_env(domain, task, int(seed), timestep) for seed in seeds]
     starts = [own.reset() for own in owns]
 
     def flat(step) -> np.ndarray:

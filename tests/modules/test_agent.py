@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_gn.modules import Agent
+from torchrl_gn.scenes import ObservationGraph
 
 SMALL = {"hidden": (8,), "model_options": {"latent": 4, "hidden": [8]}, "policy_options": {"latent": 4, "hidden": [8]}}
 KINDS = [
@@ -52,6 +53,26 @@ def test_a_stochastic_policy_explores_and_a_deterministic_one_does_not(observati
         drawn = Agent(graph, policy=policy, min_scale=0.3, **SMALL).policy(td.clone())["action"]
         same = Agent(graph, stochastic=False, **SMALL).policy(td.clone())["action"]
     assert (drawn.std(0) > 0.2).all() and (same == same[0]).all()
+
+
+def test_a_graph_policy_drives_bodies_of_other_lengths(observation_graphs, transitions):
+    short, long = observation_graphs["swimmer3"], ObservationGraph.swimmer(6)
+    agent, fresh = Agent(short, policy="graph", **SMALL), Agent(long, policy="graph", **SMALL)
+    agent.update_normalizers(*transitions(short, 40))
+    policy = agent.policy_for(long)
+    fresh.policy.load_state_dict(agent.policy.state_dict())
+    td = TensorDict({"observation": transitions(long, 20, seed=1)[0].float()}, [20])
+    for each in (ExplorationType.DETERMINISTIC, ExplorationType.RANDOM):
+        with set_exploration_type(each):
+            found = []
+            for one in (policy, fresh.policy):
+                torch.manual_seed(0)
+                found.append(one(td.clone())["action"])
+        assert found[0].shape == (20, 5) and torch.equal(*found)
+    with pytest.raises(
+        ValueError, match="Only a graph network drives other bodies; build the agent with policy='graph'"
+    ):
+        Agent(short, **SMALL).policy_for(long)
 
 
 def test_statistics_take_every_transition_once(observation_graphs, transitions):

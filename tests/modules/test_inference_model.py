@@ -30,12 +30,12 @@ SMALL = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden":
 def make_identifying(fit):
     """Both models, small and with random weights, and the scene they know."""
 
-    def make(name: str = "pendulum", **options):
+    def make(name: str = "pendulum", readout: str = "weighted"):
         torch.manual_seed(0)
         scene = load_scene(name)
         forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=(4, 3, 2), **SMALL)
         model = IdentifyingModel(
-            forward_model.double(), edge_hidden=(8,), node_hidden=(8,), global_hidden=(8,)
+            forward_model.double(), edge_hidden=(8,), node_hidden=(8,), global_hidden=(8,), readout=readout
         ).double()
         bound, _ = model.bind(scene)
         data = collect_trajectories(scene, 20, 5)
@@ -52,18 +52,23 @@ def sequence_of(data: TensorDict, steps: int) -> dict:
     return {"state": state[:, :steps], "action": action[:, :steps], "next": {"state": state[:, 1 : steps + 1]}}
 
 
-def test_a_step_is_a_gn_block_over_both_graphs(random_graph):
+@pytest.mark.parametrize("readout", ["weighted", "mean", "last"])
+def test_a_step_is_a_gn_block_over_both_graphs(readout, random_graph):
     torch.manual_seed(0)
     size, inferred, memory = GraphSize(3, 2, 1), GraphSize(4, 5, 6), GraphSize(7, 8, 9)
-    model = InferenceModel(size, inferred=(4, 5, 6), memory=(7, 8, 9)).double()
+    model = InferenceModel(size, inferred=(4, 5, 6), memory=(7, 8, 9), readout=readout).double()
     assert isinstance(model.block, GNBlock)
     dynamic, hidden = random_graph(size, EDGES, 3, 2), random_graph(memory, EDGES, 3, 2, seed=1)
-    found, after = model(dynamic, hidden)
+    told, weight, after = model(dynamic, hidden)
     out = model.block(graph_concat(dynamic, hidden))
     for part in ("nodes", "edges", "globals_"):
-        first = getattr(inferred, part)
-        assert torch.equal(getattr(found, part), getattr(out, part)[..., :first])
-        assert torch.equal(getattr(after, part), getattr(out, part)[..., first:].tanh())
+        first, last = getattr(inferred, part), getattr(memory, part)
+        features = getattr(out, part)
+        assert features.shape[-1] == first + last + (first if readout == "weighted" else 0)
+        assert torch.equal(getattr(told, part), features[..., :first])
+        assert torch.equal(getattr(after, part), features[..., -last:].tanh())
+        weights = features[..., first:-last].sigmoid() + 1e-3 if readout == "weighted" else 1.0
+        assert (getattr(weight, part) == weights).all() and getattr(weight, part).shape == getattr(told, part).shape
     assert all((value == 0).all() for value in (model.start(dynamic).nodes, model.start(dynamic).globals_))
 
 
@@ -86,19 +91,21 @@ def test_observations_one_by_one_are_the_sequence(make_identifying):
         inference.infer(*(part[:, :0] for part in sequence))
 
 
-def test_what_is_inferred_is_the_mean_of_what_each_observation_tells(make_identifying):
-    model, scene = make_identifying("swimmer3")
+@pytest.mark.parametrize("readout", ["weighted", "mean", "last"])
+def test_what_is_inferred_is_the_mean_of_what_each_observation_tells(readout, make_identifying, monkeypatch):
+    model, scene = make_identifying("swimmer3", readout=readout)
     _, inference = model.bind(scene)
     data = collect_trajectories(scene, 4, 6, seed=1)
-    sequence = data["state"][:, :6], data["action"], data["state"][:, 1:]
-    means = [known.static for known in inference.observe(*sequence)]
-    model.inference.readout = "last"
-    each = [known.static for known in inference.observe(*sequence)]
+    each, forward = [], model.inference.forward
+    monkeypatch.setattr(model.inference, "forward", lambda *args: each.append(forward(*args)) or each[-1])
+    known = [known.static for known in inference.observe(data["state"][:, :6], data["action"], data["state"][:, 1:])]
     for count in (1, 2, 6):
         for key in ("nodes", "edges", "globals_"):
-            mean = sum(known[key] for known in each[:count]) / count
-            torch.testing.assert_close(means[count - 1][key], mean)
-    with pytest.raises(ValueError, match="readout must be 'mean' or 'last', got 'first'"):
+            told, weight = (torch.stack([getattr(step[at], key) for step in each[:count]]) for at in (0, 1))
+            expected = told[-1] if readout == "last" else (weight * told).sum(0) / weight.sum(0)
+            torch.testing.assert_close(known[count - 1][key], expected)
+            assert (weight.std(0) > 0).all() if readout == "weighted" and count > 1 else (weight > 0).all()
+    with pytest.raises(ValueError, match="readout must be 'weighted', 'mean' or 'last', got 'first'"):
         InferenceModel(GraphSize(3, 2, 1), readout="first")
 
 
@@ -145,27 +152,35 @@ def test_an_inferred_graph_is_kept_and_used_again(make_identifying, tmp_path):
 @pytest.mark.parametrize("system", ["pendulum", "cartpole", "swimmer3", "cheetah", "jaco"])
 @pytest.mark.parametrize("static", ["none", "inferred"])
 def test_true_parameters_cannot_leak(system, static):
-    """A sample's own parameters change nothing and get no gradient; only its states and actions count."""
+    """What is predicted is a function of states and actions: true parameters change nothing and get no gradient."""
     torch.manual_seed(0)
-    scene = load_scene(system)
+    scene, variants = load_scene(system), sample_variants(system, 3, rng=0)
     model = ForwardModel(FeatureSet.of(scene), static=static, inferred=(4, 3, 2), **SMALL).double()
-    variants = collect_trajectories(sample_variants(system, 3, rng=0), 3, 6, seed=0)
+    data = collect_trajectories(variants, 3, 6, seed=0)
     bound = model.bind(scene, static_key="static")
-    bound.update_dynamic_normalizers(variants["state"][:, 0], variants["action"][:, 0], variants["state"][:, 1])
-    state, action = variants["state"][:, 2], variants["action"][:, 2]
-    sample = TensorDict({"state": state, "action": action, "static": variants["static"]}, [3])
-    if static == "none":
-        mixed = sample.clone().set("static", variants["static"].apply(lambda value: value.flip(0)))
-        assert torch.equal(bound(sample)["next", "state"], bound(mixed)["next", "state"])
-        return
-    with pytest.raises(ValueError, match="Static entry 'nodes' must be|true parameters"):
-        bound(sample.clone())
-    identifying = IdentifyingModel(model, edge_hidden=(8,), node_hidden=(8,), global_hidden=(8,)).double()
-    bound, inference = identifying.bind(scene)
-    td = sample.set("identification", sequence_of(variants, 6))
-    found = bound(inference(td.clone()))["next", "state"]
-    td.set("static", variants["static"].apply(lambda value: value.flip(0)))
-    assert torch.equal(bound(inference(td))["next", "state"], found)
+    bound.update_dynamic_normalizers(data["state"][:, 0], data["action"][:, 0], data["state"][:, 1])
+    sample = TensorDict({"state": data["state"][:, 2], "action": data["action"][:, 2]}, [3])
+    modules = [bound]
+    if static == "inferred":
+        with pytest.raises(ValueError, match="Static entry 'nodes' must be|true parameters"):
+            bound(sample.clone().set("static", data["static"]))
+        identifying = IdentifyingModel(model, edge_hidden=(8,), node_hidden=(8,), global_hidden=(8,)).double()
+        bound, inference = identifying.bind(scene)
+        sample["identification"] = TensorDict(sequence_of(data, 6), [3])
+        modules = [inference, bound]
+    predicted = []
+    for true in (data["static"], data["static"].apply(torch.zeros_like), data["static"] * torch.nan):
+        true = true.clone().apply(lambda value: value.double().requires_grad_())
+        td = sample.clone().set("static", true)
+        for module in modules:
+            td = module(td)
+        predicted.append(td["next", "state"])
+        gradients = torch.autograd.grad(predicted[-1].sum(), list(true.values()), allow_unused=True)
+        assert all(gradient is None for gradient in gradients)
+    assert torch.equal(predicted[0], predicted[1]) and torch.equal(predicted[0], predicted[2])
+    # Bodies would be linked by a variant's own lengths, and their pins looked for near there.
+    with pytest.raises(ValueError, match="is a variant, whose bodies it would link by their true lengths"):
+        model.bind(variants[1])
 
 
 def test_the_forward_model_must_read_what_is_inferred():

@@ -9,12 +9,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, set_specs, step_reward
+from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, reward_of, set_specs, step_reward
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.finite import require_finite
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel
@@ -61,8 +61,8 @@ class ModelEnv(ModelBasedEnvBase):
     Raises:
         TypeError: the model lacks these keys or the scene.
         ValueError: start states, or when stepping ``state`` or ``action``, of a wrong shape; no start states of a
-            robot without a model; an ``unstable_reward``, or when resetting a ``state`` or static values, that are
-            not finite.
+            robot without a model; a reward of another scene; an ``unstable_reward``, or when resetting a ``state`` or
+            static values, that are not finite.
         KeyError: when stepping, no ``state`` or ``action``.
     """
 
@@ -92,7 +92,7 @@ class ModelEnv(ModelBasedEnvBase):
             device = torch.device("cpu") if weight is None else weight.device
         super().__init__(cast(TensorDictModule, model), device=device, allow_done_after_reset=True)
         self.scene = cast(Scene, model.scene)
-        self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
+        self.reward = reward_of(reward, self, self.scene)
         self.unstable_reward = finite_reward(unstable_reward)
         self.starts = StartSampler(self.scene, start_states, seed)
         self._simulator: Simulator | None = None

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, set_specs, step_reward
+from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, reward_of, set_specs, step_reward
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
@@ -62,8 +62,8 @@ class SceneEnv(EnvBase):
         device: where TensorDicts live; the simulation runs on the CPU.
 
     Raises:
-        ValueError: start states of a wrong shape, or an ``unstable_reward`` that is not finite; when
-            stepping or resetting, an action or physics that is not finite or of a wrong shape.
+        ValueError: start states of a wrong shape, a reward of another scene, or an ``unstable_reward`` that is not
+            finite; when stepping or resetting, an action or physics that is not finite or of a wrong shape.
         KeyError: when stepping, no ``physics`` or ``action``.
 
     Example:
@@ -97,7 +97,7 @@ class SceneEnv(EnvBase):
         if not self.scenes:
             raise ValueError("SceneEnv needs at least one scene.")
         self.scene = self.scenes[0]
-        self.reward = reward.to(self.device) if isinstance(reward, nn.Module) else reward
+        self.reward = reward_of(reward, self, self.scene)
         self.num_threads = num_threads
         self.unstable_reward = finite_reward(unstable_reward)
         self.starts = StartSampler(self.scene, start_states, seed)

@@ -8,10 +8,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.scenes.scene import Scene
 
 RewardFunction = Callable[..., Tensor]
@@ -75,6 +76,20 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
         expected = [*tensordict.shape, *shape]
         raise ValueError(f"{env}: {key!r} must be {expected}, got {list(value.shape)}")
     return value
+
+
+def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
+    """The reward function of an environment, on its device.
+
+    Raises:
+        ValueError: it reads the bodies of another scene.
+    """
+    if not isinstance(reward, nn.Module):
+        return reward
+    for each in reward.modules():
+        if isinstance(each, Bodies):
+            each.require_same(scene)
+    return reward.to(env.device)
 
 
 def finite_reward(value: float) -> float:

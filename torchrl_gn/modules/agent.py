@@ -83,17 +83,7 @@ class Agent(nn.Module):
             else:
                 mlp = LayerNormMLP(observations, 2 * actions, hidden)
                 parameters = nn.Sequential(mlp, NormalParamExtractor(scale_lb=cast(Any, min_scale)))
-            self.policy = ProbabilisticActor(
-                TensorDictSequential(
-                    [
-                        TensorDictModule(parameters, ["observation"], ["loc", "scale"]),
-                        TensorDictModule(OutputNormalization(), ["loc"], ["loc"]),
-                    ]
-                ),
-                in_keys=["loc", "scale"],
-                out_keys=["action"],
-                distribution_class=TanhNormal,
-            )
+            self.policy = _actor(parameters)
         else:
             mlp = LayerNormMLP(observations, actions, hidden)
             self.policy = TensorDictSequential(
@@ -112,6 +102,16 @@ class Agent(nn.Module):
     def graph_policy(self) -> GraphPolicy | None:
         """The graph network that chooses actions, if one does."""
         return next((module for module in self.policy.modules() if isinstance(module, GraphPolicy)), None)
+
+    def policy_for(self, graph: ObservationGraph) -> ProbabilisticActor:
+        """The policy for another body, sharing the weights: of a swimmer of another length, say.
+
+        Raises:
+            ValueError: if the policy is no graph network, or has identities of this body's nodes.
+        """
+        if self.graph_policy is None:
+            raise ValueError("Only a graph network drives other bodies; build the agent with policy='graph'.")
+        return _actor(self.graph_policy.for_graph(graph))
 
     @torch.no_grad()
     def update_normalizers(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> None:
@@ -133,3 +133,18 @@ class Agent(nn.Module):
     def from_description(cls, description: dict) -> Agent:
         """Build the agent that :meth:`description` described, with fresh weights."""
         return cls(ObservationGraph.from_description(description["graph"]), **description["options"])
+
+
+def _actor(parameters: nn.Module) -> ProbabilisticActor:
+    """Gaussian policy, bounded and then squashed, whose location and scale a module gives."""
+    return ProbabilisticActor(
+        TensorDictSequential(
+            [
+                TensorDictModule(parameters, ["observation"], ["loc", "scale"]),
+                TensorDictModule(OutputNormalization(), ["loc"], ["loc"]),
+            ]
+        ),
+        in_keys=["loc", "scale"],
+        out_keys=["action"],
+        distribution_class=TanhNormal,
+    )

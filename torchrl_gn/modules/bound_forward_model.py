@@ -69,7 +69,8 @@ class BoundForwardModel(TensorDictModuleBase):
         static_key: where to read each sample's static values; None: they are the scene's.
 
     Raises:
-        ValueError: if the scene lacks features that the model reads, or with ``strict``.
+        ValueError: if the scene lacks features that the model reads, or is a variant whose parameters must be hidden
+            from it, or with ``strict``.
     """
 
     model: ForwardModel
@@ -97,6 +98,11 @@ class BoundForwardModel(TensorDictModuleBase):
             raise ValueError(
                 f"The model is an MLP for graphs of {items[0]} nodes and {items[1]} edges; scene {scene.name!r} has"
                 f" {scene.num_nodes} and {scene.num_edges}. Train another, or a graph network."
+            )
+        if model.static != "scene" and "parameters" in getattr(scene, "origin", ()):
+            raise ValueError(
+                f"The model must not see true parameters (static={model.static!r}), and {scene.name!r} is a variant,"
+                " whose bodies it would link by their true lengths. Bind it to the standard scene."
             )
         self.model, self.scene, self.layout = model, scene, model.layout
         self.timestep, self.plain, self.strict = float(scene.timestep), plain, strict

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -18,6 +18,8 @@ from torchrl_gn.modules.graph import Graph, GraphSize, graph_concat, graph_split
 from torchrl_gn.modules.pin_finder import PinFinder
 from torchrl_gn.scenes import Scene
 
+SMALLEST_WEIGHT = 1e-3  # of an observation; all of them together are divided by
+
 
 class Memory(NamedTuple):
     """What is kept of observations, to go on with more.
@@ -25,13 +27,13 @@ class Memory(NamedTuple):
     Attributes:
         hidden: hidden graph of the network.
         told: what is inferred so far: the mean of what each observation told, or what the last one did.
-        count: number of observations.
+        weight: the sum of the weights of what was told.
         pins: ``[*B, N, 7, 7]`` what was seen of where bodies are pinned together; None where they are not linked.
     """
 
     hidden: Graph
     told: Graph
-    count: int
+    weight: Graph
     pins: Tensor | None
 
 
@@ -65,8 +67,9 @@ class InferenceModel(nn.Module):
         node_hidden: hidden sizes of the node MLP.
         global_hidden: hidden sizes of the global MLP.
         activation: between the layers.
-        readout: what is inferred of several observations: the ``"mean"`` of what the network says after each, or what
-            it says after the ``"last"`` (paper).
+        readout: what is inferred of several observations: the mean of what the network says after each,
+            ``"weighted"`` by how much it says that each feature tells, or all alike (``"mean"``), or what it says after
+            the ``"last"`` (paper).
 
     Raises:
         ValueError: if ``readout`` or the activation is not known.
@@ -82,11 +85,11 @@ class InferenceModel(nn.Module):
         node_hidden: Sequence[int] = (64, 64),
         global_hidden: Sequence[int] = (64, 64),
         activation: str = "silu",
-        readout: Literal["mean", "last"] = "mean",
+        readout: Literal["weighted", "mean", "last"] = "weighted",
     ) -> None:
         super().__init__()
-        if readout not in ("mean", "last"):
-            raise ValueError(f"readout must be 'mean' or 'last', got {readout!r}.")
+        if readout not in ("weighted", "mean", "last"):
+            raise ValueError(f"readout must be 'weighted', 'mean' or 'last', got {readout!r}.")
         self.readout = readout
         self.inferred_size, self.memory_size = GraphSize(*inferred), GraphSize(*memory)
         self.options = {
@@ -100,7 +103,8 @@ class InferenceModel(nn.Module):
         }
         self.block = GNBlock(
             observed + self.memory_size,
-            self.inferred_size + self.memory_size,
+            (self.inferred_size + self.inferred_size if readout == "weighted" else self.inferred_size)
+            + self.memory_size,
             edge_hidden=edge_hidden,
             node_hidden=node_hidden,
             global_hidden=global_hidden,
@@ -111,13 +115,17 @@ class InferenceModel(nn.Module):
         """Hidden graph before any observation, for a batch like that of an observation ``[*B, ...]``."""
         return observed.zeros(self.memory_size)
 
-    def forward(self, observed: Graph, memory: Graph) -> tuple[Graph, Graph]:
-        """One observation: inferred static graph, and hidden graph for the next."""
+    def forward(self, observed: Graph, memory: Graph) -> tuple[Graph, Graph, Graph]:
+        """One observation: what it tells of the static graph, how much that weighs, hidden graph for the next."""
         size = self.inferred_size
-        out = self.block(graph_concat(observed, memory))
-        inferred, memory = graph_split(out, (size.nodes, size.edges, size.globals_))
-        bounded = Graph(memory.nodes.tanh(), memory.edges.tanh(), memory.globals_.tanh(), memory.edge_index)
-        return inferred, bounded
+        sizes = (size.nodes, size.edges, size.globals_)
+        told, rest = graph_split(self.block(graph_concat(observed, memory)), sizes)
+        if self.readout == "weighted":
+            weight, rest = graph_split(rest, sizes)
+            weight = _combine(lambda value: value.sigmoid() + SMALLEST_WEIGHT, weight)
+        else:
+            weight = _combine(torch.ones_like, told)
+        return told, weight, _combine(torch.tanh, rest)
 
 
 class BoundInferenceModel(TensorDictModuleBase):
@@ -217,11 +225,12 @@ class BoundInferenceModel(TensorDictModuleBase):
                 dynamic.globals_[..., step, :],
                 dynamic.edge_index,
             )
-            told, hidden = self.model(now, self.model.start(now) if memory is None else memory.hidden)
-            count = 1 if memory is None else memory.count + 1
-            if memory is not None and self.model.readout == "mean":
-                told = _between(memory.told, told, 1 / count)
-            memory = Memory(hidden, told, count, None if pins is None else pins[..., step, :, :, :])
+            told, weight, hidden = self.model(now, self.model.start(now) if memory is None else memory.hidden)
+            if memory is not None and self.model.readout != "last":
+                total = _combine(torch.add, memory.weight, weight)
+                share = _combine(torch.div, weight, total)
+                told, weight = _combine(torch.lerp, memory.told, told, share), total
+            memory = Memory(hidden, told, weight, None if pins is None else pins[..., step, :, :, :])
             yield memory
 
     def _pins(self, state: Tensor, next_state: Tensor, memory: Memory | None) -> Tensor | None:
@@ -241,12 +250,12 @@ class BoundInferenceModel(TensorDictModuleBase):
         return Inferred(static, memory)
 
 
-def _between(first: Graph, second: Graph, share: float) -> Graph:
-    """Features a share of the way from the first graph's to the second's."""
+def _combine(function: Callable[..., Tensor], first: Graph, *others: Graph) -> Graph:
+    """A function of the features of graphs of one topology."""
     return Graph(
-        torch.lerp(first.nodes, second.nodes, share),
-        torch.lerp(first.edges, second.edges, share),
-        torch.lerp(first.globals_, second.globals_, share),
+        function(first.nodes, *(graph.nodes for graph in others)),
+        function(first.edges, *(graph.edges for graph in others)),
+        function(first.globals_, *(graph.globals_ for graph in others)),
         first.edge_index,
     )
 

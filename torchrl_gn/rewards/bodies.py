@@ -85,11 +85,23 @@ class Bodies(Float64Buffers):
         if len(set(names)) < len(names):
             raise ValueError(f"bodies must be different ones, got {list(names)}")
         found = [find_body(scene, name) for name in names]
-        self.names, self.scene_name, self.num_nodes = tuple(names), scene.name, scene.num_nodes
+        self.names, self.scene_name, self.node_names = tuple(names), scene.name, tuple(scene.node_names)
         offset, turn = np.stack([body.pos for body in found]), np.stack([body.quat for body in found])
         self.constants({"node": [body.node for body in found], "offset": offset, "turn": turn})
         # Nearly always there is nothing to add: no operations, no lost digits.
         self._is_shifted, self._is_turned = bool(np.any(offset != 0)), bool(np.any(turn[:, 1:] != 0))
+
+    def require_same(self, scene: Scene) -> None:
+        """Refuse a scene of other bodies: the same number of them would be read without a word.
+
+        Raises:
+            ValueError: its nodes have other names.
+        """
+        if tuple(scene.node_names) != self.node_names:
+            raise ValueError(
+                f"the reward reads the bodies of scene {self.scene_name!r}, not those of {scene.name!r}; build it of"
+                " that scene"
+            )
 
     def position(self, state: Tensor) -> Tensor:
         """``[*B, K, 3]`` positions in metres of states ``[*B, N, 13]``."""
@@ -114,8 +126,8 @@ class Bodies(Float64Buffers):
 
     def _nodes(self, state: Tensor) -> Tensor:
         """States ``[*B, K, 13]`` of the nodes that carry the bodies."""
-        if state.shape[-2:] != (self.num_nodes, BODY_STATE.size):
-            wanted = f"[*B, {self.num_nodes}, {BODY_STATE.size}]"
+        if state.shape[-2:] != (len(self.node_names), BODY_STATE.size):
+            wanted = f"[*B, {len(self.node_names)}, {BODY_STATE.size}]"
             raise ValueError(f"states of scene {self.scene_name!r} must be {wanted}, got {list(state.shape)}")
         return state.index_select(-2, self.node)
 
