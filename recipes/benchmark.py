@@ -37,7 +37,7 @@ from torchrl_gn.evaluation import plot_loglog, squared_errors
 from torchrl_gn.modules import fast_matmul, specialize
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.systems import find_system
-from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, load_checkpoint, with_help
 from torchrl_gn.training.sweep import Run, refuse_failures, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
@@ -168,6 +168,7 @@ def pareto(points: dict[str, tuple[float, float]]) -> set[str]:
     }
 
 
+@with_help
 @hydra.main(config_path="config", config_name="benchmark", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -175,6 +176,7 @@ def main(cfg: DictConfig) -> None:
     scene = load_scene(cfg.system)
     run = RunFolder(cfg.run_dir, "benchmark")
     run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark", config=cfg)
     contestants = [*physical(cfg, scene), *learned(trained(cfg, run), scene)]
 
     rng = np.random.default_rng(cfg.seed)
@@ -203,8 +205,8 @@ def main(cfg: DictConfig) -> None:
             line[0].append(seconds)
             line[1].append(contestant.error)
         print(f"{contestant.name:38}{contestant.error:10.1e}{cells}")
-    run.write_metrics(metrics, seed=cfg.seed)
-    print(plot_loglog(panels, run.path / "work_precision.png", ylabel="error over equal simulated time"))
+    plot_loglog(panels, run.file("work_precision.png"), ylabel="error over equal simulated time")
+    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), run.written)
     for path in run.written:
         print(path)
 

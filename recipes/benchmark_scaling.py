@@ -27,7 +27,16 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.modules import FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, Trainer, Workers, clean_exit, join_workers, make_optimizer
+from torchrl_gn.training import (
+    RunFolder,
+    Tracker,
+    Trainer,
+    Workers,
+    clean_exit,
+    join_workers,
+    make_optimizer,
+    with_help,
+)
 from torchrl_gn.training.budget import Budget
 
 PART = "TORCHRL_GN_BENCHMARK"  # set in the processes that are timed: where they leave their times
@@ -70,6 +79,7 @@ def start(cfg: DictConfig, batch: int, processes: int) -> dict[str, float]:
         return json.loads(place.read_text())
 
 
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="benchmark_scaling")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -81,6 +91,7 @@ def main(cfg: DictConfig) -> None:
         return
     run = RunFolder(cfg.run_dir, "benchmark_scaling")
     run.write_config(OmegaConf.to_yaml(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_scaling", config=cfg)
     every = [(batch, processes) for batch in cfg.batches for processes in cfg.processes] * cfg.repeats
     found: dict[tuple[int, int], list[dict[str, float]]] = {}
     for batch, processes in tqdm(every, desc="measuring", leave=False):
@@ -96,7 +107,7 @@ def main(cfg: DictConfig) -> None:
         metrics[f"batch {batch}/{processes} processes/speedup"] = speedup
         parts = f"{middle['sampling']:>10.1f}{middle['model']:>10.1f}{middle['optimizer']:>11.1f}"
         print(f"{batch:>8}{processes:>11}{middle['step']:>11.1f}{speedup:>9.2f}x{parts}")
-    run.write_metrics(metrics, seed=cfg.seed)
+    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), run.written)
     for path in run.written:
         print(path)
 

@@ -33,7 +33,7 @@ from torchrl.envs import DMControlEnv, DMControlWrapper
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.scenes import Scene, load_scene
-from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 
 RIVAL = "DMControlEnv, same step"
 SUITE_TASKS = {
@@ -87,6 +87,7 @@ def measure(contestants: dict, repeats: int) -> dict[str, list[float]]:
     return seconds
 
 
+@with_help
 @hydra.main(config_path="config", config_name="benchmark_simulation", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -95,6 +96,7 @@ def main(cfg: DictConfig) -> None:
     scene = load_scene(cfg.system)
     run = RunFolder(cfg.run_dir, "benchmark_simulation")
     run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_simulation", config=cfg)
     torch.manual_seed(cfg.seed)
     contestants = make_contestants(cfg, scene)
     seconds = measure(contestants, cfg.repeats)
@@ -114,7 +116,7 @@ def main(cfg: DictConfig) -> None:
         metrics[f"{key}_simulated_seconds_per_second"] = simulated
         metrics[f"{key}_speedup"] = physics_rate / rival
         metrics[f"{key}_spread"] = (max(seconds[name]) - min(seconds[name])) / median
-    run.write_metrics(metrics, seed=cfg.seed)
+    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), run.written)
 
     print(f"{scene.name}, {cfg.repeats} repeats in turn, medians, {metrics['cpu_count']} cores")
     print(f"{'':28}{'control steps/s':>16}{'physics steps/s':>16}{'simulated s/s':>15}{'speed-up':>10}")

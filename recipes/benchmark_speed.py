@@ -40,7 +40,7 @@ from torchrl_gn.evaluation import plot_loglog
 from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, fast_matmul, specialize
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, clean_exit, make_optimizer
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, make_optimizer, with_help
 
 R = TypeVar("R")
 
@@ -267,6 +267,7 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
     return panels
 
 
+@with_help
 @hydra.main(config_path="config", config_name="benchmark_speed", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -274,6 +275,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     run = RunFolder(cfg.run_dir, "benchmark_speed")
     run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_speed", config=cfg)
     model, transitions = make_model(cfg, cfg.system, list(cfg.hidden))
     ways, works = make_ways(cfg, model, cfg.system), make_works(cfg, model, transitions)
     model.requires_grad_(False)
@@ -317,8 +319,8 @@ def main(cfg: DictConfig) -> None:
         for panel, lines in panels.items():
             for name, (xs, ys) in lines.items():
                 metrics.update({f"curve/{panel}/{name}/{x}": y for x, y in zip(xs, ys, strict=True)})
-        print(plot_loglog(panels, run.path / "speed.png", ylabel="milliseconds"))
-    run.write_metrics(metrics, seed=cfg.seed)
+        plot_loglog(panels, run.file("speed.png"), ylabel="milliseconds")
+    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), run.written)
     for path in run.written:
         print(path)
 

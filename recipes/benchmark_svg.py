@@ -29,7 +29,7 @@ from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
 from torchrl_gn.rewards import TargetDistance
 from torchrl_gn.scenes import ObservationGraph
-from torchrl_gn.training import OffPolicyTrainer, RunFolder, clean_exit, make_agent_optimizer
+from torchrl_gn.training import OffPolicyTrainer, RunFolder, Tracker, clean_exit, make_agent_optimizer, with_help
 
 
 def make_update(
@@ -49,6 +49,7 @@ def make_update(
     return trainer.update
 
 
+@with_help
 @hydra.main(version_base="1.3", config_path="config", config_name="benchmark_svg")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -56,6 +57,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     run = RunFolder(cfg.run_dir, "benchmark_svg")
     run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_svg", config=cfg)
     graph = ObservationGraph.of_task("swimmer", cfg.task)
     env = observation_env(graph, "swimmer", cfg.task, num_envs=cfg.num_envs, timestep=0.02, seed=cfg.seed)
     data = env.rollout(-(-4 * cfg.batch_size // cfg.num_envs), break_when_any_done=False)
@@ -83,7 +85,8 @@ def main(cfg: DictConfig) -> None:
         )
     with atomic_path(run.file("table.md")) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
-    run.write_metrics({f"{name}/ms": 1e3 * median for name, median in medians.items()}, seed=cfg.seed)
+    metrics = run.write_metrics({f"{name}/ms": 1e3 * median for name, median in medians.items()}, seed=cfg.seed)
+    tracker.finish(metrics, run.written)
     print("\n".join(lines))
     for path in run.written:
         print(path)

@@ -27,7 +27,7 @@ from typing import Any, cast
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.sweep import Run, folder_name, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
@@ -145,6 +145,7 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
     return lines[:-1], metrics, bars
 
 
+@with_help
 @hydra.main(config_path="config", config_name="compare", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -153,9 +154,10 @@ def main(cfg: DictConfig) -> None:
         cfg.data_dir = str(folder.data)
     trainings = all_trainings(cfg, folder.path)
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name="compare", config=cfg)
     failed = run_all([training.run for training in trainings], cfg.jobs)
     lines, metrics, bars = summarise(trainings, [*cfg.systems, *cfg.zero_shot])
-    report_sweep(folder, lines, bars, metrics, failed, seed=cfg.seeds[0])
+    report_sweep(folder, lines, bars, metrics, failed, tracker, seed=cfg.seeds[0])
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from torchrl_gn.envs import SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, rollout_video
 from torchrl_gn.modules import Agent, SwimmerObservation
 from torchrl_gn.scenes import Scene, load_scene
-from torchrl_gn.training import RunFolder, clean_exit, load_checkpoint
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, load_checkpoint, with_help
 from torchrl_gn.training.sweep import Run, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
@@ -142,6 +142,7 @@ def table(results: dict[tuple[str, str], dict[str, dict[str, list[float]]]]) -> 
     return lines[:-1]
 
 
+@with_help
 @hydra.main(config_path="config", config_name="data_shift", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -150,6 +151,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.data_dir is None:
         cfg.data_dir = str(folder.data)
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name="data_shift", config=cfg)
     scene, rng = load_scene(cfg.system), np.random.default_rng(cfg.seed)
     metrics: dict[str, float | int] = {}
     if cfg.policy is not None:
@@ -201,7 +203,7 @@ def main(cfg: DictConfig) -> None:
             if math.isfinite(center):
                 bars.setdefault(ERRORS[error], {}).setdefault(f"{network}, {trained_on}", {})[test] = (center, spread)
     lines = table(results) if results else []
-    report_sweep(folder, lines, bars, metrics, failed, seed=cfg.seed)
+    report_sweep(folder, lines, bars, metrics, failed, tracker, seed=cfg.seed)
 
 
 if __name__ == "__main__":

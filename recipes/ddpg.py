@@ -35,6 +35,7 @@ from torchrl_gn.training import (
     make_agent_optimizer,
     mean_return,
     report_learning,
+    with_help,
 )
 
 # When a run goes on.
@@ -46,6 +47,7 @@ def options(cfg: DictConfig) -> dict[str, Any]:
     return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
 
 
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="ddpg")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -58,7 +60,7 @@ def main(cfg: DictConfig) -> None:
     graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, options(cfg)["task"]["graph"])
     agent = begun.agent if begun else Agent(graph, stochastic=False, hidden=cfg.hidden)
     run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"ddpg-{cfg.task.name}", config=options(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"ddpg-{cfg.task.name}", config=cfg)
 
     task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
     make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)

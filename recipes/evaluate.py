@@ -18,10 +18,11 @@ from torchrl_gn.data import collect_trajectories
 from torchrl_gn.evaluation import report
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.progress import HORIZON, collecting
 
 
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="evaluate")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -33,10 +34,11 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     run = RunFolder(cfg.run_dir, "evaluate")
     run.write_config(OmegaConf.to_yaml(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name="evaluate", config=cfg)
     with collecting("test data") as show:
         test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, progress=show)
     table, files = report(model, test, run.path)
-    run.write_metrics(table.to_metrics(), seed=cfg.seed)
+    tracker.finish(run.write_metrics(table.to_metrics(), seed=cfg.seed), files)
     print(table)
     for path in [*files, run.path / "metrics.json"]:
         print(path)

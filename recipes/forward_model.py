@@ -50,6 +50,7 @@ from torchrl_gn.training import (
     join_workers,
     load_checkpoint,
     make_optimizer,
+    with_help,
 )
 from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
 
@@ -147,7 +148,9 @@ def extra_trajectories(source: str, length: int) -> TensorDict:
         raise ValueError(f"data.extra={source} has episodes of {steps} steps, fewer than data.length={length}.")
     states, actions = (kept[name].unfold(1, length + more, length) for name, more in (("state", 1), ("action", 0)))
     pieces = {"state": states.movedim(-1, 2).flatten(0, 1), "action": actions.movedim(-1, 2).flatten(0, 1)}
-    return TensorDict(pieces, [episodes * (steps // length)])
+    # An episode whose simulation became unstable is NaN from there on.
+    whole = pieces["state"].isfinite().flatten(1).all(1)
+    return TensorDict({name: piece[whole] for name, piece in pieces.items()}, [int(whole.sum())])
 
 
 def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
@@ -252,7 +255,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
         run.write_config(OmegaConf.to_yaml(cfg))
     names = "-".join(scene.name for scene in scenes)
     logger = cfg.logger if workers.first else "none"
-    tracker = Tracker(logger, run.path / "log", name=f"forward_model-{names}", config=options(cfg))
+    tracker = Tracker(logger, run.path / "log", name=f"forward_model-{names}", config=cfg)
 
     with workers.first_goes_first():
         tasks = make_tasks(cfg, scenes, Path(cfg.data.folder) if cfg.data.folder else run.data)
@@ -279,16 +282,15 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
         "outside_model_share": trainer.outside_share(),
     }
     metrics = run.write_metrics(metrics, seed=cfg.seed)
-    tracker.log(metrics, trainer.step)
     for name, table in tables.items():
         tracker.log_table(f"errors of {name}", table.rows())
-    tracker.log_files([*files, run.checkpoint])
-    tracker.close()
+    tracker.finish(metrics, [*files, run.checkpoint], trainer.step)
     print(tables[scenes[0].name] if len(tables) == 1 else summary(tables))
     for path in [*files, run.path / "metrics.json", run.checkpoint]:
         print(path)
 
 
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="forward_model")
 @clean_exit
 def main(cfg: DictConfig) -> None:

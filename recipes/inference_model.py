@@ -58,6 +58,7 @@ from torchrl_gn.training import (
     clean_exit,
     load_checkpoint,
     make_optimizer,
+    with_help,
 )
 from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
 from torchrl_gn.training.sweep import Run, refuse_failures, run_all
@@ -193,6 +194,7 @@ def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, s
     return {name: evaluate_errors(bound, systems.predicted) for name, bound in models.items()}
 
 
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="inference_model")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -209,7 +211,7 @@ def main(cfg: DictConfig) -> None:
         forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", **options(cfg.model))
         model = IdentifyingModel(forward_model, **options(cfg.inference))
     run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"inference_model-{scene.name}", config=options(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"inference_model-{scene.name}", config=cfg)
 
     data = Path(cfg.data.folder) if cfg.data.folder else run.data
     dataset = dataset_with_progress(data, scene, cfg.data, variants=cfg.data.train)
@@ -243,9 +245,7 @@ def main(cfg: DictConfig) -> None:
     metrics |= {f"observed steps/{steps}/rollout_error_100": value for steps, value in curve.items()}
     metrics |= {f"read from the inferred graph/{name}": value for name, value in readable.items()}
     metrics |= {"validation_error": trainer.best, "steps": trainer.step, "training_seconds": trainer.seconds}
-    tracker.log(run.write_metrics(metrics, seed=cfg.seed), trainer.step)
-    tracker.log_files([*files, run.checkpoint])
-    tracker.close()
+    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), [*files, run.checkpoint], trainer.step)
     print(summary(tables))
     print("\nShare of each parameter's variance that a linear map reads from the inferred graph:")
     print("  ".join(f"{name} {value:.2f}" for name, value in readable.items()))

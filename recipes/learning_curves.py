@@ -22,7 +22,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_gn.evaluation import plot_learning_curves
-from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.sweep import Run, folder_name, report_sweep, run_all
 
 
@@ -47,11 +47,13 @@ def quartiles(values: list[float]) -> tuple[float, float, float]:
     return float(low), float(middle), float(high)
 
 
+@with_help
 @hydra.main(config_path="config", config_name="learning_curves", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "learning_curves")
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name="learning_curves", config=cfg)
     runs = make_runs(cfg, folder.path)
     in_turn = [run for of in zip(*runs.values(), strict=True) for run in of]
     failed = run_all(in_turn, cfg.jobs, desc="learning")
@@ -78,7 +80,7 @@ def main(cfg: DictConfig) -> None:
         lines.append("| " + " | ".join(cells) + " |")
     if curves:
         plot_learning_curves(curves, folder.file("curves.png"))
-    report_sweep(folder, lines, {}, metrics, failed, seed=cfg.seeds[0])
+    report_sweep(folder, lines, {}, metrics, failed, tracker, seed=cfg.seeds[0])
 
 
 if __name__ == "__main__":

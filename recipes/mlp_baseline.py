@@ -22,7 +22,7 @@ from statistics import mean
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.sweep import Run, best, folder_name, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
@@ -53,6 +53,7 @@ def values(runs: list[Run], key: str) -> list[float]:
     return [math.inf if metrics[key] is None else float(metrics[key]) for metrics in done if metrics is not None]
 
 
+@with_help
 @hydra.main(config_path="config", config_name="mlp_baseline", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -60,6 +61,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.data_dir is None:
         cfg.data_dir = str(folder.data)
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name="mlp_baseline", config=cfg)
     mlps, first = candidates(cfg), cfg.seeds[0]
 
     def runs(system: str, names: list[str], minutes: float, seeds: list[int]) -> list[Run]:
@@ -108,7 +110,7 @@ def main(cfg: DictConfig) -> None:
         steps = " / ".join(f"{mean(values(final[system, kind], 'steps') or [0]):,.0f}" for kind in ("GN", "MLP"))
         metrics[f"{system}/best"] = winner
         lines.append("| " + " | ".join([system, *cells, winner, steps]) + " |")
-    report_sweep(folder, lines, bars, metrics, failed, seed=first)
+    report_sweep(folder, lines, bars, metrics, failed, tracker, seed=first)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from safetensors.torch import load_file
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.sweep import Run, report_sweep, run_all
 
 RECIPES = Path(__file__).parent
@@ -45,6 +45,7 @@ def learning(cfg: DictConfig, folder: Path, index: int, model: str, played: list
     return Run(RECIPES / "forward_model.py", folder / f"learned{index}", options, f"learning, round {index}")
 
 
+@with_help
 @hydra.main(config_path="config", config_name="plan_and_learn", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -52,6 +53,7 @@ def main(cfg: DictConfig) -> None:
     model = cfg.checkpoint or cfg.system
     load_model(model)  # refused before anything is written
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name="plan_and_learn", config=cfg)
     place = folder.path.resolve()  # named in the rounds' options, which may not change
     lines = ["| round | mean reward (spread over starts) | ms a step | one-step error | 100 steps |", "|---" * 5 + "|"]
     metrics: dict[str, float] = {}
@@ -81,7 +83,7 @@ def main(cfg: DictConfig) -> None:
     if rewards:
         curves = {f"round {index}": values for index, values in enumerate(rewards)}
         plot_rewards(curves, folder.file("rewards.png"), timestep=load_scene(cfg.system).timestep, ylabel="reward")
-    report_sweep(folder, lines, {}, metrics, failed, seed=cfg.seed)
+    report_sweep(folder, lines, {}, metrics, failed, tracker, seed=cfg.seed)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from tqdm import tqdm
 from torchrl_gn.evaluation import fresh_errors, summary
 from torchrl_gn.modules import Agent
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import clean_exit, load_checkpoint, save_checkpoint
+from torchrl_gn.training import clean_exit, load_checkpoint, save_checkpoint, with_help
 
 
 def without_places(value: Any) -> Any:
@@ -37,6 +37,7 @@ def without_places(value: Any) -> Any:
     return Path(value).name if isinstance(value, str) and os.sep in value else value
 
 
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="publish")
 @clean_exit
 def main(cfg: DictConfig) -> None:

@@ -43,7 +43,7 @@ from torchrl_gn.modules import (
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import Scene, has_variants, load_scene, make_variants, parameter_ranges
-from torchrl_gn.training import RunFolder, clean_exit
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.sweep import Run, refuse_failures, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
@@ -328,6 +328,7 @@ def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
     return {name: Setting(model, exact, *inputs) for name, model in models.items()}
 
 
+@with_help
 @hydra.main(config_path="config", config_name="stability", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -335,6 +336,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     run = RunFolder(cfg.run_dir, "stability")
     run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, run.path / "log", name="stability", config=cfg)
     checkpoint = cfg.checkpoint or run.path / "model"
     if not cfg.checkpoint:
         options = (f"system={cfg.system}", f"minutes={cfg.minutes}", f"seed={cfg.seed}", f"threads={cfg.threads}")
@@ -358,7 +360,7 @@ def main(cfg: DictConfig) -> None:
                 failed.append(f"{check.name}, {name}: {figure:.1e} > {check.limits[name]:.1e}")
         limits = sorted({f"{limit:.0e}" for limit in check.limits.values()}, key=float)
         lines.append(f"{check.name:46}{cells}   {' '.join(limits)}")
-    run.write_metrics({**metrics, "failed": len(failed)}, seed=cfg.seed)
+    tracker.finish(run.write_metrics({**metrics, "failed": len(failed)}, seed=cfg.seed), run.written)
     print(f"{prepared['float64'].scene.name}: figures by dtype of the network (!: over its limit)")
     print(f"{'':46}" + "".join(f"{name:>10} " for name in DTYPES) + "   limits")
     print("\n".join(lines))

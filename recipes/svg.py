@@ -21,6 +21,7 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.objectives import LossModule, ValueEstimators
+from tqdm import tqdm
 
 from torchrl_gn.envs import observation_env
 from torchrl_gn.modules import Agent
@@ -38,6 +39,7 @@ from torchrl_gn.training import (
     make_agent_optimizer,
     mean_return,
     report_learning,
+    with_help,
 )
 
 # When a run goes on.
@@ -50,6 +52,7 @@ MAY_CHANGE = (
     "checkpoint_seconds",
     "ray",
     "collectors",
+    "evaluate_on",
 )
 
 
@@ -67,6 +70,7 @@ def make_losses(cfg: DictConfig, agent: Agent) -> list[LossModule]:
     return [loss] if agent.model is None else [loss, ObservationModelLoss(agent.model, agent.reward)]
 
 
+@with_help
 @hydra.main(version_base=None, config_path="config", config_name="svg")
 @clean_exit
 def main(cfg: DictConfig) -> None:
@@ -79,13 +83,16 @@ def main(cfg: DictConfig) -> None:
     if begun:
         run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
     graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, options(cfg)["task"]["graph"])
+    if cfg.evaluate_on and cfg.agent.policy != "graph":
+        raise ValueError("Only a graph network drives other bodies; evaluate_on needs agent.policy=graph.")
+    others = {name: ObservationGraph.of_task(cfg.task.domain, name) for name in cfg.evaluate_on}
     more = options(cfg.agent)
     if cfg.horizon == 0:
         more["model"] = None
     learned = cfg.task.reward == "learned" and cfg.horizon > 0
     agent = begun.agent if begun else Agent(graph, learned_reward=learned, **more)
     run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"svg{cfg.horizon}-{cfg.task.name}", config=options(cfg))
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"svg{cfg.horizon}-{cfg.task.name}", config=cfg)
 
     task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
     make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)
@@ -104,7 +111,11 @@ def main(cfg: DictConfig) -> None:
             **options(cfg.trainer),
         )
         learn_with_progress(trainer, run.checkpoint, begun, tracker, config=options(cfg))
-    report_learning(trainer, run, tracker, label=f"SVG({cfg.horizon})", seed=cfg.seed)
+    returns = {}
+    for name, other in tqdm(others.items(), desc="other bodies", leave=False, disable=not others):
+        env = observation_env(other, cfg.task.domain, name, num_envs=cfg.evaluate_episodes, **task)
+        returns[f"return/{name}"] = mean_return(env, agent.policy_for(other), cfg.task.steps, seed=10_000)
+    report_learning(trainer, run, tracker, label=f"SVG({cfg.horizon})", seed=cfg.seed, more=returns)
 
 
 if __name__ == "__main__":

@@ -60,6 +60,16 @@ def check_options(recipe: str, options: list[str]) -> None:
             hydra.compose(inner, overrides=list(config[key]))
 
 
+@pytest.mark.parametrize("recipe", sorted(path.stem for path in (ROOT / "recipes").glob("*.py")))
+def test_every_recipe_helps_and_logs(recipe):
+    source, options = (ROOT / "recipes" / name for name in (f"{recipe}.py", f"config/{recipe}.yaml"))
+    assert "@with_help\n@hydra.main(" in source.read_text()
+    if recipe == "publish":  # it makes a file of a model, and has no run
+        return
+    assert "\nlogger: none" in options.read_text()
+    assert re.search(r"tracker\.finish\(|report_sweep\(.* tracker,|report_learning\(.* tracker,", source.read_text())
+
+
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if scripts(page)], ids=lambda page: str(page.relative_to(ROOT))
 )

@@ -97,7 +97,9 @@ class Checkpoint:
 
     def _as(self, kind: type[_Kind]) -> _Kind:
         if not isinstance(self.trained, kind):
-            raise CheckpointError(f"The checkpoint holds a {type(self.trained).__name__}, no {kind.__name__}.")
+            raise CheckpointError(
+                f"The checkpoint holds a {type(self.trained).__name__} (its attribute trained), not a {kind.__name__}."
+            )
         return self.trained
 
     def scenes(self) -> list[Scene]:
@@ -112,7 +114,10 @@ class Checkpoint:
         """
         if len(self.scene_descriptions) != 1:
             names = [scene.name for scene in self.scenes()]
-            raise CheckpointError(f"The model was trained on several scenes, {names}; say which one to use.")
+            raise CheckpointError(
+                f"The model was trained on several scenes, {names}; say which one to use: system= of a recipe, or one"
+                " of scenes()."
+            )
         return scene_from_description(self.scene_descriptions[0])
 
 

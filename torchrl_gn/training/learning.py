@@ -50,7 +50,15 @@ def learn_with_progress(
     save()
 
 
-def report_learning(trainer: OffPolicyTrainer, run: RunFolder, tracker: Tracker, *, label: str, seed: int) -> None:
+def report_learning(
+    trainer: OffPolicyTrainer,
+    run: RunFolder,
+    tracker: Tracker,
+    *,
+    label: str,
+    seed: int,
+    more: Mapping[str, float] | None = None,
+) -> None:
     """Write ``curve.json``, ``curve.png`` and ``metrics.json``, and print a table and the paths.
 
     Args:
@@ -59,6 +67,7 @@ def report_learning(trainer: OffPolicyTrainer, run: RunFolder, tracker: Tracker,
         tracker: what the figure is logged with.
         label: what to call the agent.
         seed: of the run.
+        more: further numbers of the metrics.
     """
     curve = trainer.curve
     write_json(run.file("curve.json"), vars(curve))
@@ -73,10 +82,10 @@ def report_learning(trainer: OffPolicyTrainer, run: RunFolder, tracker: Tracker,
         "learning_seconds": trainer.seconds,
         "updates_per_second": trainer.updates / max(trainer.seconds, 1e-9),
         "frames_per_second": trainer.frames / max(trainer.seconds, 1e-9),
+        **(more or {}),
     }
     run.write_metrics(numbers, seed=seed)
-    tracker.log_files([*run.written, run.checkpoint])
-    tracker.close()
+    tracker.finish(numbers, [*run.written, run.checkpoint], trainer.frames)
     width = max(map(len, numbers))
     for name, value in numbers.items():
         tqdm.write(f"{name:{width}}  {value:,.4g}")

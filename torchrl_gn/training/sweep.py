@@ -20,6 +20,7 @@ from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.evaluation import plot_bars
 from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.run_folder import RunFolder
+from torchrl_gn.training.tracking import Tracker
 
 OPTIONS_FILE = "options.json"
 MAY_DIFFER = ("threads=", "compile=", "data.folder=")  # of a finished run
@@ -126,10 +127,11 @@ def report_sweep(
     bars: Mapping[str, Mapping[str, Mapping[str, tuple[float, float]]]],
     metrics: Mapping[str, Any],
     failed: Sequence[Run],
+    tracker: Tracker,
     *,
     seed: int,
 ) -> None:
-    """Write what a sweep found, print it, and say what failed.
+    """Write what a sweep found, log it, print it, and say what failed.
 
     Args:
         folder: where ``table.md``, ``errors.png`` and ``metrics.json`` go.
@@ -137,6 +139,7 @@ def report_sweep(
         bars: as :func:`~torchrl_gn.evaluation.plot_bars` takes them; none are drawn if there are none.
         metrics: flat names and plain numbers.
         failed: runs that failed.
+        tracker: what the numbers and figures are logged with, and which is closed.
         seed: the sweep's first seed.
 
     Raises:
@@ -146,7 +149,7 @@ def report_sweep(
         temporary.write_text("\n".join(lines) + "\n")
     if bars:
         plot_bars(bars, folder.file("errors.png"))
-    folder.write_metrics({**metrics, "failed": len(failed)}, seed=seed)
+    tracker.finish(folder.write_metrics({**metrics, "failed": len(failed)}, seed=seed), folder.written)
     tqdm.write("\n".join(lines))
     for path in folder.written:
         tqdm.write(str(path))

@@ -22,7 +22,7 @@ class Tracker:
             login), wandb runs offline; ``wandb sync`` uploads such a run later.
         folder: where the logger writes, in the run's folder.
         name: name of the run.
-        config: configuration of the run.
+        config: configuration of the run, as Hydra gives it, or plain values.
 
     Raises:
         ValueError: if the kind is unknown.
@@ -36,6 +36,7 @@ class Tracker:
         self._logger: Any = None
         if kind == "none":
             return
+        config = _plain(config)
         from torchrl.record.loggers import get_logger
 
         options: dict[str, Any] = {}
@@ -43,7 +44,7 @@ class Tracker:
             options["wandb_kwargs"] = {
                 "offline": not _has_account(),
                 "project": "torchrl_gn",
-                "config": dict(config),
+                "config": config,
                 # The same folder is the same run, so that a resumed run goes on where it was.
                 "id": hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
                 "log_env_packages": False,
@@ -115,12 +116,27 @@ class Tracker:
             lines = [titles, ["---"] * len(titles), *data]
             self._logger.experiment.add_text(name, "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines))
 
+    def finish(self, numbers: Mapping[str, float], paths: Sequence[Path], step: int = 0) -> None:
+        """Log what came out of the run, its numbers and its files, and close."""
+        self.log(numbers, step)
+        self.log_files(paths)
+        self.close()
+
     def close(self) -> None:
         """Finish the run."""
         if self.kind == "wandb":
             self._logger.experiment.finish()
         elif self.kind == "tensorboard":
             self._logger.experiment.close()
+
+
+def _plain(value: Any) -> Any:
+    """Nested mappings and lists of any kind as dictionaries and lists."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(each) for each in value]
+    return value
 
 
 def _has_account() -> bool:

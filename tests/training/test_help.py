@@ -1,0 +1,76 @@
+"""What `--help` of a recipe shows."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import pytest
+
+from torchrl_gn.training.help import commented_options
+
+YAML = """# Options of a recipe.
+size: 3            # of something
+
+data:
+  folder: null     # where
+  hydra: 1         # an option of that name
+
+hydra:
+  run: {dir: .}
+  job:
+    chdir: false
+
+defaults:
+  - task: swimmer6 # or another
+  - _self_
+  - override hydra/job_logging: disabled
+"""
+
+RECIPE = """'''What it does.
+
+    how it is called
+'''
+from functools import wraps
+from torchrl_gn.training import with_help
+
+ran = []
+
+
+@with_help
+@lambda function: wraps(function)(lambda: ran.append(True))
+def main():
+    pass
+"""
+
+
+def test_options_keep_their_comments_and_lose_what_hydra_is_told():
+    kept = """# Options of a recipe.
+size: 3            # of something
+
+data:
+  folder: null     # where
+  hydra: 1         # an option of that name
+
+defaults:
+  - task: swimmer6 # or another
+"""
+    assert commented_options(YAML) == kept
+    assert commented_options(YAML.replace("  - task: swimmer6 # or another\n", "")) == kept.split("\ndefaults:")[0]
+
+
+@pytest.mark.parametrize("word", ["--help", "-h", "size=4"])
+def test_help_is_the_first_lines_and_the_options(word, tmp_path, monkeypatch, capsys):
+    (tmp_path / "config").mkdir()
+    (tmp_path / "config" / "small_recipe.yaml").write_text(YAML)
+    (tmp_path / "small_recipe.py").write_text(RECIPE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["small_recipe.py", word])
+    monkeypatch.delitem(sys.modules, "small_recipe", raising=False)
+    recipe = importlib.import_module("small_recipe")
+    recipe.main()
+    said = capsys.readouterr().out
+    if word == "size=4":
+        assert recipe.ran and not said
+    else:
+        assert not recipe.ran and said == f"What it does.\n\n    how it is called\n\n{commented_options(YAML)}"
