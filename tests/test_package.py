@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import ast
+import itertools
+import re
 import subprocess
 import sys
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -49,6 +53,27 @@ def test_imports_point_one_way(file):
     parts = {name[1] for name in inside if len(name) > 1}
     wrong = parts - ALLOWED[folder] - ANYWHERE - {folder}
     assert not wrong, f"torchrl_gn.{folder} must not import torchrl_gn.{', '.join(sorted(wrong))}"
+
+
+def test_what_is_imported_is_declared():
+    """What only a dependency of a dependency brings would one day fail a plain install."""
+    lines = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    needed, optional = (
+        {re.split(r"[<>=\[]", line)[0] for line in some}
+        for some in (lines["dependencies"], itertools.chain(*lines["optional-dependencies"].values()))
+    )
+    brought_by = metadata.packages_distributions()
+    for file in PACKAGE.rglob("*.py"):
+        parsed = ast.parse(file.read_text())
+        inside = [node for node in ast.walk(parsed) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
+        later = {name for function in inside for name in imports(function)}
+        for name in imports(parsed):
+            package = name.split(".")[0]
+            if package in sys.stdlib_module_names | {"torchrl_gn"}:
+                continue
+            known = needed | optional if name in later else needed
+            distributions = {found.replace("_", "-") for found in brought_by[package]}
+            assert distributions & known, f"{file.name} imports {name}, which pyproject.toml does not name"
 
 
 def test_every_folder_has_a_place_in_the_order():

@@ -19,15 +19,16 @@ def test_a_shipped_model_has_the_errors_that_it_states(name):
     trained, stated = loaded.trained, dict(loaded.metrics)
     assert not isinstance(trained, Agent)
     how = stated.pop("evaluation")
-    scene = loaded.scenes()[0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # it is at home in its own scene
-        errors = fresh_errors(trained, scene, **how)
-    for key, value in stated[scene.name].items():
-        assert errors[key].total == pytest.approx(value, rel=0.05), key
-        assert value < 1
-    for other in stated.keys() - {scene.name}:
-        trained.bind(load_scene(other))
+    scenes = {scene.name: scene for scene in loaded.scenes()}
+    assert scenes.keys() <= stated.keys()
+    # Of many lengths of swimmers, some that it was trained on and some that it was not: long ones take their time.
+    for system in list(stated)[:: 5 if len(stated) > 5 else 1]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # it is at home in its own scenes, and in others that it states errors of
+            errors = fresh_errors(trained, scenes.get(system) or load_scene(system), **how)
+        for key, value in stated[system].items():
+            assert errors[key].total == pytest.approx(value, rel=0.05), (system, key)
+            assert value < 1
 
 
 def test_there_are_some_and_they_are_small():
