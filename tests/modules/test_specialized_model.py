@@ -347,10 +347,10 @@ def test_compiled_rollouts_and_their_gradients(scenes, make_model, random_states
         old.sum().backward()
 
 
-def test_compiling_without_a_compiler_is_refused(scenes, make_model, monkeypatch):
-    monkeypatch.setattr("torch._inductor.config.cpp.cxx", ("no-such-compiler",))
-    from torch._inductor import cpp_builder
+def test_compiling_without_a_compiler_is_refused(scenes, make_model):
+    from torch._inductor import config, cpp_builder
 
     getattr(cpp_builder.get_cpp_compiler, "cache_clear", lambda: None)()
-    with pytest.raises(FileNotFoundError, match="compile=True needs a C\\+\\+ compiler: install g\\+\\+"):
+    missing = pytest.raises(FileNotFoundError, match="compile=True needs a C\\+\\+ compiler: install g\\+\\+")
+    with config.patch({"cpp.cxx": ("no-such-compiler",)}), missing:
         specialize(make_model(scenes["swimmer6"]).bind(scenes["swimmer6"]), compile=True)

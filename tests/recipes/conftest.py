@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -61,17 +63,31 @@ def _run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
     return process.returncode, output, errors
 
 
+@functools.cache
+def _load(recipe: str) -> ModuleType:
+    """A recipe's own functions."""
+    pytest.importorskip("hydra")
+    spec = importlib.util.spec_from_file_location(f"recipe_{recipe}", ROOT / "recipes" / f"{recipe}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for it
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def load() -> Callable[[str], ModuleType]:
+    """A recipe's own functions."""
+    return _load
+
+
 @pytest.fixture
-def call(capfd, monkeypatch) -> Callable[..., tuple[int, str, str]]:
+def call(capfd) -> Callable[..., tuple[int, str, str]]:
     """As ``run``, in this process and without Hydra's command line: for runs shorter than the recipe's imports."""
     hydra = pytest.importorskip("hydra")
 
     def call(*options: str, recipe: str) -> tuple[int, str, str]:
-        spec = importlib.util.spec_from_file_location(f"recipe_{recipe}", ROOT / "recipes" / f"{recipe}.py")
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        monkeypatch.setitem(sys.modules, spec.name, module)  # where dataclasses look for it
-        spec.loader.exec_module(module)
+        module = _load(recipe)
         with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
             config = hydra.compose(recipe, overrides=list(options))
         capfd.readouterr()

@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
-import pytest
 from omegaconf import OmegaConf
 
 from torchrl_gn.scenes import load_scene
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "data_shift.py"
 
-
-@pytest.fixture(scope="module")
-def recipe():
-    spec = importlib.util.spec_from_file_location("recipe_data_shift", RECIPE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_gait_that_is_found_carries_the_swimmer(recipe):
+def test_the_gait_that_is_found_carries_the_swimmer(load):
+    recipe = load("data_shift")
     scene, rng = load_scene("swimmer6"), np.random.default_rng(0)
     cfg = OmegaConf.create({"search": {"generations": 3, "population": 16, "starts": 1, "steps": 200}})
     gait, _ = recipe.find_gait(scene, cfg, rng)

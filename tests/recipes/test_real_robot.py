@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
@@ -26,16 +23,9 @@ SMALL = (
 )
 
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "real_robot.py"
-
-
 @pytest.fixture(scope="module")
-def recipe():
-    spec = importlib.util.spec_from_file_location("recipe_real_robot", RECIPE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def recipe(load):
+    return load("real_robot")
 
 
 @pytest.fixture(scope="module")

@@ -49,7 +49,7 @@ def rollout_video(
         truth: ``[T + 1, N, 13]`` true states.
         prediction: ``[T + 1, N, 13]`` predicted states, or None to show the truth alone;
             frames of states that are not finite say so.
-        path: file to write: ``.gif``, or ``.mp4`` (needs ``imageio[ffmpeg]``).
+        path: file to write: ``.gif``, or ``.mp4`` (needs imageio-ffmpeg).
         speed: 1 is real time. States are skipped where frames would be shorter than
             20 ms (walker at 2.5 ms: every eighth state is shown).
         size: width and height of a panel, pixels.
@@ -62,7 +62,8 @@ def rollout_video(
 
     Raises:
         ValueError: if shapes do not fit the scene, the truth is not finite, or an option is unknown.
-        RuntimeError: if ``engine="gl"`` cannot render here, or ``.mp4`` cannot be written.
+        RuntimeError: if ``engine="gl"`` cannot render here.
+        ImportError: if an ``.mp4`` is asked for and imageio-ffmpeg is not installed.
     """
     path = Path(path)
     if path.suffix not in (".gif", ".mp4"):
@@ -179,7 +180,7 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
     try:
         import imageio_ffmpeg
     except ImportError:
-        raise RuntimeError("Writing .mp4 needs ffmpeg: pip install 'imageio[ffmpeg]', or write a .gif.") from None
+        raise ImportError("Writing .mp4 needs ffmpeg: pip install imageio-ffmpeg, or write a .gif.") from None
     first = next(frames)
     # Rates need not be whole numbers, whatever the annotation says.
     rate: Any = 1 / seconds
