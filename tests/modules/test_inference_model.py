@@ -105,7 +105,7 @@ def test_what_is_inferred_is_the_mean_of_what_each_observation_tells(readout, ma
             expected = told[-1] if readout == "last" else (weight * told).sum(0) / weight.sum(0)
             torch.testing.assert_close(known[count - 1][key], expected)
             assert (weight.std(0) > 0).all() if readout == "weighted" and count > 1 else (weight > 0).all()
-    with pytest.raises(ValueError, match="readout must be 'weighted', 'mean' or 'last', got 'first'"):
+    with pytest.raises(ValueError, match="readout must be 'mean', 'weighted' or 'last', got 'first'"):
         InferenceModel(GraphSize(3, 2, 1), readout="first")
 
 

@@ -67,9 +67,8 @@ class InferenceModel(nn.Module):
         node_hidden: hidden sizes of the node MLP.
         global_hidden: hidden sizes of the global MLP.
         activation: between the layers.
-        readout: what is inferred of several observations: the mean of what the network says after each,
-            ``"weighted"`` by how much it says that each feature tells, or all alike (``"mean"``), or what it says after
-            the ``"last"`` (paper).
+        readout: what is inferred of several observations: the ``"mean"`` of what the network says after each, that mean
+            ``"weighted"`` by how much it says that each feature tells, or what it says after the ``"last"`` (paper).
 
     Raises:
         ValueError: if ``readout`` or the activation is not known.
@@ -85,11 +84,11 @@ class InferenceModel(nn.Module):
         node_hidden: Sequence[int] = (64, 64),
         global_hidden: Sequence[int] = (64, 64),
         activation: str = "silu",
-        readout: Literal["weighted", "mean", "last"] = "weighted",
+        readout: Literal["mean", "weighted", "last"] = "mean",
     ) -> None:
         super().__init__()
-        if readout not in ("weighted", "mean", "last"):
-            raise ValueError(f"readout must be 'weighted', 'mean' or 'last', got {readout!r}.")
+        if readout not in ("mean", "weighted", "last"):
+            raise ValueError(f"readout must be 'mean', 'weighted' or 'last', got {readout!r}.")
         self.readout = readout
         self.inferred_size, self.memory_size = GraphSize(*inferred), GraphSize(*memory)
         self.options = {
