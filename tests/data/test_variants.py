@@ -88,7 +88,7 @@ def test_variants_are_stable() -> None:
         scenes = sample_variants(system, 12 if system == "jaco" else 60, 5)  # an arm takes its time
         rng = np.random.default_rng(0)
         starts = np.concatenate([sample_start_states(scene, 1, rng) for scene in scenes])
-        played = Simulator(scenes).rollout(starts, spline_controls(scenes[0], 60, 30, rng))
+        played = Simulator(scenes).rollout(starts, spline_controls(scenes[0], len(scenes), 30, rng))
         assert played["stable"].all(), system
 
 
