@@ -28,6 +28,7 @@ from torchrl_gn.modules import FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import (
+    Budget,
     RunFolder,
     Tracker,
     Trainer,
@@ -37,7 +38,6 @@ from torchrl_gn.training import (
     make_optimizer,
     with_help,
 )
-from torchrl_gn.training.budget import Budget
 
 PART = "TORCHRL_GN_BENCHMARK"  # set in the processes that are timed: where they leave their times
 

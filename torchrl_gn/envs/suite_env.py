@@ -57,13 +57,13 @@ def suite_env(
         raise ValueError(f"num_envs={num_envs} and steps={steps} must be at least 1.")
     seeds = np.random.SeedSequence(seed).generate_state(num_envs).tolist()
     make = partial(_make, domain, task, timestep, steps)
-    entries = _load(domain, task, 0).observation_spec()
-    order = tuple(entries) if keys is None else tuple(keys)
+    order = tuple(_load(domain, task, 0).observation_spec()) if keys is None else tuple(keys)
     env = SerialEnv(num_envs, [partial(make, seed=int(each)) for each in seeds])
     env = TransformedEnv(env, DoubleToFloat())
-    for key, rank in ((key, len(entries[key].shape)) for key in order):
-        if rank > 1:
-            env.append_transform(FlattenObservation(-rank, -1, in_keys=[key]))
+    for key in order:
+        axes = env.observation_spec[key].ndim - 1  # beside the environments'
+        if axes > 1:
+            env.append_transform(FlattenObservation(-axes, -1, in_keys=[key]))
     env.append_transform(CatTensors(in_keys=list(order), out_key="observation", sort=False))
     return env
 
