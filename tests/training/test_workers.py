@@ -11,12 +11,12 @@ import torch
 
 from torchrl_gn.training import Workers, join_workers
 
-from .train_together import train
+from .train_together import PRESETS, train
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory) -> list[dict[str, torch.Tensor]]:
-    """What each of two processes ended with."""
+def results(tmp_path_factory) -> list[dict[str, dict[str, torch.Tensor]]]:
+    """What each of two processes ended with, by optimiser."""
     folder = tmp_path_factory.mktemp("together")
     script = Path(__file__).with_name("train_together.py")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", script, folder]
@@ -25,18 +25,23 @@ def results(tmp_path_factory) -> list[dict[str, torch.Tensor]]:
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
 
 
-def test_all_end_with_the_same_weights_and_statistics(results):
-    first, second = results
+@pytest.mark.parametrize("preset", PRESETS)
+def test_all_end_with_the_same_weights_and_statistics(results, preset):
+    first, second = (result[preset] for result in results)
     for name in first:
         assert torch.equal(first[name], second[name]), name
 
 
-def test_one_process_trains_the_same_but_for_rounding(results):
-    alone = train(Workers())
+@pytest.mark.parametrize("preset", PRESETS)
+def test_one_process_trains_the_same_but_for_rounding(results, preset):
+    alone, together = train(Workers(), preset), results[0][preset]
     assert len(alone["losses"]) == 24  # patience ended it: at 80 % of 30 steps, five validations after the best
     assert alone["best"] == 1.0
+    # Muon makes its steps orthogonal in bfloat16: a gradient that differs in its last bit may be rounded the other way.
+    tolerance = {"adam": 1e-5, "muon": 2e-2}[preset]
     for name, value in alone.items():
-        torch.testing.assert_close(results[0][name], value, rtol=1e-5, atol=1e-6, msg=name)
+        within = 1e-3 if name == "losses" and preset == "muon" else tolerance
+        assert (together[name] - value).norm() <= within * value.norm(), name
 
 
 def test_a_process_alone_needs_no_others():

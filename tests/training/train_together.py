@@ -14,9 +14,12 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Trainer, Workers, join_workers, make_optimizer
 from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.optimizers import Preset
+
+PRESETS: tuple[Preset, ...] = ("adam", "muon")
 
 
-def train(workers: Workers, *, steps: int = 30) -> dict[str, torch.Tensor]:
+def train(workers: Workers, preset: Preset, *, steps: int = 30) -> dict[str, torch.Tensor]:
     """Weights and statistics after steps on transitions and windows; what each brings of its own must not show."""
     scene = load_scene("pendulum")
     trajectories = collect_trajectories(scene, num=20, steps=20)
@@ -31,7 +34,7 @@ def train(workers: Workers, *, steps: int = 30) -> dict[str, torch.Tensor]:
     trainer = Trainer(
         loss,
         trajectory_buffer(trajectories, batch_size=16, seed=0, shard=workers.shard),
-        make_optimizer(model.core, "muon"),
+        make_optimizer(model.core, preset),
         Budget(steps=steps),
         unroll=trajectory_buffer(trajectories, batch_size=8, window=3, seed=1, shard=workers.shard),
         unroll_fraction=0.5,
@@ -47,4 +50,5 @@ def train(workers: Workers, *, steps: int = 30) -> dict[str, torch.Tensor]:
 
 if __name__ == "__main__":
     with join_workers() as workers:
-        torch.save(train(workers), Path(sys.argv[1]) / f"{workers.rank}.pt")
+        results = {preset: train(workers, preset) for preset in PRESETS}
+        torch.save(results, Path(sys.argv[1]) / f"{workers.rank}.pt")
