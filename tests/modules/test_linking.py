@@ -181,7 +181,6 @@ def test_gradients_of_linking_by_joints(make_model):
     assert torch.autograd.gradcheck(
         lambda delta: bound.linking(state, bound.frame.matrices(state), delta * bound.live, std, bound.values),
         (raw.requires_grad_(),),
-        fast_mode=True,
     )
 
 

@@ -38,10 +38,12 @@ def test_one_process_trains_the_same_but_for_rounding(results, preset):
     assert len(alone["losses"]) == 24  # patience ended it: at 80 % of 30 steps, five validations after the best
     assert alone["best"] == 1.0
     # Muon makes its steps orthogonal in bfloat16: a gradient that differs in its last bit may be rounded the other way.
-    tolerance = {"adam": 1e-5, "muon": 2e-2}[preset]
+    rounded = {"core": 2e-2, "losses": 1e-3} if preset == "muon" else {}
     for name, value in alone.items():
-        within = 1e-3 if name == "losses" and preset == "muon" else tolerance
-        assert (together[name] - value).norm() <= within * value.norm(), name
+        if within := rounded.get(name.split(".")[0]):
+            assert (together[name] - value).norm() <= within * value.norm(), name
+        else:
+            torch.testing.assert_close(together[name], value, rtol=1e-5, atol=1e-6, msg=name)
 
 
 def test_a_process_alone_needs_no_others():

@@ -12,8 +12,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.modules import FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import Trainer, Workers, join_workers, make_optimizer
-from torchrl_gn.training.budget import Budget
+from torchrl_gn.training import Budget, Trainer, Workers, join_workers, make_optimizer
 from torchrl_gn.training.optimizers import Preset
 
 PRESETS: tuple[Preset, ...] = ("adam", "muon")
