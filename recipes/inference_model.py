@@ -87,7 +87,9 @@ def options(cfg: DictConfig) -> dict[str, Any]:
 def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset: TrajectoryDataset) -> Trainer:
     """Wire data, loss and optimiser together."""
     noise = torch.Generator().manual_seed(cfg.seed)
-    loss = IdentificationLoss(model, scene, phase=cfg.phase, parts=cfg.parts, noise=cfg.noise, generator=noise)
+    loss = IdentificationLoss(
+        model, scene, phase=cfg.phase, shortest=cfg.shortest, parts=cfg.parts, noise=cfg.noise, generator=noise
+    )
 
     def buffer(batch_size: int, length: int, seed: int):
         elsewhere = (cfg.parts, length)

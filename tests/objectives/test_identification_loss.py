@@ -50,6 +50,24 @@ def test_it_is_the_forward_models_loss_with_the_inferred_graph(make_loss, trajec
     torch.testing.assert_close(loss(batch)["loss_forward_model"], torch.stack(alone).mean())
 
 
+def test_a_random_number_of_steps_is_identified_from_the_last_of_the_phase(make_loss, trajectories):
+    loss = make_loss(phase=6, shortest=4, parts=1, generator=torch.Generator().manual_seed(0))
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(1, 1), seed=0).sample()
+    fewer = [make_loss(phase=steps)(batch[:, 6 - steps :])["loss_forward_model"].item() for steps in (4, 5, 6)]
+    drawn = [loss(batch)["loss_forward_model"].item() for _ in range(20)]
+    assert {round(value, 6) for value in drawn} == {round(value, 6) for value in fewer}
+    state = loss.training_state()
+    assert [loss(batch)["loss_forward_model"].item() for _ in range(9)] != drawn[:9]
+    after = loss(batch)["loss_forward_model"].item()
+    loss.load_training_state(state)
+    assert [loss(batch)["loss_forward_model"].item() for _ in range(10)][-1] == after
+    loss.eval()
+    assert loss(batch)["loss_forward_model"].item() == pytest.approx(fewer[-1])
+    for shortest in (0, 7):
+        with pytest.raises(ValueError, match=f"shortest={shortest} must be from 1 to phase=6"):
+            make_loss(phase=6, shortest=shortest)
+
+
 def test_one_loss_trains_both_models_and_identification_pays(make_loss, trajectories):
     loss = make_loss(phase=10, parts=4)
     buffer = trajectory_buffer(trajectories, batch_size=16, window=10, elsewhere=(4, 1), seed=0)

@@ -15,8 +15,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.modules import Agent, FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, ObservationModelLoss, SVGLoss
 from torchrl_gn.scenes import ObservationGraph, Scene, load_scene
-from torchrl_gn.training import OffPolicyTrainer, mean_return
-from torchrl_gn.training.budget import Budget
+from torchrl_gn.training import Budget, OffPolicyTrainer, mean_return
 from torchrl_gn.training.optimizers import make_optimizer
 from torchrl_gn.training.trainer import Trainer
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchrl_gn.training.budget import Budget
+from torchrl_gn.training import Budget
 
 
 def test_steps_count_steps_and_minutes_count_minutes():

@@ -14,8 +14,8 @@ from tensordict import TensorDict
 
 from torchrl_gn.modules import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
+from torchrl_gn.training import Budget
 from torchrl_gn.training import checkpoint as module
-from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.checkpoint import CheckpointError, load_checkpoint, package_versions, save_checkpoint
 
 

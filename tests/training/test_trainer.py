@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_gn.modules import fast_matmul
-from torchrl_gn.training.budget import Budget
+from torchrl_gn.training import Budget
 from torchrl_gn.training.checkpoint import load_checkpoint, save_checkpoint
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -24,10 +25,12 @@ class IdentificationLoss(LossModule):
     Args:
         model: the two models.
         scene: the standard scene of the samples.
-        phase: steps to identify a system from.
+        phase: steps to identify a system from, the most ...
+        shortest: ... and the fewest: every batch is identified from the last of its steps, a random number of them,
+            which is quicker and teaches what few steps tell. Default: always ``phase`` (paper).
         parts: other parts of the trajectory that are predicted with what was inferred.
         noise: of the input state, see :class:`ForwardModelLoss`.
-        generator: source of the noise.
+        generator: source of the noise and of these numbers; the global one if None.
 
     Input: ``state``, ``action`` and ``("next", "state")`` ``[B, phase + parts * H, ...]`` as
     ``trajectory_buffer(..., window=phase, elsewhere=(parts, H))`` draws them; over ``H`` steps the model is fed its own
@@ -45,6 +48,7 @@ class IdentificationLoss(LossModule):
         scene: Scene,
         *,
         phase: int = 20,
+        shortest: int | None = None,
         parts: int = 1,
         noise: float = 0.0,
         generator=None,
@@ -52,10 +56,13 @@ class IdentificationLoss(LossModule):
         super().__init__()
         if phase < 1 or parts < 1:
             raise ValueError(f"phase={phase} and parts={parts} must be at least 1.")
+        shortest = phase if shortest is None else shortest
+        if not 1 <= shortest <= phase:
+            raise ValueError(f"shortest={shortest} must be from 1 to phase={phase}.")
         self.identifying = model
         bound, self.inference = model.bind(scene)
         self.prediction = ForwardModelLoss(bound, noise=noise, generator=generator)
-        self.phase, self.parts = phase, parts
+        self.phase, self.shortest, self.parts = phase, shortest, parts
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         pass
@@ -99,7 +106,7 @@ class IdentificationLoss(LossModule):
                 f" trajectory_buffer(..., window={self.phase}, elsewhere=({self.parts}, H))."
             )
         state, action, next_state = (self._entry(tensordict, key) for key in self.in_keys)
-        seen = slice(self.phase)
+        seen = slice(self._skipped(), self.phase)
         static = self.inference.infer(state[:, seen], action[:, seen], next_state[:, seen]).static
         # Every part that is predicted is a sample of its own, [B * parts, H, ...].
         state, action, next_state = (
@@ -111,6 +118,15 @@ class IdentificationLoss(LossModule):
         static = static.apply(lambda value: value.unsqueeze(1).expand(*steps, *value.shape[1:]), batch_size=steps)
         entries = {"state": state, "action": action, "next": {"state": next_state}, "static": static}
         return self.prediction(TensorDict(entries, batch_size=steps))
+
+    def _skipped(self) -> int:
+        """Steps of the phase that this batch is not identified from."""
+        most = self.phase - self.shortest
+        if not most or not self.training:
+            return 0
+        generator = self.prediction.generator
+        device = None if generator is None else generator.device
+        return int(torch.randint(most + 1, (), generator=generator, device=device))
 
     def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         value = tensordict.get(key, None)
