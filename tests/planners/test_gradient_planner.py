@@ -175,6 +175,27 @@ def test_the_next_call_goes_on_from_the_last_plan():
     assert (fresh.planning(alone).double() - optimum[0]).abs() > (played["action"][0, 0].double() - optimum[0]).abs()
 
 
+def test_steps_shrink_where_they_gain_nothing_and_grow_where_they_do():
+    env, error, sizes = point_env(20.0), {}, {}
+    for shrink in (1.0, 0.7):
+        planner = GradientPlanner(env, HORIZON, 3, shrink=shrink, warm_up=200, samples=4, seed=0)
+        played = env.rollout(30, planner, tensordict=at(1.0, -0.5, 2.0), auto_reset=False)
+        best = -played["state"][:, :, 1, [0, 7]] @ torch.from_numpy(best_gains()[0]).T
+        error[shrink] = (played["action"] - best)[:, 15:].abs().mean()
+        sizes[shrink] = played["plan", "step_size"][..., 0]
+    assert error[0.7] < 0.4 * error[1.0]
+    assert (sizes[1.0] == 1).all()
+    assert (sizes[0.7][:, :1] == 1).all() and (sizes[0.7] <= 1).all() and 0.01 <= sizes[0.7][:, 15:].mean() < 0.5
+    # Two rows that go on from here, one of them thrown off: its steps grow at every step, the other's do not.
+    now = torch.cat([played[:1, -1].exclude("next", "action")] * 2)
+    now["plan", "step_size"] = torch.full((2, 1), 0.05)
+    now["state"][1, 1, 0] += 5.0
+    for _ in range(3):
+        planner.planning(now)
+    at_rest, thrown = now["plan", "step_size"][:, 0].tolist()
+    assert thrown == pytest.approx(0.4) and at_rest < 0.4
+
+
 def test_rows_are_planned_on_their_own():
     env = point_env(20.0)
     optimum = GradientPlanner(env, HORIZON, warm_up=150, samples=1, candidates=1, seed=0)
@@ -357,6 +378,7 @@ def test_bad_input_is_named():
         ({"horizon": 3, "warm_up": -1}, "warm_up must be at least 0"),
         ({"horizon": 3, "warm_up": 2.5}, "warm_up must be a whole number"),
         ({"horizon": 3, "noise": 2.0}, "noise must be in"),
+        ({"horizon": 3, "shrink": 0.0}, "shrink must be above 0 and at most 1, got 0"),
         ({"horizon": 3, "action_cost": float("inf")}, "action_cost finite"),
     ):
         with pytest.raises(ValueError, match=message):

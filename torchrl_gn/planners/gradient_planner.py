@@ -19,7 +19,9 @@ from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.modules import BoundForwardModel
 from torchrl_gn.modules.weights import frozen
-from torchrl_gn.planners.plan import check_count, check_plannable, plan_primer, read_plan, write_plan
+from torchrl_gn.planners.plan import KEY, check_count, check_plannable, plan_primer, read_plan, write_plan
+
+SMALLEST_STEP = 0.01  # as a share of the optimiser's
 
 OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
 
@@ -32,6 +34,10 @@ class GradientPlanner(MPCPlannerBase):
     (:meth:`~torchrl_gn.envs.ModelEnv.imagine`), differentiated with respect to the actions, and the actions changed, a
     number of times. The first is taken; the others, shifted by one step and with the last repeated, are where the
     next control step's planning starts (receding horizon). The best sequence seen counts, not the last.
+
+    An optimiser with a fixed rate cannot balance finely: near the best actions its steps go past them. So a state's
+    steps are ``shrink`` times as large after a control step that found nothing better than the plan it began with, and
+    twice as large, up to what the optimiser makes them, after one that did.
 
     A plan is the TensorDict's entry ``plan``: the planner itself keeps nothing, serves any batch, and an episode's
     first call is one without that entry. It then draws smooth random sequences and improves the best ones for
@@ -55,6 +61,7 @@ class GradientPlanner(MPCPlannerBase):
         noise: how far from the best, as a share of the actions' range.
         optimizer: makes the optimiser of the actions, which it sees in units of half their range.
             Default: Adam with a rate of 0.1.
+        shrink: how much smaller steps get where they gain nothing, above 0; 1: never.
         action_cost: subtracted for each step's mean squared action, in those units.
         seed: of the random sequences. Default: drawn from torch's global generator.
 
@@ -76,6 +83,7 @@ class GradientPlanner(MPCPlannerBase):
         samples: int = 64,
         noise: float = 0.25,
         optimizer: OptimizerFactory | None = None,
+        shrink: float = 0.7,
         action_cost: float = 0.0,
         seed: int | None = None,
     ) -> None:
@@ -93,7 +101,10 @@ class GradientPlanner(MPCPlannerBase):
             raise ValueError(
                 f"noise must be in [0, 1] and action_cost finite and not negative, got {noise} and {action_cost}"
             )
+        if not 0 < shrink <= 1:
+            raise ValueError(f"shrink must be above 0 and at most 1, got {shrink}")
         super().__init__(env)
+        self.shrink = shrink
         self.horizon, self.iterations, self.warm_up = horizon, iterations, warm_up
         self.candidates, self.samples, self.noise, self.action_cost = candidates, samples, noise, action_cost
         self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)
@@ -122,7 +133,7 @@ class GradientPlanner(MPCPlannerBase):
         Of a recurrent model it also carries what that remembers.
         """
         memory = cast(TensorDictBase, self.imagined.world_model.own_memory()) if self._remembers else None
-        return plan_primer(self.plan_shape, torch.float32, self.imagined.device, memory)
+        return plan_primer(self.plan_shape, torch.float32, self.imagined.device, memory, step_size=(1,))
 
     def planning(self, td: TensorDictBase) -> Tensor:
         """The action to take now, ``[*B, A]``, where the states are; the rest of the plan is written to ``td``."""
@@ -141,7 +152,7 @@ class GradientPlanner(MPCPlannerBase):
                 "The model remembers past states, and the environment drops its entry 'memory' between steps: append"
                 " the planner's make_tensordict_primer() to the environment that is acted in."
             )
-        best = plan.clone()
+        best, size = plan.clone(), self._step_size(flat).to(device)
         with frozen(self.imagined):
             first = (~planned, self.warm_up, "there is no plan yet, and nothing is done")
             for rows, iterations, otherwise in (first, (planned, self.iterations, "their last plan is kept")):
@@ -150,12 +161,25 @@ class GradientPlanner(MPCPlannerBase):
                     continue
                 some = entries if len(where) == len(flat) else cast(TensorDictBase, entries[where])
                 begin = self._renewed(plan[where]) if bool(planned[where[0]]) else self._first(some)
-                best[where] = self._improve(some, begin, iterations, otherwise)
-        actions = self._actions(best)
-        write_plan(td, actions.reshape(*batch, *self.plan_shape).to(states_at))
+                best[where], better = self._improve(some, begin, iterations, otherwise, size[where])
+                if rows is planned:
+                    size[where] *= torch.where(better, 2.0, self.shrink)
+        actions, size = self._actions(best), size.clamp(SMALLEST_STEP, 1.0)
+        write_plan(
+            td,
+            actions.reshape(*batch, *self.plan_shape).to(states_at),
+            step_size=size.reshape(*batch, 1).to(states_at),
+        )
         if self._remembers:
             td.set(("next", "memory"), self._remember(entries, actions[:, 0, 0]).reshape(batch).to(states_at))
         return actions[:, 0, 0].reshape(*batch, -1).to(states_at)
+
+    def _step_size(self, flat: TensorDictBase) -> Tensor:
+        """Of every state ``[B, 1]``, as a share of the optimiser's; whole where there is no plan."""
+        size = cast("Tensor | None", flat.get((KEY, "step_size"), None))
+        if size is None:
+            return torch.ones(len(flat), 1)
+        return size.where(size > 0, 1.0)  # a primer's is 0
 
     def _scaled(self, actions: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in units of half their range, from -1 to 1 around its middle; 0 where they are fixed."""
@@ -221,30 +245,41 @@ class GradientPlanner(MPCPlannerBase):
         noise = self.noise * self._splines(len(plan), renewed)
         return torch.cat([plan[:, : self.candidates - renewed], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
 
-    def _improve(self, entries: TensorDictBase, plan: Tensor, iterations: int, otherwise: str) -> Tensor:
-        """Sequences ``[B, K, H, A]`` improved, the best one first; as given, and a warning, where none is finite."""
+    def _improve(
+        self, entries: TensorDictBase, plan: Tensor, iterations: int, otherwise: str, size: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Sequences ``[B, K, H, A]`` improved, the best one first, and ``[B, 1]`` whether that is a better one.
+
+        As given, and a warning, where none is finite. Steps are ``size`` ``[B, 1]`` times the optimiser's.
+        """
         # The same tensors in every iteration: what the model folds of them is folded once.
         many = _repeated(entries, self.candidates)
         best, record = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
-        actions = plan.clone().requires_grad_()
-        optimizer = self.optimizer([actions])
-        for _ in range(iterations):
+        actions, began = plan, record
+        # What the optimiser sees: a step of it is one of the actions times the step size.
+        size = size[..., None, None]
+        moved = torch.zeros_like(plan, requires_grad=True)
+        optimizer = self.optimizer([moved])
+        for iteration in range(iterations):
             with torch.enable_grad():
+                actions = plan + size * moved
                 total = self._imagine(many, actions)
                 if not total.requires_grad:
                     raise ValueError(
                         f"The rewards that {self.imagined} imagines do not depend on the actions. Has its model been"
                         " trained, and is the horizon long enough for the reward to show what actions do?"
                     )
-                (gradient,) = torch.autograd.grad(-total.sum(), actions)
+                (gradient,) = torch.autograd.grad(-total.sum(), moved)
             best, record = _keep_better(best, record, actions, total)
+            began = record if iteration == 0 else began
             # A sequence whose rollout leaves all bounds has no usable gradient: it stays where it is.
             usable = gradient.isfinite().flatten(2).all(-1)[..., None, None]
-            actions.grad = torch.where(usable, gradient, 0.0)
+            moved.grad = torch.where(usable, gradient, 0.0)
             optimizer.step()
             with torch.no_grad():
-                actions.clamp_(-1, 1)
+                moved.copy_(((plan + size * moved).clamp(-1, 1) - plan) / size)
         with torch.no_grad():
+            actions = plan + size * moved
             best, record = _keep_better(best, record, actions, self._imagine(many, actions))
         lost = int((record == -torch.inf).all(1).sum())
         if lost:
@@ -255,7 +290,8 @@ class GradientPlanner(MPCPlannerBase):
                 stacklevel=2,
             )
         order = record.argsort(dim=1, descending=True, stable=True)
-        return best.gather(1, order[..., None, None].expand_as(best))
+        better = record.amax(1, keepdim=True) > began.amax(1, keepdim=True)
+        return best.gather(1, order[..., None, None].expand_as(best)).clamp(-1, 1), better
 
 
 def _repeated(entries: TensorDictBase, count: int) -> TensorDictBase:

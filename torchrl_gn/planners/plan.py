@@ -92,21 +92,26 @@ def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.d
     return actions.to(dtype), planned
 
 
-def write_plan(tensordict: TensorDictBase, actions: Tensor) -> None:
+def write_plan(tensordict: TensorDictBase, actions: Tensor, **more: Tensor) -> None:
     """Write what is left of a plan when its first action was taken, with the last one repeated.
 
     Args:
         tensordict: ``[*B]``; its entry ``plan`` is replaced.
         actions: ``[*B, ..., H, A]``.
+        **more: what else the planner wants to find there at the next step, ``[*B, ...]``.
     """
     left = torch.cat([actions[..., 1:, :], actions[..., -1:, :]], dim=-2)
     planned = torch.ones(*tensordict.shape, 1, dtype=torch.bool, device=actions.device)
-    plan = TensorDict({"actions": left, "planned": planned}, batch_size=tensordict.shape)
+    plan = TensorDict({"actions": left, "planned": planned, **more}, batch_size=tensordict.shape)
     tensordict.set(KEY, plan)
 
 
 def plan_primer(
-    shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | None, memory: TensorDictBase | None = None
+    shape: tuple[int, ...],
+    dtype: torch.dtype,
+    device: torch.device | None,
+    memory: TensorDictBase | None = None,
+    **more: tuple[int, ...],
 ) -> TensorDictPrimer:
     """Transform that clears the plan when an episode begins; append it to the environment that is acted in.
 
@@ -115,12 +120,12 @@ def plan_primer(
         dtype: of the actions.
         device: of the environment.
         memory: what a recurrent model remembers of nothing, zeros, to clear too.
+        **more: shapes of a sample's other entries of the plan.
     """
-    spec = Composite(
-        actions=Unbounded(shape=torch.Size(shape), dtype=dtype, device=device),
-        planned=Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=device),
-    )
-    specs = {KEY: spec}
+    entries = {key: Unbounded(shape=torch.Size(of), dtype=dtype, device=device) for key, of in more.items()}
+    entries["actions"] = Unbounded(shape=torch.Size(shape), dtype=dtype, device=device)
+    entries["planned"] = Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=device)
+    specs = {KEY: Composite(entries)}
     if memory is not None:
         of = {str(key): Unbounded(shape=value.shape, dtype=value.dtype, device=device) for key, value in memory.items()}
         specs["memory"] = Composite(of)
