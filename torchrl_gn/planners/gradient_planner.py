@@ -255,7 +255,7 @@ class GradientPlanner(MPCPlannerBase):
         # The same tensors in every iteration: what the model folds of them is folded once.
         many = _repeated(entries, self.candidates)
         best, record = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
-        actions, began = plan, record
+        began = record
         # What the optimiser sees: a step of it is one of the actions times the step size.
         size = size[..., None, None]
         moved = torch.zeros_like(plan, requires_grad=True)
