@@ -39,6 +39,10 @@ def plot_loglog(
     for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for number, (label, (x, y)) in enumerate(lines.items()):
             axes.loglog(x, y, color=colors[number % len(colors)], label=label, linewidth=1.6, marker="o", markersize=4)
+        counts = sorted({value for x, _ in lines.values() for value in x})
+        if all(float(value).is_integer() for value in counts) and len(counts) < 10:
+            axes.set_xticks(counts, [f"{value:,.0f}" for value in counts])  # of powers of ten labels may overlap
+            axes.set_xticks([], minor=True)
         axes.set_xlabel(xlabel)
         axes.set_ylabel(ylabel)
         axes.grid(alpha=0.25, which="both")
