@@ -12,10 +12,12 @@ from torchrl_gn.atomic import atomic_path
 from torchrl_gn.evaluation import (
     ErrorTable,
     PredictionError,
+    figures,
     plot_bars,
     plot_body_trajectory,
     plot_errors,
     plot_learning_curves,
+    plot_loglog,
     plot_motions,
     plot_rewards,
     plot_training_curve,
@@ -140,6 +142,19 @@ def test_motions_count_whole_turns(scenes, tmp_path):
     panels = {"with control": (states, states[:, 20:])}
     path = plot_motions(panels, scenes["swimmer6"], tmp_path / "motions.png", labels=("a", "b", "c"))
     assert is_picture(path)
+
+
+def test_counts_on_logarithmic_axes_are_labelled_as_such(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure))
+    times = [1.0, 2.0, 8.0, 20.0]
+    panel = {"a": ([3, 6, 12], times[:3]), "b": ([3, 25], times[2:])}
+    plot_loglog({"links": panel, "error": {"a": (times, times)}}, "x.png", ylabel="ms")
+    plot_loglog({"error": {"a": ([1e-3, 2e-2], [1, 3])}}, "x.png", ylabel="ms")
+    counted, powers = drawn[0].axes[0], drawn[1].axes[0]
+    assert [label.get_text() for label in counted.get_xticklabels()] == ["3", "6", "12", "25"]
+    assert not len(counted.get_xticks(minor=True)) and len(counted.get_yticks(minor=True))
+    assert len(powers.get_xticks(minor=True))
 
 
 def test_bars(tmp_path):
