@@ -19,6 +19,7 @@ from torchrl_gn.evaluation import (
     plot_learning_curves,
     plot_loglog,
     plot_motions,
+    plot_planning_curves,
     plot_rewards,
     plot_training_curve,
     summary,
@@ -132,6 +133,18 @@ def test_learning_curves_of_one_or_several_seeds(tmp_path):
     with pytest.raises(ValueError, match=r"Every seed of 'SVG\(0\)' must have 3 returns, got \[3, 2\]"):
         plot_learning_curves(curves, tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
+
+
+def test_rewards_over_planning_time(tmp_path, monkeypatch):
+    curves = {"gn": ([20, 60.0, 200], [1.0, 1.5, 1.7], [0.1, 0.1, 0.3]), "ilqg": ([90], [2.0], [0.0])}
+    assert is_picture(plot_planning_curves(curves, tmp_path / "curves.png"))
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure))
+    plot_planning_curves(curves, "x.png")
+    axes = drawn[0].axes[0]
+    assert axes.get_xscale() == "log" and axes.get_yscale() == "linear"
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["gn", "ilqg"]
+    np.testing.assert_allclose(axes.containers[0].lines[0].get_xydata(), [[20, 1.0], [60, 1.5], [200, 1.7]])
 
 
 def test_motions_count_whole_turns(scenes, tmp_path):

@@ -10,6 +10,7 @@ from torchrl_gn.evaluation.figures import plot_bars as plot_bars
 from torchrl_gn.evaluation.figures import plot_errors as plot_errors
 from torchrl_gn.evaluation.figures import plot_learning_curves as plot_learning_curves
 from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog
+from torchrl_gn.evaluation.figures import plot_planning_curves as plot_planning_curves
 from torchrl_gn.evaluation.figures import plot_rewards as plot_rewards
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve
 from torchrl_gn.evaluation.fresh_errors import fresh_errors as fresh_errors

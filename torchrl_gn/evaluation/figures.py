@@ -82,6 +82,32 @@ def plot_rewards(
     return save(figure, path)
 
 
+def plot_planning_curves(
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[float]]], path: str | os.PathLike
+) -> Path:
+    """Rewards over planning time, on a logarithmic axis, with their spread as bars.
+
+    Args:
+        curves: milliseconds of planning a control step, mean rewards and their spread, ``[N]`` each, by label.
+        path: file to write; its suffix is the format.
+
+    Returns:
+        The written path.
+    """
+    figure = new_figure((6.4, 3.8))
+    axes = figure.subplots()
+    style = {"linewidth": 1.6, "marker": "o", "markersize": 4, "elinewidth": 0.8, "capsize": 2}
+    for number, (label, (times, rewards, spreads)) in enumerate(curves.items()):
+        color = palette.SERIES[number % len(palette.SERIES)]
+        axes.errorbar(times, rewards, yerr=spreads, color=color, label=label, **style)
+    axes.set_xscale("log")
+    axes.set_xlabel("planning a control step [ms]")
+    axes.set_ylabel("mean reward of a step")
+    axes.legend(frameon=False, fontsize=9)
+    clean(axes)
+    return save(figure, path)
+
+
 def plot_learning_curves(
     curves: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float]]]], path: str | os.PathLike
 ) -> Path:

@@ -1,0 +1,96 @@
+"""What planning time buys: the reward of a planner against how long it plans a step.
+
+    python recipes/benchmark_planning.py [system=cheetah] [iterations=[1,3,10,30]] ["checkpoints=[PATH, ...]"]
+    python recipes/benchmark_planning.py system=jaco episodes=1 steps=60 "rivals={ilqg: []}"
+
+Plays the same episodes with ever more iterations a control step, through every model (of several hidden sizes, for
+example) and with the rivals: each a run of recipes/mpc.py, one after the other. Finished runs are kept, and the same
+run_dir goes on. What came out: docs/results.md.
+
+Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
+folder.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_gn.evaluation import plot_planning_curves
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
+from torchrl_gn.training.sweep import Run, folder_name, report_sweep, run_all
+
+RECIPE = Path(__file__).with_name("mpc.py")
+
+
+def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
+    """Every model's and rival's runs, by number of iterations."""
+    options = [f"{name}={cfg[name]}" for name in ("system", "episodes", "steps", "compile", "seed", "threads")]
+    options += [f"simulation_threads={cfg.threads}", "video=false", *cfg.overrides]
+    runs: dict[str, dict[int, Run]] = {}
+
+    def add(label: str, planner: str, iterations: list[int], *more: str) -> None:
+        if label in runs:
+            raise ValueError(f"Two models or planners are called {label!r}; rename a run folder.")
+        key = f"{planner.removesuffix('_true')}.iterations"
+        runs[label] = {
+            count: Run(
+                RECIPE,
+                folder / folder_name(label) / str(count),
+                (*options, f"planner={planner}", f"{key}={count}", *more),
+                f"{label}, {count} iterations",
+            )
+            for count in iterations
+        }
+
+    for checkpoint in [None] if cfg.checkpoints is None else cfg.checkpoints:
+        label = "gn" if checkpoint is None else Path(checkpoint).stem
+        add(label, "gn", cfg.iterations, *([] if checkpoint is None else [f"checkpoint={checkpoint}"]))
+    for planner, iterations in cfg.rivals.items():
+        add(str(planner), str(planner), iterations)
+    return runs
+
+
+@with_help
+@hydra.main(config_path="config", config_name="benchmark_planning", version_base="1.3")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    folder = RunFolder(cfg.run_dir, "benchmark_planning")
+    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name=f"benchmark_planning-{cfg.system}", config=cfg)
+    clock = 1e3 * load_scene(cfg.system).timestep
+    runs = make_runs(cfg, folder.path)
+    failed = run_all([run for of in runs.values() for run in of.values()], jobs=1, desc="planning")
+
+    metrics: dict[str, float] = {"clock_ms": clock}
+    curves: dict[str, tuple[list[float], list[float], list[float]]] = {}
+    lines = [
+        f"| {cfg.system}, {cfg.episodes} x {cfg.steps} steps | iterations | mean reward of a step | spread |"
+        " planning a step, ms | times the clock |",
+        "|---" * 6 + "|",
+    ]
+    for label, of in runs.items():
+        times, rewards, spreads = curves.setdefault(label, ([], [], []))
+        for iterations, run in of.items():
+            if (found := run.metrics) is None:
+                continue
+            planner = "gn" if label not in cfg.rivals else label
+            reward, spread, ms = (
+                found[f"{planner}/{key}"] for key in ("mean_reward", "mean_reward_std", "planning_ms")
+            )
+            for values, value in ((times, ms), (rewards, reward), (spreads, spread)):
+                values.append(value)
+            name = f"{label}/{iterations}"
+            metrics |= {f"{name}/mean_reward": reward, f"{name}/mean_reward_std": spread, f"{name}/planning_ms": ms}
+            lines.append(f"| {label} | {iterations} | {reward:.4g} | {spread:.2g} | {ms:,.0f} | {ms / clock:.2g} |")
+    curves = {label: curve for label, curve in curves.items() if curve[0]}
+    if curves:
+        plot_planning_curves(curves, folder.file("curves.png"))
+    report_sweep(folder, lines, {}, metrics, failed, tracker, seed=cfg.seed)
+
+
+if __name__ == "__main__":
+    main()
