@@ -30,27 +30,19 @@ def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
     """Every model's and rival's runs, by number of iterations."""
     options = [f"{name}={cfg[name]}" for name in ("system", "episodes", "steps", "compile", "seed", "threads")]
     options += [f"simulation_threads={cfg.threads}", "video=false", *cfg.overrides]
+    models = [None] if cfg.checkpoints is None else cfg.checkpoints
+    ways = [("gn" if path is None else Path(path).stem, "gn", cfg.iterations, path) for path in models]
+    ways += [(str(planner), str(planner), iterations, None) for planner, iterations in cfg.rivals.items()]
     runs: dict[str, dict[int, Run]] = {}
-
-    def add(label: str, planner: str, iterations: list[int], *more: str) -> None:
+    for label, planner, iterations, checkpoint in ways:
         if label in runs:
             raise ValueError(f"Two models or planners are called {label!r}; rename a run folder.")
+        chosen = [*options, f"planner={planner}", *([] if checkpoint is None else [f"checkpoint={checkpoint}"])]
         key = f"{planner.removesuffix('_true')}.iterations"
-        runs[label] = {
-            count: Run(
-                RECIPE,
-                folder / folder_name(label) / str(count),
-                (*options, f"planner={planner}", f"{key}={count}", *more),
-                f"{label}, {count} iterations",
-            )
-            for count in iterations
-        }
-
-    for checkpoint in [None] if cfg.checkpoints is None else cfg.checkpoints:
-        label = "gn" if checkpoint is None else Path(checkpoint).stem
-        add(label, "gn", cfg.iterations, *([] if checkpoint is None else [f"checkpoint={checkpoint}"]))
-    for planner, iterations in cfg.rivals.items():
-        add(str(planner), str(planner), iterations)
+        runs[label] = {}
+        for count in iterations:
+            place = folder / folder_name(label) / str(count)
+            runs[label][count] = Run(RECIPE, place, (*chosen, f"{key}={count}"), f"{label}, {count} iterations")
     return runs
 
 
@@ -73,11 +65,11 @@ def main(cfg: DictConfig) -> None:
         "|---" * 6 + "|",
     ]
     for label, of in runs.items():
-        times, rewards, spreads = curves.setdefault(label, ([], [], []))
+        planner = label if label in cfg.rivals else "gn"
+        times, rewards, spreads = [], [], []
         for iterations, run in of.items():
             if (found := run.metrics) is None:
                 continue
-            planner = "gn" if label not in cfg.rivals else label
             reward, spread, ms = (
                 found[f"{planner}/{key}"] for key in ("mean_reward", "mean_reward_std", "planning_ms")
             )
@@ -86,7 +78,8 @@ def main(cfg: DictConfig) -> None:
             name = f"{label}/{iterations}"
             metrics |= {f"{name}/mean_reward": reward, f"{name}/mean_reward_std": spread, f"{name}/planning_ms": ms}
             lines.append(f"| {label} | {iterations} | {reward:.4g} | {spread:.2g} | {ms:,.0f} | {ms / clock:.2g} |")
-    curves = {label: curve for label, curve in curves.items() if curve[0]}
+        if times:
+            curves[label] = (times, rewards, spreads)
     if curves:
         plot_planning_curves(curves, folder.file("curves.png"))
     report_sweep(folder, lines, {}, metrics, failed, tracker, seed=cfg.seed)
