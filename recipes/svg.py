@@ -79,13 +79,16 @@ def main(cfg: DictConfig) -> None:
     if cfg.ray is None and cfg.collectors != 1:
         raise ValueError(f"collectors={cfg.collectors} needs a Ray cluster; give ray=local, or ray=auto to join one.")
     run = RunFolder(cfg.run_dir, "svg")
+    if (per_batch := cfg.trainer.frames_per_batch) % (together := cfg.collectors * cfg.num_envs):
+        raise ValueError(
+            f"trainer.frames_per_batch={per_batch} must be a multiple of {together}: num_envs times collectors."
+        )
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
         run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
     graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, options(cfg)["task"]["graph"])
     if cfg.evaluate_on and cfg.agent.policy != "graph":
         raise ValueError("Only a graph network drives other bodies; evaluate_on needs agent.policy=graph.")
-    others = {name: ObservationGraph.of_task(cfg.task.domain, name) for name in cfg.evaluate_on}
     more = options(cfg.agent)
     if cfg.horizon == 0:
         more["model"] = None
@@ -95,6 +98,11 @@ def main(cfg: DictConfig) -> None:
     tracker = Tracker(cfg.logger, run.path / "log", name=f"svg{cfg.horizon}-{cfg.task.name}", config=cfg)
 
     task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
+    others = {}  # before all learning, so that what does not fit is told at once
+    for name in cfg.evaluate_on:
+        other = ObservationGraph.of_task(cfg.task.domain, name)
+        agent.policy_for(other)
+        others[name] = other, observation_env(other, cfg.task.domain, name, num_envs=cfg.evaluate_episodes, **task)
     make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)
     judged = make_env(num_envs=cfg.evaluate_episodes)
     losses = make_losses(cfg, agent)
@@ -112,8 +120,7 @@ def main(cfg: DictConfig) -> None:
         )
         learn_with_progress(trainer, run.checkpoint, begun, tracker, config=options(cfg))
     returns = {}
-    for name, other in tqdm(others.items(), desc="other bodies", leave=False, disable=not others):
-        env = observation_env(other, cfg.task.domain, name, num_envs=cfg.evaluate_episodes, **task)
+    for name, (other, env) in tqdm(others.items(), desc="other bodies", leave=False, disable=not others):
         returns[f"return/{name}"] = mean_return(env, agent.policy_for(other), cfg.task.steps, seed=10_000)
     report_learning(trainer, run, tracker, label=f"SVG({cfg.horizon})", seed=cfg.seed, more=returns)
 

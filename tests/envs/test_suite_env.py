@@ -136,6 +136,7 @@ def test_the_graph_of_another_task_is_refused():
     for observation, actions in (
         ({"position": 9, "velocity": 8}, 6),
         ({"pose": 17}, 6),
+        ({"position": 8}, 6),
         ({"position": 8, "velocity": 9}, 5),
     ):
         joints = {("a", "b"): ()}
@@ -143,3 +144,9 @@ def test_the_graph_of_another_task_is_refused():
         graph = ObservationGraph("mine", observation, {"a": tuple(observation), "b": ()}, joints, actions=acting)
         with pytest.raises(ValueError, match="Task cheetah run has observations .* graph 'mine' arranges"):
             observation_env(graph, "cheetah", "run")
+
+
+def test_actions_of_other_ranges_are_refused():
+    graph = ObservationGraph.swimmer(3)
+    with pytest.raises(ValueError, match=r"Task lqr lqr_2_1 has actions of -1e\+10 to 1e\+10; policies give -1 to 1"):
+        observation_env(graph, "lqr", "lqr_2_1")

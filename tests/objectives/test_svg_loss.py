@@ -234,6 +234,35 @@ def test_an_error_in_the_midst_of_a_loss_leaves_all_networks_whole(planning):
     assert dict(agent.named_parameters()).keys() == names.keys()
 
 
+def test_a_goal_that_is_not_predicted_stays_as_it_is():
+    batch = make_batch(8)
+    batch["goal"], batch["next", "goal"] = batch["action"], batch["action"]
+    towards = Weights(lambda w, x, goal: w[0] * (x - goal), K)
+    policy = TensorDictModule(towards, ["observation", "goal"], ["action"])
+    value = ValueOperator(Weights(quadratic, -2.0, -0.5, -0.8), in_keys=["observation", "action"])
+    steps = make_loss(2)
+    loss = SVGLoss(policy, value, steps.model, reward, steps=2)
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    x, goal, expected = batch["observation"], batch["goal"], 0.0
+    for step in range(2):
+        u = K * (x - goal)
+        expected, x = expected + GAMMA**step * reward(x, u, x), A * x + B * u
+    at_end = quadratic(torch.tensor([-2.0, -0.5, -0.8], dtype=torch.float64), x, K * (x - goal))
+    torch.testing.assert_close(loss(batch)["loss_actor"], -(expected + GAMMA**2 * at_end).mean(), rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("steps", [0, 1])
+def test_each_loss_alone_draws_actions_too(steps):
+    loss, batch = make_loss(steps, scale=0.3), make_batch(5)
+    for each in (loss.loss_actor, lambda entries: (loss.loss_value(entries)[1]["target_value"].sum(), {})):
+        torch.manual_seed(0)
+        first, second = each(batch)[0], each(batch)[0]
+        torch.manual_seed(0)
+        assert first != second and first == each(batch)[0]
+    gradients = torch.autograd.grad(loss.loss_actor(batch)[0], list(loss.actor_network_params.parameters()))
+    assert (gradients[0] != 0).all()  # of the scale too
+
+
 def test_gamma_weighs_later_rewards():
     batch = make_batch(8)
     x, u = batch["observation"], K * batch["observation"]
@@ -304,6 +333,13 @@ def test_bad_options_are_named():
     for model, known in ((None, reward), (loss.model, None)):
         with pytest.raises(ValueError, match="steps=2 need a model and a reward; use steps=0 without"):
             SVGLoss(*networks, model, known, steps=2)
+    bodies = TensorDictModule(lambda x, u: x, ["state", "action"], [("next", "state")])
+    with pytest.raises(ValueError, match=r"predicts \[\('state',\)\], nothing of what the policy reads: .*observation"):
+        SVGLoss(*networks, bodies, reward, steps=1)
+    flat = SVGLoss(*networks, loss.model, lambda x, u, _: reward(x, u, _).squeeze(-1), steps=1)
+    flat.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    with pytest.raises(ValueError, match=r"The reward must be \[7, 1\], got \[7\]"):
+        flat(make_batch(7))
 
 
 @pytest.mark.parametrize("special", [False, True])

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ValueOperator
-from torchrl.objectives import HardUpdate, ValueEstimators
+from torchrl.objectives import DDPGLoss, HardUpdate, ValueEstimators
 
 from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import SVGLoss
@@ -78,18 +78,39 @@ def test_a_loaded_or_cast_loss_still_shares_statistics(dtype):
     assert acted["loc"].dtype == dtype and acted["loc"].isfinite().all()
 
 
-def test_targets_share_no_weights():
-    """Not even those that policy and value have in common, which TorchRL then holds as plain tensors."""
+def with_common_layer() -> tuple[TensorDictModule, ValueOperator, nn.Linear]:
+    """Policy and value that see observations through the same layer."""
     torch.manual_seed(0)
     common = nn.Linear(3, 4).double()
     policy = TensorDictModule(nn.Sequential(common, nn.Linear(4, 2).double()), ["observation"], ["action"])
-    value = ValueOperator(Shared(common), in_keys=["observation", "action"])
+    return policy, ValueOperator(Shared(common), in_keys=["observation", "action"]), common
+
+
+def test_targets_share_no_weights():
+    """Not even those that policy and value have in common, which TorchRL then holds as plain tensors."""
+    policy, value, _ = with_common_layer()
     loss = SVGLoss(policy, value, steps=0, separate_losses=True, delay_actor=True)
     for name in ("actor_network_params", "value_network_params"):
         pairs = zip(
             getattr(loss, name).values(True, True), getattr(loss, f"target_{name}").values(True, True), strict=True
         )
         assert all(own.data_ptr() != target.data_ptr() for own, target in pairs)
+
+
+@pytest.mark.parametrize("separate", [False, True])
+def test_layers_that_policy_and_value_share_get_ddpgs_gradients(separate):
+    ended = torch.zeros(5, 1, dtype=torch.bool)
+    draw = torch.randn(5, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    after = {"observation": draw[:, 5:8], "reward": draw[:, 8:], "done": ended, "terminated": ended}
+    batch = TensorDict({"observation": draw[:, :3], "action": draw[:, 3:5], "next": after}, [5])
+    found = []
+    for kind, options in ((DDPGLoss, {}), (SVGLoss, {"steps": 0})):
+        policy, value, common = with_common_layer()
+        loss = kind(policy, value, separate_losses=separate, **options)
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+        loss(batch.clone())["loss_actor"].backward()
+        found.append(common.weight.grad)
+    assert found[0].abs().sum() > 0 and torch.equal(*found)
 
 
 class Shared(nn.Module):

@@ -119,3 +119,28 @@ def test_a_description_makes_the_same_graph():
         assert str(again) == str(graph) and again.identity == graph.identity
         for table in ("node_entries", "global_entries", "node_actions", "edge_index"):
             np.testing.assert_array_equal(getattr(again, table), getattr(graph, table))
+
+
+def test_a_description_may_leave_out_what_is_empty():
+    described = ObservationGraph.swimmer(3).description()
+    short = {key: value for key, value in described.items() if key != "identity"}
+    assert str(ObservationGraph.from_description(short)) == str(ObservationGraph.swimmer(3))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"nodes": None}, r"The mapping lacks \['nodes'\]; it needs \['name', .* may have \['globals',"),
+        ({"global": []}, r"The mapping has unknown \['global'\]"),
+        (
+            {"joints": [["head", "segment_0"]]},
+            r"Each of 'joints' must be \[carrying body, .* got \['head', 'segment_0'\]",
+        ),
+        ({"actions": [["head", "segment_0", "01"]]}, "Each of 'actions' must be"),
+        ({"joints": 2 * [["head", "segment_0", ["joints[0]"]]]}, r"'joints' name \['head', 'segment_0'\] twice"),
+    ],
+)
+def test_a_description_that_does_not_fit_is_refused(changes, message):
+    described = ObservationGraph.swimmer(3).description() | changes
+    with pytest.raises(ValueError, match=message):
+        ObservationGraph.from_description({key: value for key, value in described.items() if value is not None})

@@ -178,13 +178,61 @@ def test_a_finished_run_goes_on_with_more_frames(make_learner, capacity):
     assert again.curve.frames[: len(trainer.curve.frames)] == trainer.curve.frames
 
 
-def test_a_finished_run_asked_for_fewer_frames_does_nothing(make_learner):
+def test_a_run_asked_for_fewer_frames_than_it_has_is_refused_and_forgets_nothing(make_learner):
     trainer = make_learner(frames=200)
     spend(trainer)
-    again = make_learner(trainer.agent, frames=100)
+    fewer = make_learner(trainer.agent, frames=100)
+    before = copy.deepcopy(fewer.state_dict())
+    with pytest.raises(ValueError, match="200 frames were learned from before; give frames=200 or more"):
+        fewer.load_state_dict(trainer.state_dict())
+    assert fewer.frames == len(fewer.buffer) == 0 and same(fewer.losses[0].state_dict(), before["losses"][0])
+    again = make_learner(trainer.agent, frames=190)  # the last batch went beyond
     again.load_state_dict(trainer.state_dict())
-    assert spend(again) == [] and again.frames == 200
-    assert torch.equal(contents(again), contents(trainer)[-100:])
+    assert spend(again) == [] and torch.equal(contents(again), contents(trainer))
+
+
+@pytest.mark.parametrize(
+    "at", ["first evaluation", "first batch", "update", "evaluation", "last update", "last evaluation"]
+)
+def test_an_interrupt_costs_no_update_and_no_point_of_the_curve(make_learner, at):
+    """Wherever it comes, the run that goes on makes as many updates and has the points that it would have had."""
+    whole = make_learner(frames=200, random_frames=20)
+    spend(whole)
+    trainer = make_learner(frames=200, random_frames=20)
+    name, when = {
+        "first evaluation": ("evaluate", lambda: True),
+        "first batch": ("remember", lambda: True),
+        "update": ("update", lambda: trainer.updates == 5),
+        "evaluation": ("evaluate", lambda: trainer.frames == 100),
+        "last update": ("update", lambda: trainer.frames == 200),
+        "last evaluation": ("evaluate", lambda: trainer.frames == 200),
+    }[at]
+    original = getattr(trainer, name)
+
+    def interrupt(*inputs):
+        if when():
+            raise KeyboardInterrupt
+        return original(*inputs)
+
+    setattr(trainer, name, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        spend(trainer)
+    again = make_learner(trainer.agent, frames=200, random_frames=20)
+    again.load_state_dict(trainer.state_dict())
+    spend(again)
+    assert again.curve.frames == whole.curve.frames == [0, 100, 200]
+    assert (again.frames, again.updates, again.owed) == (200, whole.updates, whole.owed)
+    assert again.curve.updates == whole.curve.updates
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["frames", "batch_size", "updates_per_frame", "evaluate_frames", "capacity", "target_interval", "max_norm"],
+)
+def test_numbers_that_are_not_positive_are_named(make_learner, option):
+    for value in (0, -1):
+        with pytest.raises(ValueError, match=f"{option}={value} must be positive"):
+            make_learner(**{option: value})
 
 
 @pytest.mark.parametrize("key", ["observation", ("next", "observation"), ("next", "reward")])

@@ -72,13 +72,16 @@ def observation_env(graph: ObservationGraph, domain: str, task: str, **options) 
     """The task whose observations a graph arranges, see :func:`suite_env`.
 
     Raises:
-        ValueError: if the task's observation or action is another than the graph's.
+        ValueError: if the task's observation or action is another than the graph's, or actions do not lie in -1 to 1
+            (quadrupeds' and lqr's).
     """
     loaded = _load(domain, task, 0)
+    low, high = loaded.action_spec().minimum, loaded.action_spec().maximum
+    if (low != -1).any() or (high != 1).any():
+        raise ValueError(f"Task {domain} {task} has actions of {low.min():g} to {high.max():g}; policies give -1 to 1.")
     observation = {name: int(np.prod(entry.shape)) for name, entry in loaded.observation_spec().items()}
     actions = int(np.prod(loaded.action_spec().shape))
-    arranged = {name: observation.get(name) for name in graph.observation}
-    if arranged != dict(graph.observation) or actions != graph.num_actions:
+    if observation != dict(graph.observation) or actions != graph.num_actions:
         raise ValueError(
             f"Task {domain} {task} has observations {observation} and {actions} actions, graph {graph.name!r} arranges"
             f" {dict(graph.observation)} and {graph.num_actions}."

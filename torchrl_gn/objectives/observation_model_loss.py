@@ -65,15 +65,6 @@ class ObservationModelLoss(LossModule):
         """Keys that the loss writes."""
         return ["loss_model", *([] if self.reward is None else ["loss_reward"])]
 
-    def update_normalizers(self, tensordict: TensorDictBase) -> None:
-        """Take newly collected transitions ``[*B]`` into the model's statistics, each once.
-
-        Raises:
-            KeyError: if an entry is missing.
-            ValueError: if a number is not finite; no statistic is changed.
-        """
-        self.model.update_normalizers(*self._read(tensordict)[:3])
-
     def _read(self, tensordict: TensorDictBase) -> list[torch.Tensor]:
         values = []
         for key in self.in_keys:

@@ -8,9 +8,9 @@ from typing import Any, cast
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss
 
 from torchrl_gn.modules.weights import frozen, with_weights
@@ -44,13 +44,15 @@ class SVGLoss(DDPGLoss):
         actor_network: policy, for example a ``ProbabilisticActor``; one that does not sample is DDPG's.
         value_network: writes ``state_action_value``.
         model: TensorDict module from observation and action to ``("next", observation)``, for example an
-            :class:`~torchrl_gn.modules.ObservationModel`. Not read with ``steps=0``.
+            :class:`~torchrl_gn.modules.ObservationModel`. Not read with ``steps=0``. What policy and value read besides
+            (a goal) stays as it is.
         reward: reward of an imagined step, known or learned.
         steps: ``N``, steps through the model.
         **options: of :class:`~torchrl.objectives.DDPGLoss`.
 
     Raises:
-        ValueError: if ``steps`` is negative, or there are steps but no model or reward.
+        ValueError: if ``steps`` is negative, or there are steps but no model or reward, or one that predicts nothing of
+            what policy or value read.
 
     Input: as DDPG's: what the policy reads, ``action``, and under ``"next"`` the same and ``reward``, ``done`` and
     ``terminated``.
@@ -77,6 +79,13 @@ class SVGLoss(DDPGLoss):
             raise ValueError(f"steps={steps} must be 0 or more.")
         if steps and (model is None or reward is None):
             raise ValueError(f"steps={steps} need a model and a reward; use steps=0 without.")
+        predicted = {unravel_key(key)[1:] for key in model.out_keys} if steps and model is not None else set()
+        for name, network in (("policy", actor_network), ("value", value_network)) if steps else ():
+            read = {key if isinstance(key, tuple) else (key,) for key in map(unravel_key, network.in_keys)}
+            if not read & predicted:
+                raise ValueError(
+                    f"The model predicts {sorted(predicted)}, nothing of what the {name} reads: {sorted(read)}."
+                )
         super().__init__(actor_network, value_network, **options)
         self.steps = steps
         self._share_statistics()
@@ -104,29 +113,32 @@ class SVGLoss(DDPGLoss):
         self._share_statistics()
         return self
 
+    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
+        """Loss of the value, and what to read along."""
+        with set_exploration_type(self.deterministic_sampling_mode):  # as in forward, where it is called alone
+            return super().loss_value(tensordict)
+
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Loss of the policy, and nothing more to read along."""
+        """Loss of the policy, and nothing more to read along.
+
+        Raises:
+            ValueError: if the reward of an imagined step has another shape than ``[*B, 1]``.
+        """
         weights = self._maybe_get_priority_weight(tensordict)
         keys = [*self.actor_in_keys, *self.value_exclusive_keys]
         now = tensordict.select(*keys, *self._carried, strict=False).detach()
         value, discount = cast(Tensor | float, 0.0), 1.0
         gamma = cast(Tensor, self.value_estimator.gamma) if self.steps else 1.0
-        with ExitStack() as stack:
-            for module, parameters in (
-                (self.actor_network, self.actor_network_params),
-                (self.value_network, self._cached_detached_value_params),
-            ):
-                stack.enter_context(with_weights(module, parameters))
-            for module in (self.model, self.reward):
-                if isinstance(module, nn.Module):
-                    stack.enter_context(frozen(module))
+        with set_exploration_type(self.deterministic_sampling_mode):
             for _ in range(self.steps):
-                now = self.actor_network(now)
-                now, reward = self._imagine(now)
+                now, reward = self._imagine(self._act(now))
                 value = value + discount * reward
                 discount = discount * gamma
-            now = self.value_network(self.actor_network(now))
-            value = value + discount * now.get(self.tensor_keys.state_action_value)
+            now = self._act(now)
+        # In turn, not together: policy and value may have layers in common, which are the value's only here.
+        with with_weights(self.value_network, self._cached_detached_value_params):
+            now = self.value_network(now)
+        value = value + discount * now.get(self.tensor_keys.state_action_value)
         loss = self._reduce_loss(-value.squeeze(-1), tensordict=tensordict, weights=weights)
         self._clear_weakrefs(
             tensordict,
@@ -138,6 +150,11 @@ class SVGLoss(DDPGLoss):
         )
         return loss, {}
 
+    def _act(self, now: TensorDictBase) -> TensorDictBase:
+        """The policy's action beside what it read."""
+        with with_weights(self.actor_network, self.actor_network_params):
+            return self.actor_network(now)
+
     @property
     def _carried(self) -> list[NestedKey]:
         """What the model reads but for the action: imagined steps pass it on."""
@@ -148,7 +165,14 @@ class SVGLoss(DDPGLoss):
         """The next step's entries, and the reward ``[*B, 1]`` of getting there."""
         assert self.model is not None and self.reward is not None
         observation, action = (cast(Tensor, now.get(key)) for key in self.model.in_keys[:2])
-        predicted = cast(TensorDictBase, self.model(now.copy()).get("next"))
-        next_observation = cast(Tensor, predicted.get(self.model.in_keys[0]))
-        reward = self.reward(observation, action, next_observation)
-        return now.select(*self.value_exclusive_keys, *self._carried, strict=False).update(predicted), reward
+        with ExitStack() as stack:
+            for module in (self.model, self.reward):
+                if isinstance(module, nn.Module):
+                    stack.enter_context(frozen(module))
+            predicted = cast(TensorDictBase, self.model(now.copy()).get("next"))
+            reward = self.reward(observation, action, cast(Tensor, predicted.get(self.model.in_keys[0])))
+        if reward.shape != (*now.batch_size, 1):
+            raise ValueError(f"The reward must be {[*now.batch_size, 1]}, got {list(reward.shape)}.")
+        # What is not predicted stays as it is: a goal, for example.
+        kept = now.select(*self.actor_in_keys, *self.value_exclusive_keys, *self._carried, strict=False)
+        return kept.update(predicted), reward

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -237,15 +237,26 @@ class ObservationGraph:
 
     @classmethod
     def from_description(cls, description: dict) -> ObservationGraph:
-        """The graph that :meth:`description` described."""
+        """The graph that :meth:`description` described; its ``globals``, ``actions`` and ``identity`` may be left out.
+
+        Raises:
+            ValueError: if something is missing, unknown or declared twice, or the graph is none.
+        """
+        needed, optional = ["name", "observation", "nodes", "joints"], ["globals", "actions", "identity"]
+        for wrong, what in (
+            ([key for key in needed if key not in description], "lacks"),
+            ([key for key in description if key not in needed + optional], "has unknown"),
+        ):
+            if wrong:
+                raise ValueError(f"The mapping {what} {wrong}; it needs {needed} and may have {optional}.")
         return cls(
             name=description["name"],
             observation=description["observation"],
             nodes={name: tuple(entries) for name, entries in description["nodes"].items()},
-            joints={(before, after): tuple(entries) for before, after, entries in description["joints"]},
-            globals_=tuple(description["globals"]),
-            actions={(before, after): tuple(indices) for before, after, indices in description["actions"]},
-            identity=description["identity"],
+            joints=_by_joint(description["joints"], "joints"),
+            globals_=tuple(description.get("globals", ())),
+            actions=_by_joint(description.get("actions", ()), "actions"),
+            identity=description.get("identity", False),
         )
 
     def __str__(self) -> str:
@@ -259,6 +270,18 @@ class ObservationGraph:
             acting = ", ".join(map(str, self.actions.get(joint, ()))) or "-"
             lines.append(f"  joint {joint[0]} - {joint[1]}: {', '.join(entries) or '-'}; actions {acting}")
         return "\n".join([*lines, f"  globals: {', '.join(self.globals_) or '-'}"])
+
+
+def _by_joint(rows: Sequence[Sequence], what: str) -> dict[tuple[str, str], tuple]:
+    """What is declared of each joint, in rows of the bodies that carry and are moved and a list."""
+    found: dict[tuple[str, str], tuple] = {}
+    for row in rows:
+        if len(row) != 3 or isinstance(row[2], str):
+            raise ValueError(f"Each of {what!r} must be [carrying body, moved body, [...]], got {row!r}.")
+        if (row[0], row[1]) in found:
+            raise ValueError(f"{what!r} name {[row[0], row[1]]} twice; list all of it under one.")
+        found[row[0], row[1]] = tuple(row[2])
+    return found
 
 
 def _listed_at(entries: np.ndarray) -> np.ndarray:

@@ -84,7 +84,7 @@ class OffPolicyTrainer:
             again.
 
     Raises:
-        ValueError: if a number of frames does not fit the environments.
+        ValueError: if a number of frames does not fit the environments, or a number is not positive.
         FileNotFoundError: with ``compile``, without a C++ compiler on a CPU.
     """
 
@@ -113,11 +113,22 @@ class OffPolicyTrainer:
             raise ValueError(
                 f"frames_per_batch={frames_per_batch} must be a multiple of {env.batch_size.numel()} environments."
             )
+        for name, value in (
+            ("frames", frames),
+            ("batch_size", batch_size),
+            ("updates_per_frame", updates_per_frame),
+            ("evaluate_frames", evaluate_frames),
+            ("capacity", capacity),
+            ("target_interval", target_interval),
+            ("max_norm", max_norm),
+        ):
+            if not 0 < value < math.inf:
+                raise ValueError(f"{name}={value} must be positive and finite.")
         self.agent, self.losses, self.env, self.explore = agent, list(losses), env, explore
         self.evaluate, self.optimizer = evaluate, optimizer
         self.total, self.per_batch, self.random_frames = frames, frames_per_batch, random_frames
         self.updates_per_frame, self.evaluate_frames, self.max_norm = updates_per_frame, evaluate_frames, max_norm
-        self.capacity = min(capacity, frames)
+        self.capacity = min(capacity, frames + frames_per_batch)  # the last batch may go beyond
         # TorchRL's interval are the updates in between.
         self.target = HardUpdate(losses[0], value_network_update_interval=target_interval - 1)
         self.generator = torch.Generator().manual_seed(seed)
@@ -140,38 +151,43 @@ class OffPolicyTrainer:
         Raises:
             FloatingPointError: if a loss or a gradient is not finite, before any weight is touched by it.
         """
-        if self.frames == 0:
+        if not self.curve.frames:
             self._evaluate()
+        if self.owed >= 1 or self._due:  # an interrupt came between a batch and what belongs to it
+            yield self._learn(time.perf_counter())
         if self.frames >= self.total:
             return
         collector = self._collector()
         try:
-            yield from self._learn(collector)
+            start = time.perf_counter()
+            for batch in collector:
+                self.remember(batch)
+                yield self._learn(start)
+                start = time.perf_counter()
+                if not isinstance(self.env, EnvBase):
+                    collector.update_policy_weights_(self.explore)
         finally:
             # Left to itself it would close an environment that is the caller's, and leave processes of a cluster.
             collector.shutdown(**({"close_env": False} if isinstance(self.env, EnvBase) else {}))
 
-    def _learn(self, collector: BaseCollector) -> Iterator[LearningProgress]:
-        start = time.perf_counter()
-        for batch in collector:
-            self.remember(batch)
-            losses: dict[str, list[float]] = {}
-            while self.owed >= 1:
-                self.owed -= 1
-                for name, value in self.update().items():
-                    losses.setdefault(name, []).append(value)
-            if not isinstance(self.env, EnvBase):
-                collector.update_policy_weights_(self.explore)
-            now = time.perf_counter()
-            self.seconds += now - start
-            due = (
-                self.frames // self.evaluate_frames
-                > (self.curve.frames[-1] if self.curve.frames else 0) // self.evaluate_frames
-            )
-            evaluation = self._evaluate() if due or self.frames >= self.total else None
-            means = {name: sum(values) / len(values) for name, values in losses.items()}
-            yield LearningProgress(self.frames, self.updates, self.seconds, means, evaluation)
-            start = time.perf_counter()
+    def _learn(self, start: float) -> LearningProgress:
+        """The updates that are owed, and an evaluation where one is due; time counts from ``start``."""
+        losses: dict[str, list[float]] = {}
+        while self.owed >= 1:
+            for name, value in self.update().items():
+                losses.setdefault(name, []).append(value)
+            self.owed -= 1
+        self.seconds += time.perf_counter() - start
+        evaluation = self._evaluate() if self._due else None
+        means = {name: sum(values) / len(values) for name, values in losses.items()}
+        return LearningProgress(self.frames, self.updates, self.seconds, means, evaluation)
+
+    @property
+    def _due(self) -> bool:
+        """Whether the policy is to be evaluated: now and then, and at the end."""
+        last = self.curve.frames[-1]
+        passed = self.frames // self.evaluate_frames > last // self.evaluate_frames
+        return passed or self.frames >= self.total and self.frames > last
 
     def _collector(self) -> BaseCollector:
         common: dict[str, Any] = {
@@ -279,7 +295,14 @@ class OffPolicyTrainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave."""
+        """Go on from what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: if it has more frames than there are to be in all; nothing is changed.
+        """
+        frames = state["progress"]["frames"]
+        if frames >= self.total + self.per_batch:
+            raise ValueError(f"{frames} frames were learned from before; give frames={frames} or more to go on.")
         for loss, saved in zip(self.losses, state["losses"], strict=True):
             loss.load_state_dict(saved)
         self.optimizer.load_state_dict(state["optimizer"])
