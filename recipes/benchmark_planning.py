@@ -32,7 +32,8 @@ def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
     options += [f"simulation_threads={cfg.threads}", "video=false", *cfg.overrides]
     models = [None] if cfg.checkpoints is None else cfg.checkpoints
     ways = [("gn" if path is None else Path(path).stem, "gn", cfg.iterations, path) for path in models]
-    ways += [(str(planner), str(planner), iterations, None) for planner, iterations in cfg.rivals.items()]
+    # Rivals have the first model too: what cem and mppi plan with, and what identifies variants for all.
+    ways += [(str(planner), str(planner), iterations, models[0]) for planner, iterations in cfg.rivals.items()]
     runs: dict[str, dict[int, Run]] = {}
     for label, planner, iterations, checkpoint in ways:
         if label in runs:

@@ -164,12 +164,17 @@ def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
     return scene, sample_variants(cfg.system, cfg.episodes, rng)
 
 
-def bind_model(cfg: DictConfig, scene: Scene):
-    """The trained model, bound to the scene, and the inference model if it has one."""
+def shipped_models(cfg: DictConfig) -> list[str]:
+    """Names of models of the system, or its variants, that come with the package."""
     fitting = [cfg.system, re.sub(r"^swimmer\d+$", "swimmerN", cfg.system)]
     if cfg.variants:
         fitting = [f"identified_{cfg.system}"]
-    names = [name for name in fitting if name in pretrained_names()]
+    return [name for name in fitting if name in pretrained_names()]
+
+
+def bind_model(cfg: DictConfig, scene: Scene):
+    """The trained model, bound to the scene, and the inference model if it has one."""
+    names = shipped_models(cfg)
     if cfg.checkpoint is None and not names:
         what = f"variants of {cfg.system!r}" if cfg.variants else repr(cfg.system)
         raise ValueError(f"No trained model of {what} comes with the package; give checkpoint=PATH.")
@@ -220,7 +225,11 @@ def make_planner(
         return GradientPlanner(imagined, cfg.horizon, optimizer=optimizer, seed=cfg.seed, **more)
     where = env if name.endswith("_true") else imagined
     assert where is not None
-    chosen = cfg[name.removesuffix("_true")]
+    kind = name.removesuffix("_true")
+    chosen = cfg[kind]
+    check_count(f"{kind}.iterations", chosen.iterations, 1)
+    check_count(f"{kind}.top_k", chosen.top_k, 2)  # of which the spread is taken
+    check_count(f"{kind}.candidates", chosen.candidates, chosen.top_k)
     sizes = {"optim_steps": chosen.iterations, "num_candidates": chosen.candidates, "top_k": chosen.top_k}
     if name.startswith("cem"):
         return CEMPlanner(where, planning_horizon=cfg.horizon, **sizes)
@@ -285,8 +294,10 @@ def foresee(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase) -> Te
     if imagined is None:
         ahead = env.simulator.rollout(now["physics"][:1], actions[:1])
         return ahead["state"][0, -1].where(ahead["stable"][0], torch.nan)
-    # All episodes, as the planner has them: a compiled model is compiled for every number of rows.
-    return imagined.imagine(now, actions)[0][0, -1].detach()
+    # As many rows as the planner has: a compiled model is compiled for every number of them.
+    rows = cast(Tensor, now["plan", "actions"]).shape[1]
+    many = cast(TensorDictBase, now.repeat_interleave(rows, 0))
+    return imagined.imagine(many, actions.repeat_interleave(rows, 0))[0][0, -1].detach()
 
 
 def distance_left(played: Episodes, target: Tensor) -> Tensor:
@@ -327,7 +338,9 @@ def main(cfg: DictConfig) -> None:
     scene, scenes = make_scenes(cfg)
     reward = make_reward(cfg.reward, scene)
     env = SceneEnv(scenes, reward, num_threads=cfg.simulation_threads, seed=cfg.seed)
-    bound, inference = bind_model(cfg, scene) if set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint else (None, None)
+    # Variants are identified first whoever plans, so that all planners have the same starts.
+    needed = set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint or (cfg.variants and shipped_models(cfg))
+    bound, inference = bind_model(cfg, scene) if needed else (None, None)
     imagined = None if bound is None else ModelEnv(bound, reward)
     run = RunFolder(cfg.run_dir, "mpc")
     if (run.path / "config.yaml").exists():
@@ -347,6 +360,8 @@ def main(cfg: DictConfig) -> None:
         played = Episodes(run.file(f"{name}.safetensors"), start.copy())
         if len(played) > cfg.steps:
             raise ValueError(f"{played.path} has {len(played)} steps, more than steps={cfg.steps}; name a new run_dir.")
+        if not torch.allclose(played.records["state"][0], start["state"]):
+            raise ValueError(f"{played.path} began in other states than the other planners do; name a new run_dir.")
         planner = make_planner(name, cfg, env, imagined, len(played))
         policy = planner if target is None else TensorDictSequential([FixTask(reward), planner])
         play(cfg, name, policy, env, imagined, played)

@@ -79,7 +79,7 @@ def main(cfg: DictConfig) -> None:
         reward = f"{values['gn/mean_reward']:.3g} ({values['gn/mean_reward_std']:.2g})"
         lines.append(f"| {index} | {reward} | {values['gn/planning_ms']:.0f} | " + " | ".join(errors) + " |")
     kept = [run for run in played if run.metrics is not None]
-    rewards = [load_file(run.folder / "gn.safetensors")["reward"].squeeze(-1) for run in kept]
+    rewards = [load_file(run.folder / "gn.safetensors")["reward"] for run in kept]
     if rewards:
         curves = {f"round {index}": values for index, values in enumerate(rewards)}
         plot_rewards(curves, folder.file("rewards.png"), timestep=load_scene(cfg.system).timestep, ylabel="reward")

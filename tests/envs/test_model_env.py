@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.envs.specs import reward_of
 from torchrl_gn.modules import ForwardModel
 from torchrl_gn.modules.forward_model import FeatureSet
+from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import SceneValues, load_scene
 
 
@@ -96,6 +102,15 @@ def test_a_prediction_that_is_not_finite_is_flagged_and_held(model_env):
 def test_the_weights_are_the_environments_and_follow_it(model_env):
     assert {name for name, _ in model_env.named_parameters()} == {"world_model.gain", "world_model.drift"}
     assert {p.dtype for p in model_env.double().parameters()} == {torch.float64}
+
+
+def test_a_reward_may_serve_environments_on_several_devices(pendulum):
+    reward = make_reward("balance", pendulum)
+    here, elsewhere = (SimpleNamespace(device=torch.device(name)) for name in ("cpu", "meta"))
+    moved = cast(nn.Module, reward_of(reward, cast(EnvBase, elsewhere), pendulum))
+    assert {buffer.device.type for buffer in moved.buffers()} == {"meta"}
+    assert reward_of(reward, cast(EnvBase, here), pendulum) is reward
+    assert {buffer.device.type for buffer in reward.buffers()} == {"cpu"}
 
 
 def test_refuses_models_that_do_not_fit(pendulum):

@@ -117,7 +117,7 @@ def trained(scene, **options):
 def test_it_reaches_the_known_optimum_of_a_linear_quadratic_problem():
     env, start = point_env(20.0), at(1.0, -0.5)
     planner = GradientPlanner(env, HORIZON, warm_up=400, samples=4, seed=0)
-    action = planner.planning(start)
+    action = planner(start)["action"]
     optimum = torch.stack([best_actions(1.0), best_actions(-0.5)])
     assert optimum.abs().max() < 20  # no limit in the way
     # The plan that is left lacks the first action and repeats the last.
@@ -131,7 +131,7 @@ def test_it_reaches_the_known_optimum_of_a_linear_quadratic_problem():
 def test_limits_bind():
     env, start = point_env(2.0), at(1.0)
     planner = GradientPlanner(env, HORIZON, warm_up=300, samples=4, seed=0)
-    assert planner.planning(start).item() == pytest.approx(-2.0)
+    assert planner(start)["action"].item() == pytest.approx(-2.0)
     assert (start["plan", "actions"].abs() <= 2).all()
 
 
@@ -172,7 +172,7 @@ def test_the_next_call_goes_on_from_the_last_plan():
     torch.testing.assert_close(played["action"][0].double(), optimum, rtol=0.1, atol=0.3)
     fresh = GradientPlanner(env, HORIZON, 2, warm_up=2, samples=4, seed=0)
     alone = at(1.0)
-    assert (fresh.planning(alone).double() - optimum[0]).abs() > (played["action"][0, 0].double() - optimum[0]).abs()
+    assert (fresh(alone)["action"].double() - optimum[0]).abs() > (played["action"][0, 0].double() - optimum[0]).abs()
 
 
 def test_steps_shrink_where_they_gain_nothing_and_grow_where_they_do():
@@ -191,7 +191,7 @@ def test_steps_shrink_where_they_gain_nothing_and_grow_where_they_do():
     now["plan", "step_size"] = torch.full((2, 1), 0.05)
     now["state"][1, 1, 0] += 5.0
     for _ in range(3):
-        planner.planning(now)
+        planner(now)
     at_rest, thrown = now["plan", "step_size"][:, 0].tolist()
     assert thrown == pytest.approx(0.4) and at_rest < 0.4
 
@@ -200,8 +200,8 @@ def test_rows_are_planned_on_their_own():
     env = point_env(20.0)
     optimum = GradientPlanner(env, HORIZON, warm_up=150, samples=1, candidates=1, seed=0)
     both, one = at(1.0, -2.0), at(1.0)
-    together = optimum.planning(both)
-    torch.testing.assert_close(together[:1], optimum.planning(one), rtol=0.05, atol=0.05)
+    together = optimum(both)["action"]
+    torch.testing.assert_close(together[:1], optimum(one)["action"], rtol=0.05, atol=0.05)
 
 
 def test_candidates_find_what_one_sequence_misses():
@@ -214,7 +214,7 @@ def test_candidates_find_what_one_sequence_misses():
 
     env, start = ModelEnv(Point(scene), hills), at(0.0)
     many = GradientPlanner(env, HORIZON, warm_up=60, candidates=6, samples=6, seed=1)
-    many.planning(start)
+    many(start)
     states, _ = env.imagine(at(0.0), start["plan", "actions"][:, 0])
     assert start["plan", "actions"].shape == (1, 6, HORIZON, 1)
     assert states[0, -1, 1, 0] > 0.2
@@ -226,13 +226,13 @@ def test_a_first_plan_is_of_the_best_samples_only(monkeypatch):
     planner = GradientPlanner(env, HORIZON, 1, warm_up=0, candidates=4, samples=9, seed=3)
     drawn, splines = [], planner._splines
     monkeypatch.setattr(planner, "_splines", lambda *counts: drawn.append(splines(*counts)) or drawn[-1].clone())
-    planner.planning(start)
+    planner(start)
     (samples,) = drawn
     samples[:, 0] = 0
     returns = planner._imagine(at(-0.3, 0.2).repeat_interleave(9, 0), samples)
     best = samples.gather(1, returns.argsort(1, descending=True)[:, :4, None, None].expand(-1, -1, HORIZON, 1))
     torch.testing.assert_close(start["plan", "actions"][:, :, :-1], best[:, :, 1:])
-    planner.planning(start)
+    planner(start)
     assert [part.shape[1] for part in drawn] == [9, 2]
 
 
@@ -248,13 +248,13 @@ def test_an_episode_that_begins_anew_is_planned_anew(monkeypatch):
     planner = GradientPlanner(ModelEnv(Point(scene), quadratic), 4, 1, warm_up=3, samples=3, seed=0)
     env = batched(SceneEnv(scene, quadratic, seed=0), 2).append_transform(StepCounter(2))
     seen = []
-    planning = planner.planning
+    decide = planner.decide
 
     def watched(tensordict):
         seen.append(tensordict["plan", "planned"].flatten().tolist())
-        return planning(tensordict)
+        return decide(tensordict)
 
-    monkeypatch.setattr(planner, "planning", watched)
+    monkeypatch.setattr(planner, "decide", watched)
     # TorchRL finds the primer by its name and appends it.
     collector = Collector(env, planner, frames_per_batch=8, total_frames=8, auto_register_policy_transforms=True)
     for data in collector:
@@ -289,11 +289,11 @@ def test_what_is_not_finite_keeps_the_last_good_plan_and_says_so():
     good = at(1.0, 0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        planner.planning(good)
+        planner(good)
     plan = good["plan", "actions"].clone()
     good["state"][1, 1, 0] = 9.0
     with pytest.warns(RuntimeWarning, match="1 of 2 states has predictions or rewards that are not finite"):
-        action = planner.planning(good)
+        action = planner(good)["action"]
     assert action.isfinite().all()
     torch.testing.assert_close(action[1], plan[1, 0, 0])
 
@@ -326,7 +326,7 @@ def test_a_plan_that_diverges_upwards_never_wins(what):
     for _ in range(2):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            action = planner.planning(start)
+            action = planner(start)["action"]
         assert (action <= 1.5).all() and 1.3 < start["plan", "actions"][:, 0].max() <= 1.5
 
 
@@ -337,11 +337,11 @@ def test_where_nothing_is_finite_a_first_plan_is_to_rest_and_the_next_is_kept(re
     planner = GradientPlanner(env, 4, 2, warm_up=5, candidates=2, samples=40, seed=0)
     start = at(1.0, 0.5)
     with pytest.warns(RuntimeWarning, match="of 2 of 2 states .* there is no plan yet, and nothing is done"):
-        assert (planner.planning(start) == 0).all()
+        assert (planner(start)["action"] == 0).all()
     assert (start["plan", "actions"][:, 0] == 0).all()
     start["plan", "actions"][:, 0] = 0.25
     with pytest.warns(RuntimeWarning, match="their last plan is kept"):
-        torch.testing.assert_close(planner.planning(start), torch.full((2, 1), 0.25))
+        torch.testing.assert_close(planner(start)["action"], torch.full((2, 1), 0.25))
 
 
 def test_equal_bounds_fix_an_action():
@@ -349,7 +349,7 @@ def test_equal_bounds_fix_an_action():
     env.world_model.scene = env.scene = replace(env.scene, action_low=np.array([1.5]), action_high=np.array([1.5]))
     planner, start = GradientPlanner(env, 4, 2, warm_up=3, candidates=2, samples=4, action_cost=1.0, seed=0), at(1.0)
     for _ in range(2):
-        assert planner.planning(start).item() == 1.5
+        assert planner(start)["action"].item() == 1.5
         assert (start["plan", "actions"] == 1.5).all()
 
 
@@ -359,6 +359,77 @@ def test_gradients_are_opened_under_no_grad_and_refused_in_inference_mode():
         assert planner(at(1.0))["action"].shape == (1, 1)
     with torch.inference_mode(), pytest.raises(RuntimeError, match="torch.no_grad"):
         planner(at(1.0))
+
+
+def test_states_of_inference_mode_are_planned_from():
+    planner = GradientPlanner(point_env(2.0), 3, 1, warm_up=2, samples=2, seed=0)
+    with torch.inference_mode():
+        start = at(1.0) + 0
+    assert start["state"].is_inference()
+    again = copy.deepcopy(planner)
+    torch.testing.assert_close(planner(start)["action"], again(at(1.0))["action"])
+
+
+def test_output_tensordict():
+    planner = GradientPlanner(point_env(2.0), 3, 1, warm_up=2, samples=2, seed=0)
+    given, out = at(1.0), TensorDict()
+    assert planner(given, out) is out and set(given.keys()) == {"state"}
+    plan = {("plan", name) for name in ("actions", "planned", "step_size")}
+    assert set(out.keys(True, True)) == {"action", *plan}
+    with pytest.raises(ValueError, match="GradientPlanner takes no steps"):
+        planner(given, steps=3)
+
+
+def test_actions_cost_what_is_asked():
+    """Without the reward's own cost: where actions are dear the best is to do nothing."""
+    env = ModelEnv(point_env(2.0).world_model, lambda *step: quadratic(*step) + CONTROL_COST * step[1].square())
+    start = at(1.0)
+    free, dear = (
+        GradientPlanner(env, HORIZON, warm_up=100, samples=2, action_cost=cost, seed=0)(start.clone())[
+            "plan", "actions"
+        ]
+        for cost in (0.0, 100.0)
+    )
+    assert dear.abs().max() < 0.05 < free.abs().max()
+
+
+def test_the_optimizer_is_the_one_given():
+    """A step of gradient descent with a rate of 1/4 from rest, in units of half the range."""
+    env, start = point_env(2.0), at(1.0)
+    planner = GradientPlanner(
+        env, HORIZON, warm_up=1, samples=1, optimizer=lambda moved: torch.optim.SGD(moved, lr=0.25), seed=0
+    )
+    units = torch.zeros(1, HORIZON, 1, requires_grad=True)
+    (gradient,) = torch.autograd.grad(env.imagine(at(1.0), 2 * units)[1].sum(), units)
+    action = planner(start)["action"]
+    expected = 2 * 0.25 * gradient[0]
+    assert expected.abs().max() < 2
+    torch.testing.assert_close(torch.cat((action, start["plan", "actions"][0, 0, :-1])), expected)
+
+
+def test_noise_is_a_share_of_the_range_around_the_best():
+    plan = torch.full((3, 4, HORIZON, 1), 0.1)
+    plan[:, 1:] = -0.9
+    for noise in (0.0, 0.05, 0.5):
+        planner = GradientPlanner(point_env(2.0), HORIZON, candidates=4, noise=noise, seed=0)
+        off = planner._renewed(plan)[:, 2:] - 0.1
+        assert (off.abs() <= noise + 1e-6).all() and (off.abs().max() > 0.5 * noise or noise == 0)
+        assert torch.equal(planner._renewed(plan)[:, :2], plan[:, :2])
+
+
+def test_a_gradient_that_is_no_number_costs_an_iteration_and_no_more():
+    """The reward is a number all the while."""
+    calls = []
+
+    def reward(state, action, next_state, task):
+        calls.append(None)
+        lost = torch.tensor(len(calls) == 5) & (state[..., 1, :1] < 0)
+        return quadratic(state, action, next_state, task) + torch.where(lost, 0 * action, 1.0).sqrt()
+
+    scene = load_scene(POINT.replace("LIMIT", "20"), timestep=STEP)
+    planner = GradientPlanner(ModelEnv(Point(scene), reward), 1, 60, warm_up=60, samples=1, seed=0)
+    action = planner(at(1.0, -1.0))["action"]
+    assert len(calls) > 60 and action[0] < -0.4 and action[1] == pytest.approx(-action[0].item(), rel=0.05)
 
 
 def test_a_copy_plans_the_same():
@@ -396,11 +467,15 @@ def test_bad_input_is_named():
         GradientPlanner(ModelEnv(Point(still), quadratic), 3)
     deaf = ModelEnv(Point(env.scene), lambda state, action, next_state, task: state.detach()[..., 1, :1])
     with pytest.raises(ValueError, match="do not depend on the actions"):
-        GradientPlanner(deaf, 1, 1, warm_up=1, samples=2, seed=0).planning(at(1.0))
+        GradientPlanner(deaf, 1, 1, warm_up=1, samples=2, seed=0)(at(1.0))
+    weight = torch.ones(1, requires_grad=True)  # has a gradient of its own
+    deaf = ModelEnv(Point(env.scene), lambda state, action, next_state, task: weight * state.detach()[..., 1, :1])
+    with pytest.raises(ValueError, match="do not depend on the actions"):
+        GradientPlanner(deaf, 1, 1, warm_up=1, samples=2, seed=0)(at(1.0))
     planner, start = GradientPlanner(env, 3, 1, warm_up=1, samples=2, seed=0), at(1.0)
-    planner.planning(start)
+    planner(start)
     with pytest.raises(ValueError, match="comes from another planner"):
-        GradientPlanner(env, 5, 1, warm_up=1, samples=2, seed=0).planning(start)
+        GradientPlanner(env, 5, 1, warm_up=1, samples=2, seed=0)(start)
 
 
 def test_a_compiled_model_sees_one_number_of_rows(monkeypatch):
@@ -415,5 +490,5 @@ def test_a_compiled_model_sees_one_number_of_rows(monkeypatch):
 
     monkeypatch.setattr(env, "imagine", watched)
     start = at(1.0, -0.5)
-    GradientPlanner(env, HORIZON, 2, warm_up=3, samples=9, candidates=2, seed=0).planning(start)
+    GradientPlanner(env, HORIZON, 2, warm_up=3, samples=9, candidates=2, seed=0)(start)
     assert set(rows) == {4} and len(rows) == 9 // 2 + 3 + 1

@@ -38,7 +38,7 @@ def test_weights_get_no_gradients():
         return imagine(*inputs)
 
     env.imagine = watched
-    GradientPlanner(env, 3, 1, warm_up=2, samples=2, seed=0).planning(env.reset(TensorDict(batch_size=[2])))
+    GradientPlanner(env, 3, 1, warm_up=2, samples=2, seed=0)(env.reset(TensorDict(batch_size=[2])))
     assert required and not any(required)
     assert all(weight.requires_grad and weight.grad is None for weight in bound.parameters())
 
@@ -48,10 +48,10 @@ def test_samples_of_other_variants_are_refused():
     scene, other = bound.scene, load_scene("pendulum", timestep=0.04)
     planner = GradientPlanner(ModelEnv(bound, make_reward("balance", scene)), 3, 1, warm_up=1, samples=2, seed=0)
     start = planner.imagined.reset(TensorDict(batch_size=[2]))
-    planner.planning(start.clone().set("static", bound.own_static().expand(2)))
+    planner(start.clone().set("static", bound.own_static().expand(2)))
     static = SceneValues.of(other).tensordict().expand(2)
     with pytest.raises(ValueError, match="other static 'globals_' than scene 'pendulum'"):
-        planner.planning(start.set("static", static))
+        planner(start.set("static", static))
 
 
 def test_a_recurrent_model_remembers_what_was_played():

@@ -18,6 +18,8 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv
 from torchrl_gn.data import sample_start_states
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.planners.ilqg import ILQGPlanner
+from torchrl_gn.planners.ilqg_solver import ILQGSolver
+from torchrl_gn.planners.reward_expansion import RewardExpansion
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import Scene, load_scene
 
@@ -289,6 +291,8 @@ def test_output_tensordict():
     assert point_planner(env)(given, out) is out
     assert set(out.keys(True, True)) == {"action", ("plan", "actions"), ("plan", "planned")}
     assert "action" not in given and "next" not in given
+    with pytest.raises(ValueError, match="ILQGPlanner takes no steps"):
+        point_planner(env)(given, steps=3)
 
 
 def test_unstable_states_keep_their_plan_and_warn_once():
@@ -331,6 +335,36 @@ def test_a_gradient_that_is_no_number_keeps_the_plan():
     plan = {"actions": torch.ones(HORIZON, 2, dtype=torch.float64), "planned": torch.ones(1, dtype=torch.bool)}
     planned = point_planner(env).plan(env.reset().set("plan", TensorDict(plan)))
     assert torch.equal(planned, plan["actions"])
+
+
+def solver_of(reward) -> tuple[ILQGSolver, SceneEnv]:
+    env = point_env(2.0, reward)
+    expansion = RewardExpansion(reward, None, env.device)
+    return ILQGSolver(env.simulator, expansion, control_cost=0.0, central=False), env
+
+
+def test_a_reward_that_curves_upwards_has_its_curvature_cut():
+    """Else the backward pass would look for a maximum."""
+    solver, env = solver_of(lambda state, action, next_state, task: -quadratic(state, action, next_state, task))
+    start = solver.simulate(physics_of(env, [0.5, -0.3, 0.2, 0.4])[0].numpy(), np.zeros((1, 5, 2)))
+    assert solver.improve(start, 3).cost < start.cost
+    hessian = solver.expand(start).hessian
+    assert np.linalg.eigvalsh(hessian).min() > -1e-9 and np.abs(hessian).max() < 1e-9
+    mixed, _ = solver_of(lambda *step: step[1][..., :1].square() - 3 * step[1][..., 1:].square())
+    assert np.diag(mixed.expand(start).hessian[0])[-2:] == pytest.approx([0, 6 * 2.0**2])  # by half the range
+
+
+def test_where_every_step_is_too_long_shorter_ones_are_tried():
+    """The only way down is 0.003 long, which no damping of the first iteration finds."""
+
+    def reward(state, action, next_state, task):
+        along = action[..., :1] / 2.0
+        return torch.exp(-(((along - 0.003) / 0.002) ** 2)) - 50 * along.abs()
+
+    solver, env = solver_of(reward)
+    start = solver.simulate(physics_of(env, [0.0] * 4)[0].numpy(), np.full((1, 1, 2), 1e-6))
+    assert solver.improve(start, 1).cost == start.cost
+    assert solver.improve(start, 3).cost < start.cost - 0.1
 
 
 def test_copies_and_pickles_plan_alike():

@@ -28,3 +28,18 @@ def test_it_does_not_depend_on_how_large_rewards_are():
 
 def test_candidates_that_are_alike_score_alike():
     assert (advantage(torch.ones(4, 3)) == 0).all()
+
+
+def test_candidates_that_are_far_off_do_not_make_the_others_alike():
+    """Up to three of four may be unstable."""
+    reward = torch.randn(64, 3, generator=torch.Generator().manual_seed(0))
+    good = advantage(reward[:20])
+    for lost in (1, 44):
+        given = torch.cat((reward[:20], torch.full((lost, 3), -1e6)))
+        found = advantage(given)
+        assert (found[20:] < -1e4).all()
+        torch.testing.assert_close(found[:20], good)
+
+
+def test_one_candidate_is_the_best():
+    assert (advantage(torch.ones(1, 3)) == 0).all()

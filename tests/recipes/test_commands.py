@@ -23,6 +23,7 @@ NESTED = {  # options that hold options of other recipes
     ("mlp_baseline", "overrides"): "forward_model",
     ("data_shift", "overrides"): "forward_model",
     ("learning_curves", "overrides"): "svg",
+    ("benchmark_planning", "overrides"): "mpc",
     ("plan_and_learn", "planning"): "mpc",
     ("plan_and_learn", "training"): "forward_model",
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from torchrl_gn.data import Simulator, collect_trajectories, spline_controls
 from torchrl_gn.envs import SceneEnv
@@ -44,6 +44,20 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, cal
     assert code == 1 and "other options: horizon=5 (was 4)" in errors and "Traceback" not in errors
     code, _, errors = call(*options, "steps=3", "planner=random", recipe="mpc")
     assert code == 1 and "random.safetensors has 4 steps, more than steps=3" in errors
+
+
+def test_variants_start_alike_whoever_plans(tmp_path, call):
+    """They are identified first, whether somebody plans with the model or not."""
+    options = (*SMALL, "variants=true", "phase=5", "steps=1", "video=false", f"run_dir={tmp_path}")
+    for planners in ("random", "[gn,random]"):
+        code, _, errors = call(*options, f"planner={planners}", recipe="mpc")
+        assert code == 0, errors
+    states = [load_file(tmp_path / f"{name}.safetensors")["state"][:, 0] for name in ("gn", "random")]
+    assert torch.equal(*states)
+    saved = load_file(tmp_path / "random.safetensors")
+    save_file(saved | {"state": saved["state"] + 0.1}, tmp_path / "random.safetensors")
+    code, _, errors = call(*options, "planner=random", recipe="mpc")
+    assert code == 1 and "random.safetensors began in other states" in errors and "Traceback" not in errors
 
 
 def test_targets_that_are_poses(tmp_path, call):
@@ -133,6 +147,9 @@ def test_bad_options_are_named(tmp_path, call):
         ("steps=2.5", "steps must be a whole number, got 2.5"),
         ("horizon=0", "horizon must be at least 1"),
         ("episodes=-1", "episodes must be at least 1"),
+        ("cem.top_k=1 planner=cem_true", "cem.top_k must be at least 2, got 1"),
+        ("mppi.candidates=4 planner=mppi_true", "mppi.candidates must be at least 32, got 4"),
     ):
-        code, _, errors = call(*SMALL[:1], option, f"run_dir={tmp_path / option.split(chr(61))[0]}", recipe="mpc")
+        folder = tmp_path / option.split("=")[0]
+        code, _, errors = call(*SMALL[:1], *option.split(), f"run_dir={folder}", recipe="mpc")
         assert code == 1 and message in errors and "Traceback" not in errors, errors

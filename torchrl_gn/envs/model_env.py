@@ -43,7 +43,8 @@ class ModelEnv(ModelBasedEnvBase):
     ``reset()`` draws true start states and observes them; ``reset(tensordict,
     set_state=True)`` starts from the TensorDict's ``state``. A model that reads static values of
     every sample (``static_key``) gets those of the TensorDict, or else its scene's (of an inferred
-    graph zeros: nothing is known). A recurrent model's ``memory`` is carried along, from the
+    graph zeros: nothing is known); where an episode ends and another begins within a rollout, TorchRL hands none on. A
+    recurrent model's ``memory`` is carried along, from the
     TensorDict's or from nothing.
 
     Args:

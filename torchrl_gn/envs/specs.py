@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -79,7 +81,7 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
 
 
 def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
-    """The reward function of an environment, on its device.
+    """The reward function of an environment, on its device: a copy where it is elsewhere, for another environment.
 
     Raises:
         ValueError: it reads the bodies of another scene.
@@ -89,7 +91,9 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
     for each in reward.modules():
         if isinstance(each, Bodies):
             each.require_same(scene)
-    return reward.to(env.device)
+    if all(tensor.device == env.device for tensor in itertools.chain(reward.parameters(), reward.buffers())):
+        return reward
+    return copy.deepcopy(reward).to(env.device)
 
 
 def finite_reward(value: float) -> float:

@@ -10,23 +10,31 @@ from typing import cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
-from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.modules import BoundForwardModel
 from torchrl_gn.modules.weights import frozen
-from torchrl_gn.planners.plan import KEY, check_count, check_plannable, plan_primer, read_plan, write_plan
+from torchrl_gn.planners.plan import (
+    KEY,
+    RecedingHorizonPlanner,
+    check_count,
+    check_plannable,
+    plan_left,
+    plan_primer,
+    read_plan,
+)
 
 SMALLEST_STEP = 0.01  # as a share of the optimiser's
 
 OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
 
 
-class GradientPlanner(MPCPlannerBase):
+class GradientPlanner(RecedingHorizonPlanner):
     """Choose the actions whose imagined rewards are highest, by gradient ascent.
 
     (Paper, SM "MPC planner with learned models".)
@@ -135,16 +143,16 @@ class GradientPlanner(MPCPlannerBase):
         memory = cast(TensorDictBase, self.imagined.world_model.own_memory()) if self._remembers else None
         return plan_primer(self.plan_shape, torch.float32, self.imagined.device, memory, step_size=(1,))
 
-    def planning(self, td: TensorDictBase) -> Tensor:
-        """The action to take now, ``[*B, A]``, where the states are; the rest of the plan is written to ``td``."""
+    def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
+        """The action to take now, ``[*B, A]``, where the states are; what is left of the plan; and memory."""
         if torch.is_inference_mode_enabled():
             raise RuntimeError(
                 "GradientPlanner needs gradients, which torch.inference_mode() rules out; use torch.no_grad() there."
             )
-        batch, device = td.shape, self.imagined.device
-        flat = td.reshape(-1)
+        batch, device = tensordict.shape, self.imagined.device
+        flat = tensordict.reshape(-1)
         plan, planned = read_plan(flat, self.plan_shape, torch.float32)
-        states_at = cast(Tensor, td.get("state", plan)).device
+        states_at = cast(Tensor, tensordict.get("state", plan)).device
         plan, planned = self._scaled(plan.to(device)), planned.flatten().to(device)
         entries = self._entries(flat)
         if self._remembers and "memory" not in entries.keys() and bool(planned.any()):
@@ -165,14 +173,15 @@ class GradientPlanner(MPCPlannerBase):
                 if rows is planned:
                     size[where] *= torch.where(better, 2.0, self.shrink)
         actions, size = self._actions(best), size.clamp(SMALLEST_STEP, 1.0)
-        write_plan(
-            td,
+        left = plan_left(
+            batch,
             actions.reshape(*batch, *self.plan_shape).to(states_at),
             step_size=size.reshape(*batch, 1).to(states_at),
         )
+        beside: dict[NestedKey, TensorDictBase] = {KEY: left}
         if self._remembers:
-            td.set(("next", "memory"), self._remember(entries, actions[:, 0, 0]).reshape(batch).to(states_at))
-        return actions[:, 0, 0].reshape(*batch, -1).to(states_at)
+            beside["next", "memory"] = self._remember(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
+        return actions[:, 0, 0].reshape(*batch, -1).to(states_at), beside
 
     def _step_size(self, flat: TensorDictBase) -> Tensor:
         """Of every state ``[B, 1]``, as a share of the optimiser's; whole where there is no plan."""
@@ -205,7 +214,10 @@ class GradientPlanner(MPCPlannerBase):
         if isinstance(model, BoundForwardModel):
             model.static_in(flat)  # refuses other variants, of which the entries below tell nothing any more
         keys = [key for key in (*self.imagined.world_model.in_keys, "task") if key != "action"]
-        return flat.select(*keys, strict=False).detach().to(self.imagined.device)
+        read = flat.select(*keys, strict=False).detach()
+        # Of what was made in inference mode, which autograd refuses, copies.
+        usable = read.apply(lambda entry: entry.clone() if entry.is_inference() else entry)
+        return cast(TensorDictBase, usable).to(self.imagined.device)
 
     def _imagine(self, many: TensorDictBase, plan: Tensor) -> Tensor:
         """Returns ``[B, K]`` of sequences ``[B, K, H, A]`` in units of half their range, from ``[B K]`` states.
@@ -264,12 +276,13 @@ class GradientPlanner(MPCPlannerBase):
             with torch.enable_grad():
                 actions = plan + size * moved
                 total = self._imagine(many, actions)
-                if not total.requires_grad:
+                depends = total.requires_grad
+                gradient = torch.autograd.grad(-total.sum(), moved, allow_unused=True)[0] if depends else None
+                if gradient is None:
                     raise ValueError(
                         f"The rewards that {self.imagined} imagines do not depend on the actions. Has its model been"
                         " trained, and is the horizon long enough for the reward to show what actions do?"
                     )
-                (gradient,) = torch.autograd.grad(-total.sum(), moved)
             best, record = _keep_better(best, record, actions, total)
             began = record if iteration == 0 else began
             # A sequence whose rollout leaves all bounds has no usable gradient: it stays where it is.

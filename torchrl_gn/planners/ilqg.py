@@ -9,22 +9,30 @@ from typing import Any, cast
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
-from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
-from torchrl_gn.planners.plan import check_count, check_plannable, plan_primer, read_plan, write_plan
+from torchrl_gn.planners.plan import (
+    KEY,
+    RecedingHorizonPlanner,
+    check_count,
+    check_plannable,
+    plan_left,
+    plan_primer,
+    read_plan,
+)
 from torchrl_gn.planners.reward_expansion import RewardExpansion
 
 _STARTS = 16  # random sequences of which a first plan starts from the best
 
 
-class ILQGPlanner(MPCPlannerBase):
+class ILQGPlanner(RecedingHorizonPlanner):
     """Plan with the true MuJoCo physics, by control-limited differential dynamic programming.
 
     At every control step the planned actions are improved by some iterations of iLQG (Tassa, Mansard
@@ -124,20 +132,10 @@ class ILQGPlanner(MPCPlannerBase):
         """The transform that clears plans when episodes begin."""
         return plan_primer(self._plan_shape, torch.float64, self._scene_env.device)
 
-    def planning(self, td: TensorDictBase) -> Tensor:
-        """The actions ``[*B, A]`` to take now."""
-        return self._first(self.plan(td))
-
-    def forward(
-        self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None, **kwargs: Any
-    ) -> TensorDictBase:
-        """Plan, and write the action and what is left of the plan."""
-        if kwargs:
-            raise ValueError(f"ILQGPlanner takes no {', '.join(kwargs)}.")
+    def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
+        """The actions ``[*B, A]`` to take now, and what is left of the plan."""
         actions = self.plan(tensordict)
-        written = self._write_to_tensordict(tensordict, [self._first(actions)], tensordict_out)
-        write_plan(written, actions)
-        return written
+        return actions[..., 0, :].to(self.action_spec.dtype), {KEY: plan_left(tensordict.shape, actions)}
 
     def plan(self, tensordict: TensorDictBase) -> Tensor:
         """Sequences of actions ``[*B, H, A]``, float64, from the states of a TensorDict ``[*B]``; see the class."""
@@ -195,9 +193,6 @@ class ILQGPlanner(MPCPlannerBase):
             RuntimeWarning,
             stacklevel=2,
         )
-
-    def _first(self, actions: Tensor) -> Tensor:
-        return self.action_spec.project(actions[..., 0, :].to(self.action_spec.dtype))
 
     @property
     def _scene_env(self) -> SceneEnv:

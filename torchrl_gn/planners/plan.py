@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from numbers import Integral
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
+from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
@@ -18,6 +21,34 @@ from torchrl_gn.envs.scene_env import SceneEnv
 # An entry that an environment does not know stays as it is from step to step, and so does a primer's, which also sets
 # it back when an episode begins.
 KEY = "plan"
+
+
+class RecedingHorizonPlanner(MPCPlannerBase):
+    """A planner whose plan is the TensorDict's entry ``plan``."""
+
+    @abstractmethod
+    def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
+        """The action ``[*B, A]`` to take now, and what is to be written beside it."""
+
+    def planning(self, td: TensorDictBase) -> Tensor:
+        """The action ``[*B, A]`` to take now."""
+        return self.decide(td)[0]
+
+    def forward(
+        self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None, **kwargs: Any
+    ) -> TensorDictBase:
+        """Plan, and write the action and what is left of the plan.
+
+        Raises:
+            ValueError: if there are other arguments.
+        """
+        if kwargs:
+            raise ValueError(f"{type(self).__name__} takes no {', '.join(kwargs)}.")
+        action, beside = self.decide(tensordict)
+        written = self._write_to_tensordict(tensordict, [self.action_spec.project(action)], tensordict_out)
+        for key, value in beside.items():
+            written.set(key, value)
+        return written
 
 
 def check_plannable(env: ModelEnv | SceneEnv, **counts: int) -> None:
@@ -92,18 +123,17 @@ def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.d
     return actions.to(dtype), planned
 
 
-def write_plan(tensordict: TensorDictBase, actions: Tensor, **more: Tensor) -> None:
-    """Write what is left of a plan when its first action was taken, with the last one repeated.
+def plan_left(batch: torch.Size, actions: Tensor, **more: Tensor) -> TensorDict:
+    """The entry ``plan`` when the first action was taken, with the last one repeated.
 
     Args:
-        tensordict: ``[*B]``; its entry ``plan`` is replaced.
+        batch: ``[*B]``.
         actions: ``[*B, ..., H, A]``.
         **more: what else the planner wants to find there at the next step, ``[*B, ...]``.
     """
     left = torch.cat([actions[..., 1:, :], actions[..., -1:, :]], dim=-2)
-    planned = torch.ones(*tensordict.shape, 1, dtype=torch.bool, device=actions.device)
-    plan = TensorDict({"actions": left, "planned": planned, **more}, batch_size=tensordict.shape)
-    tensordict.set(KEY, plan)
+    planned = torch.ones(*batch, 1, dtype=torch.bool, device=actions.device)
+    return TensorDict({"actions": left, "planned": planned, **more}, batch_size=batch)
 
 
 def plan_primer(
