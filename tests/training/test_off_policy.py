@@ -9,8 +9,10 @@ import math
 
 import pytest
 import torch
+import torchrl
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.modules import Agent
@@ -131,6 +133,21 @@ def test_a_run_that_goes_on_begins_other_episodes(make_learner):
         spend(again)
         starts.append(contents(again)[100:120:5, 0])
     assert not (starts[0] == starts[1]).any() and torch.equal(starts[1], starts[2])
+
+
+def test_the_last_updates_have_no_other_threads_than_the_first(make_learner, point_env, monkeypatch):
+    """Closing TorchRL's SerialEnv, which its collector does with the last batch, would give torch all it began with."""
+    monkeypatch.setattr(torchrl, "_THREAD_POOL_INIT", 4)
+    trainer, before, seen = make_learner(frames=100, random_frames=20), torch.get_num_threads(), set()
+    trainer.env = SerialEnv(2, [functools.partial(point_env, 2)] * 2)
+    update = trainer.update
+    monkeypatch.setattr(trainer, "update", lambda: seen.add(torch.get_num_threads()) or update())
+    torch.set_num_threads(2)
+    try:
+        spend(trainer)
+        assert trainer.env.is_closed and seen == {torch.get_num_threads()} == {2}
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("leave", ["break", "raise"])

@@ -157,10 +157,13 @@ class OffPolicyTrainer:
             yield self._learn(time.perf_counter())
         if self.frames >= self.total:
             return
-        collector = self._collector()
+        collector, threads = self._collector(), torch.get_num_threads()
         try:
             start = time.perf_counter()
             for batch in collector:
+                # With the last batch TorchRL closes the environments, after which a SerialEnv leaves torch all threads:
+                # on a busy machine the last updates took minutes.
+                torch.set_num_threads(threads)
                 self.remember(batch)
                 yield self._learn(start)
                 start = time.perf_counter()
