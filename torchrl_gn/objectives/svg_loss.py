@@ -79,13 +79,14 @@ class SVGLoss(DDPGLoss):
             raise ValueError(f"steps={steps} must be 0 or more.")
         if steps and (model is None or reward is None):
             raise ValueError(f"steps={steps} need a model and a reward; use steps=0 without.")
-        predicted = {unravel_key(key)[1:] for key in model.out_keys} if steps and model is not None else set()
-        for name, network in (("policy", actor_network), ("value", value_network)) if steps else ():
-            read = {key if isinstance(key, tuple) else (key,) for key in map(unravel_key, network.in_keys)}
-            if not read & predicted:
-                raise ValueError(
-                    f"The model predicts {sorted(predicted)}, nothing of what the {name} reads: {sorted(read)}."
-                )
+        if steps and model is not None:
+            predicted = {unravel_key(key)[1:] for key in model.out_keys}
+            for name, network in (("policy", actor_network), ("value", value_network)):
+                read = {key if isinstance(key, tuple) else (key,) for key in map(unravel_key, network.in_keys)}
+                if not read & predicted:
+                    raise ValueError(
+                        f"The model predicts {sorted(predicted)}, nothing of what the {name} reads: {sorted(read)}."
+                    )
         super().__init__(actor_network, value_network, **options)
         self.steps = steps
         self._share_statistics()
