@@ -13,6 +13,7 @@ folder.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import hydra
@@ -20,8 +21,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_gn.evaluation import plot_planning_curves
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
-from torchrl_gn.training.sweep import Run, folder_name, report_sweep, run_all
+from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, with_help
+from torchrl_gn.training.sweep import Run, folder_name, refuse_changes, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("mpc.py")
 
@@ -29,11 +30,11 @@ RECIPE = Path(__file__).with_name("mpc.py")
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
     """Every model's and rival's runs, by number of iterations."""
     options = [f"{name}={cfg[name]}" for name in ("system", "episodes", "steps", "compile", "seed", "threads")]
-    options += [f"simulation_threads={cfg.threads}", "video=false", *cfg.overrides]
-    models = [None] if cfg.checkpoints is None else cfg.checkpoints
-    ways = [("gn" if path is None else Path(path).stem, "gn", cfg.iterations, path) for path in models]
+    options += [f"simulation_threads={cfg.threads}", "video=false", *as_list(cfg.overrides)]
+    models = as_list(cfg.checkpoints) or [None]
+    ways = [("gn" if path is None else Path(path).stem, "gn", as_list(cfg.iterations), path) for path in models]
     # Rivals have the first model too: what cem and mppi plan with, and what identifies variants for all.
-    ways += [(str(planner), str(planner), iterations, models[0]) for planner, iterations in cfg.rivals.items()]
+    ways += [(str(planner), str(planner), as_list(iterations), models[0]) for planner, iterations in cfg.rivals.items()]
     runs: dict[str, dict[int, Run]] = {}
     for label, planner, iterations, checkpoint in ways:
         if label in runs:
@@ -52,10 +53,11 @@ def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
 @clean_exit
 def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "benchmark_planning")
-    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, folder.path / "log", name=f"benchmark_planning-{cfg.system}", config=cfg)
     clock = 1e3 * load_scene(cfg.system).timestep
     runs = make_runs(cfg, folder.path)
+    refuse_changes(run for of in runs.values() for run in of.values())
+    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name=f"benchmark_planning-{cfg.system}", config=cfg)
     failed = run_all([run for of in runs.values() for run in of.values()], jobs=1, desc="planning")
 
     metrics: dict[str, float] = {"clock_ms": clock}
@@ -69,11 +71,12 @@ def main(cfg: DictConfig) -> None:
         planner = label if label in cfg.rivals else "gn"
         times, rewards, spreads = [], [], []
         for iterations, run in of.items():
-            if (found := run.metrics) is None:
-                continue
+            # A reward is no number where every episode became unstable.
             reward, spread, ms = (
-                found[f"{planner}/{key}"] for key in ("mean_reward", "mean_reward_std", "planning_ms")
+                run.number(f"{planner}/{key}", math.nan) for key in ("mean_reward", "mean_reward_std", "planning_ms")
             )
+            if reward is None or spread is None or ms is None:
+                continue
             for values, value in ((times, ms), (rewards, reward), (spreads, spread)):
                 values.append(value)
             name = f"{label}/{iterations}"

@@ -89,6 +89,9 @@ def main(cfg: DictConfig) -> None:
             if workers.first:
                 Path(os.environ[PART]).write_text(json.dumps(times))
         return
+    for name in ("steps", "warm_up"):
+        if cfg[name] < 1:
+            raise ValueError(f"{name}={cfg[name]} must be 1 or more.")
     run = RunFolder(cfg.run_dir, "benchmark_scaling")
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_scaling", config=cfg)

@@ -22,13 +22,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
-from typing import Any, cast
+from typing import Any
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
-from torchrl_gn.training.sweep import Run, folder_name, report_sweep, run_all
+from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, plain_config, with_help
+from torchrl_gn.training.sweep import Run, folder_name, refuse_changes, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_100": "100 steps"}
@@ -69,32 +69,28 @@ class Training:
 
     def value(self, system: str, key: str) -> float | None:
         """Number of a system that it measured; infinite if it diverged, None if there is none."""
-        metrics = self.run.metrics or {}
         names = [f"{system}/{key}", f"{system} (zero-shot)/{key}", *([key] if self.systems == (system,) else [])]
-        for name in (name for name in names if name in metrics):
-            return math.inf if metrics[name] is None else float(metrics[name])
-        return None
+        return next((value for name in names if (value := self.run.number(name)) is not None), None)
 
 
 def all_trainings(cfg: DictConfig, folder: Path) -> list[Training]:
     """Every variant and seed, system by system."""
-    given = cast(dict[str, Any], OmegaConf.to_container(cfg.variants))
-    variants = {name: Variant.read(name, value) for name, value in given.items()}
-    chosen = list(variants) if cfg.only is None else list(cfg.only)
+    variants = {name: Variant.read(name, value) for name, value in plain_config(cfg.variants).items()}
+    chosen = as_list(cfg.only) or list(variants)
     unknown = [name for name in chosen if name not in variants]
     if unknown:
         raise ValueError(f"Variants {unknown} are not known; use some of {list(variants)}.")
     trainings = []
-    for seed, name in itertools.product(cfg.seeds, chosen):
+    for seed, name in itertools.product(as_list(cfg.seeds), chosen):
         variant = variants[name]
-        for systems in variant.trainings(cfg.systems):
+        for systems in variant.trainings(as_list(cfg.systems)):
             overrides = (
                 f"system=[{','.join(systems)}]" if variant.train_on else f"system={systems[0]}",
-                f"zero_shot=[{','.join(cfg.zero_shot)}]",
+                f"zero_shot=[{','.join(as_list(cfg.zero_shot))}]",
                 *(f"{option}={_plain(cfg[option])}" for option in ("minutes", "steps", "clock", "threads")),
                 f"seed={seed}",
                 f"data.folder={cfg.data_dir}",
-                *cfg.overrides,
+                *as_list(cfg.overrides),
                 *variant.overrides,
             )
             place = folder / folder_name("-".join(systems)) / folder_name(name) / f"seed{seed}"
@@ -118,10 +114,10 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
             for system in columns:
                 own = [t for t in trainings if t.variant == variant]
                 if key == "steps":
-                    found = [(t.run.metrics or {}).get(key) for t in own if system in t.systems]
+                    found = [t.run.number(key) for t in own if system in t.systems]
                 else:
                     found = [t.value(system, key) for t in own]
-                values = [float(value) for value in found if value is not None]
+                values = [value for value in found if value is not None]
                 if not values:
                     cells.append("-")
                     continue
@@ -133,10 +129,10 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
                 cells.append(f"{center:.1e}" + (f" ± {spread:.0e}" if len(values) > 1 else ""))
                 metrics[f"{system}/{variant}/{key}/half_range"] = spread
                 bars.setdefault(title, {}).setdefault(variant, {})[system] = (center, spread)
-                if first.setdefault(system, center) > 0:
-                    logs.append(math.log(center / first[system]) if math.isfinite(center) else math.inf)
+                if 0 < first.setdefault(system, center) < math.inf:  # nothing to compare with where it diverged
+                    logs.append(math.log(center / first[system]) if center > 0 else -math.inf)
             if key != "steps":
-                relative = math.exp(mean(logs)) if logs and math.isfinite(mean(logs)) else math.nan
+                relative = math.exp(mean(logs)) if logs else math.nan
                 metrics[f"relative/{variant}/{key}"] = relative
                 cells.append(f"{relative:.2f}")
             rows.append("| " + " | ".join([variant, *cells]) + " |")
@@ -153,11 +149,12 @@ def main(cfg: DictConfig) -> None:
     if cfg.data_dir is None:
         cfg.data_dir = str(folder.data)
     trainings = all_trainings(cfg, folder.path)
+    refuse_changes(training.run for training in trainings)
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
     tracker = Tracker(cfg.logger, folder.path / "log", name="compare", config=cfg)
     failed = run_all([training.run for training in trainings], cfg.jobs)
-    lines, metrics, bars = summarise(trainings, [*cfg.systems, *cfg.zero_shot])
-    report_sweep(folder, lines, bars, metrics, failed, tracker, seed=cfg.seeds[0])
+    lines, metrics, bars = summarise(trainings, [*as_list(cfg.systems), *as_list(cfg.zero_shot)])
+    report_sweep(folder, lines, bars, metrics, failed, tracker, seed=as_list(cfg.seeds)[0])
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import itertools
 import math
 from pathlib import Path
 from statistics import mean
+from typing import cast
 
 import hydra
 import numpy as np
@@ -30,16 +31,19 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_gn.data import Simulator, create_dataset, sample_start_states
+from torchrl_gn.data import Simulator, UnstableSimulationError, create_dataset, sample_start_states
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, rollout_video
 from torchrl_gn.modules import Agent, SwimmerObservation
 from torchrl_gn.scenes import Scene, load_scene
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, load_checkpoint, with_help
-from torchrl_gn.training.sweep import Run, report_sweep, run_all
+from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, load_checkpoint, with_help
+from torchrl_gn.training.run_folder import CONFIG_FILE
+from torchrl_gn.training.sweep import Run, refuse_changes, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
+# When a run goes on. All else makes other data, which finished trainings have not seen.
+MAY_CHANGE = ("minutes", "seeds", "sequences", "jobs", "threads", "data_dir", "logger", "run_dir")
 LOW, HIGH = np.array([0.1, 0.2, -np.pi]), np.array([1.0, 2.0, np.pi])  # of a wave: height, Hz, lag from joint to joint
 
 
@@ -82,8 +86,8 @@ def swim(scene: Scene, gait: np.ndarray, count: int, steps: int, rng: np.random.
     half = (scene.action_high - scene.action_low) / 2
     actions = np.clip(actions + 0.1 * half * rng.normal(size=actions.shape), scene.action_low, scene.action_high)
     found = Simulator(scene).rollout(sample_start_states(scene, count, rng), actions)
-    if not bool(found["stable"].all()):
-        raise ValueError(f"{int((~found['stable']).sum())} of {count} simulations of {scene.name!r} are unstable.")
+    if unstable := int((~found["stable"]).sum()):
+        raise UnstableSimulationError(f"{unstable} of {count} swimmers became unstable; try another seed.")
     action = torch.from_numpy(actions[:, going:])
     return TensorDict({"state": found["state"][:, going:].clone(), "action": action}, [count])
 
@@ -106,7 +110,11 @@ def swim_by_policy(scene: Scene, agent: Agent, hold: int, count: int, steps: int
             if step % hold == 0:
                 now = policy(now)
             actions.append(now["action"].double())
-            now.update(env.step(now)["next"].select("state", "physics"))
+            now.update(env.step(now)["next"].select("state", "physics", "terminated"))
+            if bool(now["terminated"].any()):
+                raise ValueError(
+                    f"{int(now['terminated'].sum())} of {count} simulations became unstable; try another seed."
+                )
     kept = {"state": torch.stack(states[going:], 1), "action": torch.stack(actions[going:-1], 1)}
     return TensorDict(kept, [count])
 
@@ -114,16 +122,16 @@ def swim_by_policy(scene: Scene, agent: Agent, hold: int, count: int, steps: int
 def make_runs(cfg: DictConfig, folder: Path, swimming: Path) -> dict[tuple[str, str], list[Run]]:
     """Trainings of every network on either data, one for each seed."""
     runs = {}
-    networks = {"GN": [], "MLP": ["model.core=mlp", *cfg.mlp]}
+    networks = {"GN": [], "MLP": ["model.core=mlp", *as_list(cfg.mlp)]}
     data = {"random": [], "mixture": [f"data.extra={swimming}"]}
     for network, trained_on in itertools.product(networks, data):
         place = folder / f"{network}_{trained_on}"
         options = (f"system={cfg.system}", f"minutes={cfg.minutes}", f"clock={cfg.clock}", f"threads={cfg.threads}")
         options += (*(f"data.{name}={size}" for name, size in cfg.random.items()), f"data.length={cfg.length}")
-        options += (f"data.folder={cfg.data_dir}", *cfg.overrides, *networks[network], *data[trained_on])
+        options += (f"data.folder={cfg.data_dir}", *as_list(cfg.overrides), *networks[network], *data[trained_on])
         runs[network, trained_on] = [
             Run(RECIPE, place / f"seed{seed}", (*options, f"seed={seed}"), f"{network} on {trained_on} data")
-            for seed in cfg.seeds
+            for seed in as_list(cfg.seeds)
         ]
     return runs
 
@@ -150,6 +158,11 @@ def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "data_shift")
     if cfg.data_dir is None:
         cfg.data_dir = str(folder.data)
+    if (begun := folder.path / CONFIG_FILE).exists():
+        folder.refuse_changes(cast(DictConfig, OmegaConf.load(begun)), cfg, free=MAY_CHANGE)
+    place = folder.path / "swimming"
+    runs = make_runs(cfg, folder.path, place)
+    refuse_changes(run for of in runs.values() for run in of)
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
     tracker = Tracker(cfg.logger, folder.path / "log", name="data_shift", config=cfg)
     scene, rng = load_scene(cfg.system), np.random.default_rng(cfg.seed)
@@ -168,12 +181,10 @@ def main(cfg: DictConfig) -> None:
         swimming = {name: swim(scene, gait, cfg.swimming[name], cfg.length, rng) for name in ("train", "test")}
         metrics["gait/distance"] = far
         metrics |= {f"gait/{name}": float(value) for name, value in zip(("height", "Hz", "lag"), gait, strict=True)}
-    place = folder.path / "swimming"
     swimming["train"].memmap(str(place), copy_existing=True)
     state = swimming["test"]["state"][0]
     rollout_video(scene, state, state, folder.file("swimming.gif"))
 
-    runs = make_runs(cfg, folder.path, place)
     failed = run_all([run for of in runs.values() for run in of], cfg.jobs)
     sizes = [int(cfg.random[name]) for name in ("train", "validation", "test")]
     dataset = create_dataset(Path(cfg.data_dir) / scene.name, scene, *sizes, steps=cfg.length)

@@ -13,7 +13,6 @@ recipes/config/ddpg.yaml.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, cast
 
 import hydra
 import torch
@@ -34,17 +33,13 @@ from torchrl_gn.training import (
     load_checkpoint,
     make_agent_optimizer,
     mean_return,
+    plain_config,
     report_learning,
     with_help,
 )
 
 # When a run goes on.
 MAY_CHANGE = ("trainer.frames", "trainer.compile", "threads", "logger", "run_dir", "checkpoint_seconds")
-
-
-def options(cfg: DictConfig) -> dict[str, Any]:
-    """Options as plain values."""
-    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
 
 
 @with_help
@@ -56,8 +51,8 @@ def main(cfg: DictConfig) -> None:
     run = RunFolder(cfg.run_dir, "ddpg")
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
-        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
-    graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, options(cfg)["task"]["graph"])
+        run.refuse_changes(begun.config, cfg, free=MAY_CHANGE)
+    graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, plain_config(cfg)["task"]["graph"])
     agent = begun.agent if begun else Agent(graph, stochastic=False, hidden=cfg.hidden)
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name=f"ddpg-{cfg.task.name}", config=cfg)
@@ -77,9 +72,9 @@ def main(cfg: DictConfig) -> None:
         lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
         make_agent_optimizer([loss], policy_lr=cfg.policy_lr, value_lr=cfg.value_lr),
         seed=cfg.seed,
-        **options(cfg.trainer),
+        **plain_config(cfg.trainer),
     )
-    learn_with_progress(trainer, run.checkpoint, begun, tracker, config=options(cfg))
+    learn_with_progress(trainer, run.checkpoint, begun, tracker, config=plain_config(cfg))
     report_learning(trainer, run, tracker, label="DDPG", seed=cfg.seed)
 
 

@@ -26,6 +26,8 @@ from torchrl_gn.training.progress import HORIZON, collecting
 @hydra.main(version_base=None, config_path="config", config_name="evaluate")
 @clean_exit
 def main(cfg: DictConfig) -> None:
+    if cfg.checkpoint is None:
+        raise ValueError("Say what to evaluate: checkpoint=runs/forward_model/<time>, or a trained model's name.")
     checkpoint = load_model(cfg.checkpoint)
     scene = load_scene(cfg.system, timestep=cfg.timestep) if cfg.system else checkpoint.scene()
     model = checkpoint.model.bind(scene, strict=cfg.strict)
@@ -36,7 +38,7 @@ def main(cfg: DictConfig) -> None:
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name="evaluate", config=cfg)
     with collecting("test data") as show:
-        test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, progress=show)
+        test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, split=3, progress=show)
     table, files = report(model, test, run.path)
     tracker.finish(run.write_metrics(table.to_metrics(), seed=cfg.seed), files)
     print(table)

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import hydra
 import torch
@@ -46,10 +46,12 @@ from torchrl_gn.training import (
     Tracker,
     Trainer,
     Workers,
+    as_list,
     clean_exit,
     join_workers,
     load_checkpoint,
     make_optimizer,
+    plain_config,
     with_help,
 )
 from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
@@ -94,15 +96,9 @@ class Task:
         return model.bind(self.scene, static_key="static" if self.parametrized else None)
 
 
-def options(cfg: DictConfig) -> dict[str, Any]:
-    """Options as plain values."""
-    return cast(dict[str, Any], OmegaConf.to_container(cfg))
-
-
 def load_scenes(names: str | ListConfig, timestep: float | None) -> list[Scene]:
     """Scenes of one name or several."""
-    names = ListConfig([names]) if isinstance(names, str) else names
-    return [load_scene(name, timestep=timestep) for name in names]
+    return [load_scene(name, timestep=timestep) for name in as_list(names)]
 
 
 def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]:
@@ -122,11 +118,10 @@ def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
     """Half of the training trajectories, and as many of `data.extra`, over and over where those are fewer."""
     if cfg.data.extra is None:
         return dataset.train
-    sources = [cfg.data.extra] if isinstance(cfg.data.extra, str) else list(cfg.data.extra)
     count = (len(dataset.train) + 1) // 2
     own = cast(TensorDict, dataset.train[:count]).select("state", "action")
     each = []
-    for source in sources:
+    for source in as_list(cfg.data.extra):
         each.append(extra_trajectories(source, cfg.data.length))
         shapes, wanted = ([list(of.get(key).shape[1:]) for key in ("state", "action")] for of in (each[-1], own))
         if shapes != wanted:
@@ -150,6 +145,8 @@ def extra_trajectories(source: str, length: int) -> TensorDict:
     pieces = {"state": states.movedim(-1, 2).flatten(0, 1), "action": actions.movedim(-1, 2).flatten(0, 1)}
     # An episode whose simulation became unstable is NaN from there on.
     whole = pieces["state"].isfinite().flatten(1).all(1)
+    if not bool(whole.any()):
+        raise ValueError(f"data.extra={source} has no {length} steps of an episode that stayed stable.")
     return TensorDict({name: piece[whole] for name, piece in pieces.items()}, [int(whole.sum())])
 
 
@@ -160,7 +157,7 @@ def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
     if cfg.model.core == "mlp" and len(scenes) > 1:
         raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
     items = (scenes[0].num_nodes, scenes[0].num_edges) if cfg.model.core == "mlp" else None
-    return ForwardModel(FeatureSet.of(scenes[0]), items=items, **options(cfg.model))
+    return ForwardModel(FeatureSet.of(scenes[0]), items=items, **plain_config(cfg.model))
 
 
 def make_buffer(tasks: list[Task], batch_size: int, window: int, seed: int, workers: Workers) -> ReplayBuffer:
@@ -249,7 +246,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     run = workers.agree(lambda: RunFolder(cfg.run_dir, "forward_model"))
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
-        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
+        run.refuse_changes(begun.config, cfg, free=MAY_CHANGE)
     model = (begun.model if begun else make_model(cfg, scenes)).to(workers.device(cfg.device))
     if workers.first:
         run.write_config(OmegaConf.to_yaml(cfg))
@@ -262,7 +259,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     trainer = make_trainer(cfg, model, tasks, workers)
     if not begun and cfg.start_from is None:
         fit_normalizers(cfg, trainer, tasks)
-    curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scenes, config=options(cfg))
+    curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scenes, config=plain_config(cfg))
     if not workers.first:
         return
 

@@ -18,7 +18,7 @@ came out: docs/results.md.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import hydra
 import numpy as np
@@ -58,6 +58,7 @@ from torchrl_gn.training import (
     clean_exit,
     load_checkpoint,
     make_optimizer,
+    plain_config,
     with_help,
 )
 from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
@@ -74,14 +75,10 @@ MAY_CHANGE = (
     "run_dir",
     "checkpoint_seconds",
     "baselines",
+    "jobs",
     "test",
     "data.ray",
 )
-
-
-def options(cfg: DictConfig) -> dict[str, Any]:
-    """Options as plain values."""
-    return cast(dict[str, Any], OmegaConf.to_container(cfg))
 
 
 def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset: TrajectoryDataset) -> Trainer:
@@ -114,6 +111,16 @@ def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset
         unroll_fraction=cfg.unroll_fraction,
         validate=validate,
     )
+
+
+def refuse_sizes(cfg: DictConfig) -> None:
+    """Refuse at once what would fail when the training is done."""
+    if cfg.phase + 20 > cfg.data.length:
+        raise ValueError(
+            f"phase={cfg.phase} leaves fewer than 20 of data.length={cfg.data.length} steps to predict in validation."
+        )
+    if cfg.test.systems < 4:
+        raise ValueError(f"test.systems={cfg.test.systems} must be 4 or more: parameters are read from three quarters.")
 
 
 class TestSystems:
@@ -183,14 +190,15 @@ def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, s
     """Errors of models without identification and with the true parameters, trained for the same time."""
     runs = {}
     for name, static in (("no identification", "none"), ("true parameters", "scene")):
-        sizes = {key: value for key, value in options(cfg)["model"].items() if key != "inferred"}
+        sizes = {key: value for key, value in plain_config(cfg)["model"].items() if key != "inferred"}
         model = [f"model.{key}={value}".replace(" ", "") for key, value in sizes.items()]
         shared = [f"system={cfg.system}", "parametrized=true", f"data.folder={data}", f"seed={cfg.seed}"]
         budget = {key: "null" if cfg[key] is None else cfg[key] for key in ("minutes", "steps", "clock", "threads")}
         shared += [f"{key}={value}" for key, value in budget.items()]
         shared += [f"data.{key}={cfg.data[key]}" for key in ("train", "validation", "test", "length", "seed")]
         shared += [f"noise={cfg.noise}", *model, f"model.static={static}"]
-        runs[name] = Run(RECIPE, folder / name.replace(" ", "_"), tuple(shared), name)
+        place = folder / name.replace(" ", "_")
+        runs[name] = Run(RECIPE, place, tuple(shared), name, goes_on=("minutes", "steps", "clock"))  # as this one may
     refuse_failures(run_all(runs.values(), cfg.jobs, desc="training baselines"))
     models = {name: load_checkpoint(run.folder).model.bind(scene, static_key="static") for name, run in runs.items()}
     return {name: evaluate_errors(bound, systems.predicted) for name, bound in models.items()}
@@ -203,15 +211,16 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
     scene = load_scene(cfg.system)
+    refuse_sizes(cfg)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)
     run = RunFolder(cfg.run_dir, "inference_model")
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
-        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
+        run.refuse_changes(begun.config, cfg, free=MAY_CHANGE)
         model = cast(IdentifyingModel, begun.trained)
     else:
-        forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", **options(cfg.model))
-        model = IdentifyingModel(forward_model, **options(cfg.inference))
+        forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", **plain_config(cfg.model))
+        model = IdentifyingModel(forward_model, **plain_config(cfg.inference))
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name=f"inference_model-{scene.name}", config=cfg)
 
@@ -220,7 +229,7 @@ def main(cfg: DictConfig) -> None:
     trainer = make_trainer(cfg, model, scene, dataset)
     if not begun:
         trainer.loss.fit_normalizers(trajectory_buffer(dataset.train, batch_size=20_000, seed=cfg.seed).sample())
-    curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scene, config=options(cfg))
+    curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scene, config=plain_config(cfg))
 
     systems = TestSystems(cfg, scene)
     tables, curve = identified_errors(cfg, model, scene, systems)

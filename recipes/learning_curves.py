@@ -22,20 +22,20 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_gn.evaluation import plot_learning_curves
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
-from torchrl_gn.training.sweep import Run, folder_name, report_sweep, run_all
+from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, with_help
+from torchrl_gn.training.sweep import Run, folder_name, refuse_changes, report_sweep, run_all
 
 
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, list[Run]]:
     """Every agent's runs, a seed each."""
-    chosen = list(cfg.agents) if cfg.only is None else list(cfg.only)
+    chosen = as_list(cfg.only) or list(cfg.agents)
     unknown = [name for name in chosen if name not in cfg.agents]
     if unknown:
         raise ValueError(f"Agents {unknown} are not known; use some of {list(cfg.agents)}.")
     runs: dict[str, list[Run]] = {name: [] for name in chosen}
-    for seed, name in itertools.product(cfg.seeds, chosen):  # seed by seed, so that early figures compare
+    for seed, name in itertools.product(as_list(cfg.seeds), chosen):  # seed by seed, so that early figures compare
         agent = cfg.agents[name]
-        overrides = (f"seed={seed}", f"threads={cfg.threads}", *cfg.overrides, *agent.overrides)
+        overrides = (f"seed={seed}", f"threads={cfg.threads}", *as_list(cfg.overrides), *agent.overrides)
         recipe = Path(__file__).with_name(f"{agent.recipe}.py")
         runs[name].append(Run(recipe, folder / folder_name(name) / f"seed{seed}", overrides, f"{name}, seed {seed}"))
     return runs
@@ -52,10 +52,11 @@ def quartiles(values: list[float]) -> tuple[float, float, float]:
 @clean_exit
 def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "learning_curves")
-    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, folder.path / "log", name="learning_curves", config=cfg)
     runs = make_runs(cfg, folder.path)
     in_turn = [run for of in zip(*runs.values(), strict=True) for run in of]
+    refuse_changes(in_turn)
+    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name="learning_curves", config=cfg)
     failed = run_all(in_turn, cfg.jobs, desc="learning")
 
     curves, metrics = {}, {}
@@ -80,7 +81,7 @@ def main(cfg: DictConfig) -> None:
         lines.append("| " + " | ".join(cells) + " |")
     if curves:
         plot_learning_curves(curves, folder.file("curves.png"))
-    report_sweep(folder, lines, {}, metrics, failed, tracker, seed=cfg.seeds[0])
+    report_sweep(folder, lines, {}, metrics, failed, tracker, seed=as_list(cfg.seeds)[0])
 
 
 if __name__ == "__main__":

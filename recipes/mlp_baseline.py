@@ -22,8 +22,8 @@ from statistics import mean
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
-from torchrl_gn.training.sweep import Run, best, folder_name, report_sweep, run_all
+from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, with_help
+from torchrl_gn.training.sweep import Run, best, folder_name, refuse_changes, report_sweep, run_all
 
 RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
@@ -33,7 +33,7 @@ def make_run(cfg: DictConfig, folder: Path, system: str, name: str, options: lis
     """A training of one network on one system."""
     shared = [f"system={system}", f"minutes={minutes}", f"seed={seed}", f"clock={cfg.clock}", f"threads={cfg.threads}"]
     place = folder / system / folder_name(name) / f"minutes{minutes}_seed{seed}"
-    overrides = (*shared, f"data.folder={cfg.data_dir}", *cfg.overrides, *options)
+    overrides = (*shared, f"data.folder={cfg.data_dir}", *as_list(cfg.overrides), *options)
     return Run(RECIPE, place, overrides, f"{system}, {name}, {minutes} minutes, seed {seed}")
 
 
@@ -49,8 +49,7 @@ def candidates(cfg: DictConfig) -> dict[str, list[str]]:
 
 def values(runs: list[Run], key: str) -> list[float]:
     """One number of every finished run; infinite where it diverged."""
-    done = [run.metrics for run in runs]
-    return [math.inf if metrics[key] is None else float(metrics[key]) for metrics in done if metrics is not None]
+    return [value for run in runs if (value := run.number(key)) is not None]
 
 
 @with_help
@@ -60,9 +59,8 @@ def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "mlp_baseline")
     if cfg.data_dir is None:
         cfg.data_dir = str(folder.data)
-    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, folder.path / "log", name="mlp_baseline", config=cfg)
-    mlps, first = candidates(cfg), cfg.seeds[0]
+    systems, seeds = as_list(cfg.systems), as_list(cfg.seeds)
+    mlps, first = candidates(cfg), seeds[0]
 
     def runs(system: str, names: list[str], minutes: float, seeds: list[int]) -> list[Run]:
         known = {**mlps, "GN": []}
@@ -70,7 +68,10 @@ def main(cfg: DictConfig) -> None:
         return [make_run(cfg, folder.path, system, name, known[name], minutes, seed) for name, seed in every]
 
     names = list(mlps)
-    screened = {system: runs(system, names, cfg.screen_minutes, [first]) for system in cfg.systems}
+    screened = {system: runs(system, names, cfg.screen_minutes, [first]) for system in systems}
+    refuse_changes(run for of in screened.values() for run in of)
+    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    tracker = Tracker(cfg.logger, folder.path / "log", name="mlp_baseline", config=cfg)
     failed = run_all([run for of in screened.values() for run in of], cfg.jobs, desc="screening")
     long = {}
     for system, of in screened.items():
@@ -79,7 +80,6 @@ def main(cfg: DictConfig) -> None:
     failed += run_all([run for of in long.values() for run in of], cfg.jobs, desc="training the best")
     # None of a system whose runs all failed.
     winners = {system: of[run] for system, of in long.items() for run in best(list(of), "validation_error")}
-    seeds = list(cfg.seeds)
     final = {
         (system, kind): runs(system, [name], cfg.minutes, seeds)
         for system, winner in winners.items()

@@ -50,6 +50,7 @@ from torchrl_gn.pretrained import load_model, pretrained_names
 from torchrl_gn.rewards import FixTask, Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
 from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
+from torchrl_gn.training.run_folder import CONFIG_FILE
 
 ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
 SAVE_SECONDS = 60
@@ -119,10 +120,6 @@ class Episodes:
         apart = {key: value.clone(memory_format=torch.contiguous_format) for key, value in (now | values).items()}
         with atomic_path(self.path) as temporary:
             save_file(apart, temporary)
-
-
-def options(cfg: DictConfig) -> dict[str, Any]:
-    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
 
 
 def fill_in(cfg: DictConfig) -> None:
@@ -213,16 +210,18 @@ def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -
 def make_planner(
     name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, played: int
 ) -> TensorDictModuleBase:
-    """The planner of a name, to go on after so many steps."""
+    """The planner of a name, to go on after so many steps; whatever it draws, it does not draw again."""
+    seed = cfg.seed + 1_000_000 * played
+    torch.manual_seed(seed)  # what TorchRL's planners draw from
     if name in ("random", "nothing"):
         return RandomControl(env.scene, cfg.episodes, cfg.steps, cfg.seed + 2, float(name == "random"), step=played)
     if name == "ilqg":
-        return ILQGPlanner(env, cfg.horizon, seed=cfg.seed, **cfg.ilqg)
+        return ILQGPlanner(env, cfg.horizon, seed=seed, **cfg.ilqg)
     if name == "gn":
         assert imagined is not None
         more = {key: value for key, value in cfg.gn.items() if key != "lr"}
         optimizer = partial(torch.optim.Adam, lr=cfg.gn.lr)
-        return GradientPlanner(imagined, cfg.horizon, optimizer=optimizer, seed=cfg.seed, **more)
+        return GradientPlanner(imagined, cfg.horizon, optimizer=optimizer, seed=seed, **more)
     where = env if name.endswith("_true") else imagined
     assert where is not None
     kind = name.removesuffix("_true")
@@ -343,9 +342,8 @@ def main(cfg: DictConfig) -> None:
     bound, inference = bind_model(cfg, scene) if needed else (None, None)
     imagined = None if bound is None else ModelEnv(bound, reward)
     run = RunFolder(cfg.run_dir, "mpc")
-    if (run.path / "config.yaml").exists():
-        before = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.load(run.path / "config.yaml")))
-        run.refuse_changes(before, options(cfg), free=MAY_CHANGE)
+    if (begun := run.path / CONFIG_FILE).exists():
+        run.refuse_changes(cast(DictConfig, OmegaConf.load(begun)), cfg, free=MAY_CHANGE)
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name=f"mpc-{scene.name}-{cfg.reward}", config=cfg)
     start = begin(cfg, env, bound, inference)

@@ -13,6 +13,7 @@ model with their logs to its run folder. All options: recipes/config/plan_and_le
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import hydra
@@ -22,8 +23,8 @@ from safetensors.torch import load_file
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
-from torchrl_gn.training.sweep import Run, report_sweep, run_all
+from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, with_help
+from torchrl_gn.training.sweep import Run, refuse_changes, report_sweep, run_all
 
 RECIPES = Path(__file__).parent
 
@@ -32,7 +33,7 @@ def playing(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
     """Episodes planned through a model."""
     options = (f"system={cfg.system}", f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"compile={cfg.compile}")
     options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
-    options += ("video=false", "gn.iterations=3", *cfg.planning)
+    options += ("video=false", "gn.iterations=3", *as_list(cfg.planning))
     return Run(RECIPES / "mpc.py", folder / f"played{index}", options, f"playing, round {index}")
 
 
@@ -41,8 +42,19 @@ def learning(cfg: DictConfig, folder: Path, index: int, model: str, played: list
     extra = ",".join(str(run.folder / "gn.safetensors") for run in played)
     options = (f"system={cfg.system}", f"start_from={model}", f"data.extra=[{extra}]", f"minutes={cfg.minutes}")
     options += (f"clock={cfg.clock}", f"lr={cfg.lr}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
-    options += (f"data.folder={folder / 'data' if cfg.data_dir is None else cfg.data_dir}", *cfg.training)
+    options += (f"data.folder={folder / 'data' if cfg.data_dir is None else cfg.data_dir}", *as_list(cfg.training))
     return Run(RECIPES / "forward_model.py", folder / f"learned{index}", options, f"learning, round {index}")
+
+
+def make_runs(cfg: DictConfig, folder: Path, model: str) -> tuple[list[Run], list[Run]]:
+    """Every round's learning, of which the first has none, and playing."""
+    learned: list[Run] = []
+    played = [playing(cfg, folder, 0, model)]
+    for index in range(1, cfg.rounds + 1):
+        learned.append(learning(cfg, folder, index, model, played))
+        model = str(learned[-1].folder)
+        played.append(playing(cfg, folder, index, model))
+    return learned, played
 
 
 @with_help
@@ -52,32 +64,32 @@ def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "plan_and_learn")
     model = cfg.checkpoint or cfg.system
     load_model(model)  # refused before anything is written
+    learned, played = make_runs(cfg, folder.path.resolve(), model)  # named in the options, which may not change
+    refuse_changes([*learned, *played])
     folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
     tracker = Tracker(cfg.logger, folder.path / "log", name="plan_and_learn", config=cfg)
-    place = folder.path.resolve()  # named in the rounds' options, which may not change
     lines = ["| round | mean reward (spread over starts) | ms a step | one-step error | 100 steps |", "|---" * 5 + "|"]
     metrics: dict[str, float] = {}
-    played: list[Run] = []
     failed: list[Run] = []
-    for index in range(cfg.rounds + 1):
-        errors = ["", ""]
+    for index, play in enumerate(played):
+        errors = {}
         if index:
-            learned = learning(cfg, place, index, model, played)
-            failed = run_all([learned], 1, desc=learned.name)
-            if failed or learned.metrics is None:
+            learn = learned[index - 1]
+            failed = run_all([learn], 1, desc=learn.name)
+            if failed:
                 break
-            model = str(learned.folder)
-            found = {name: learned.metrics[name] for name in ("one_step_error", "rollout_error_100")}
-            metrics |= {f"round {index}/{name}": value for name, value in found.items()}
-            errors = [f"{value:.1e}" for value in found.values()]
-        played.append(playing(cfg, place, index, model))
-        failed = run_all(played[-1:], 1, desc=played[-1].name)
-        values = played[-1].metrics
-        if failed or values is None:
+            errors = {name: learn.number(name) for name in ("one_step_error", "rollout_error_100")}
+            metrics |= {f"round {index}/{name}": value for name, value in errors.items() if value is not None}
+        failed = run_all([play], 1, desc=play.name)
+        if failed:
             break
-        metrics |= {f"round {index}/{name.removeprefix('gn/')}": values[name] for name in values if "gn/" in name}
-        reward = f"{values['gn/mean_reward']:.3g} ({values['gn/mean_reward_std']:.2g})"
-        lines.append(f"| {index} | {reward} | {values['gn/planning_ms']:.0f} | " + " | ".join(errors) + " |")
+        names = [name for name in play.metrics or {} if name.startswith("gn/")]
+        # A reward is no number where every episode became unstable.
+        found = {name.removeprefix("gn/"): play.number(name, math.nan) for name in names}
+        metrics |= {f"round {index}/{name}": value for name, value in found.items() if value is not None}
+        reward = f"{found['mean_reward']:.3g} ({found['mean_reward_std']:.2g})"
+        cells = [f"{value:.1e}" for value in errors.values()] or ["", ""]
+        lines.append(f"| {index} | {reward} | {found['planning_ms']:.0f} | " + " | ".join(cells) + " |")
     kept = [run for run in played if run.metrics is not None]
     rewards = [load_file(run.folder / "gn.safetensors")["reward"] for run in kept]
     if rewards:

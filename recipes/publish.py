@@ -25,7 +25,7 @@ from tqdm import tqdm
 from torchrl_gn.evaluation import fresh_errors, summary
 from torchrl_gn.modules import Agent
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import clean_exit, load_checkpoint, save_checkpoint, with_help
+from torchrl_gn.training import as_list, clean_exit, load_checkpoint, save_checkpoint, with_help
 
 
 def without_places(value: Any) -> Any:
@@ -42,13 +42,16 @@ def without_places(value: Any) -> Any:
 @clean_exit
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
+    for name in ("checkpoint", "file"):
+        if cfg[name] is None:
+            raise ValueError(f"{name}= is needed: checkpoint=runs/forward_model/<time> file=model.safetensors, say.")
     loaded = load_checkpoint(cfg.checkpoint)
     own, file = loaded.scenes(), Path(cfg.file)
     half = loaded.trained.half()
     model, how = copy.deepcopy(half).float(), {key: cfg[key] for key in ("sequences", "length", "seed")}
     if isinstance(model, Agent):
         raise ValueError(f"{cfg.checkpoint} holds an agent; only models that predict states can be published.")
-    scenes = tqdm([*own, *map(load_scene, cfg.also)], desc="evaluating", leave=False)
+    scenes = tqdm([*own, *map(load_scene, as_list(cfg.also))], desc="evaluating", leave=False)
     tables = {scene.name: fresh_errors(model, scene, **how) for scene in scenes}
     errors = {name: {key: error.total for key, error in table.errors.items()} for name, table in tables.items()}
     save_checkpoint(file, half, scene=own, config=without_places(loaded.config), metrics={**errors, "evaluation": how})

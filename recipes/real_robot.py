@@ -38,6 +38,7 @@ from torchrl_gn.training import (
     clean_exit,
     load_checkpoint,
     make_optimizer,
+    plain_config,
     with_help,
 )
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
@@ -48,21 +49,16 @@ MODELS = {"feed-forward": "gn", "recurrent": "recurrent"}
 MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")
 
 
-def options(cfg: DictConfig) -> dict[str, Any]:
-    """Options as plain values."""
-    return cast(dict[str, Any], OmegaConf.to_container(cfg))
-
-
 def read(cfg: DictConfig) -> tuple[RobotLog, JointChain]:
     """The log, or a simulated one, and the robot as a graph."""
     commands = None if cfg.commands is None else [list(indices) for indices in cfg.commands]
     if cfg.log is not None:
-        log = load_robot_log(cfg.log, timestep=cfg.timestep, names=options(cfg)["names"])
+        log = load_robot_log(cfg.log, timestep=cfg.timestep, names=plain_config(cfg)["names"])
         name, carried_by = Path(cfg.log).stem, cfg.carried_by or ()
     else:
         own = cfg.simulated
         scene = load_scene("jaco", timestep=own.timestep)
-        log = simulate_log(scene, own.episodes, own.steps, cfg.seed, **options(own.faults))
+        log = simulate_log(scene, own.episodes, own.steps, cfg.seed, **plain_config(own.faults))
         name, carried_by = "simulated jaco", [-1, 0, 1, 2, 3, 4, 5, 5, 5]
     return log, log_chain(log, name, resample=cfg.resample, commands=commands, carried_by=carried_by)
 
@@ -84,7 +80,7 @@ def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
     print(", ".join(f"{part}: {len(trajectories):,} trajectories" for part, trajectories in found.items()))
     if min(shares) <= 0 or not all(map(len, found.values())):
         raise ValueError(
-            f"{len(log.length)} episodes cannot be split by share={options(cfg.share)}, data_seed={cfg.data_seed};"
+            f"{len(log.length)} episodes cannot be split by share={plain_config(cfg.share)}, data_seed={cfg.data_seed};"
             f" give more, other shares, or a smaller length than {cfg.length}."
         )
     return found
@@ -139,12 +135,12 @@ def train(
             joint_axes=False,
             contacts=False,
             core=cast(Any, MODELS[name]),
-            **options(cfg.model),
+            **plain_config(cfg.model),
         )
     trainer = make_trainer(cfg, model, chain, data)
     if not begun:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
-    train_with_progress(trainer, path, begun, tracker, scene=cast(Any, chain), config=options(cfg), name=name)
+    train_with_progress(trainer, path, begun, tracker, scene=cast(Any, chain), config=plain_config(cfg), name=name)
     return model, trainer
 
 
@@ -167,7 +163,7 @@ def main(cfg: DictConfig) -> None:
     paths = {name: run.path / name / CHECKPOINT_FILE for name in MODELS}
     begun = {name: load_checkpoint(path) for name, path in paths.items() if path.exists()}
     for checkpoint in begun.values():
-        run.refuse_changes(checkpoint.config, options(cfg), free=MAY_CHANGE)
+        run.refuse_changes(checkpoint.config, cfg, free=MAY_CHANGE)
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name=f"real_robot-{chain.name}", config=cfg)
     tables: dict[str, ErrorTable] = {}

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from functools import partial
-from typing import Any, cast
 
 import hydra
 import torch
@@ -38,6 +37,7 @@ from torchrl_gn.training import (
     load_checkpoint,
     make_agent_optimizer,
     mean_return,
+    plain_config,
     report_learning,
     with_help,
 )
@@ -54,11 +54,6 @@ MAY_CHANGE = (
     "collectors",
     "evaluate_on",
 )
-
-
-def options(cfg: DictConfig) -> dict[str, Any]:
-    """Options as plain values."""
-    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
 
 
 def make_losses(cfg: DictConfig, agent: Agent) -> list[LossModule]:
@@ -85,11 +80,11 @@ def main(cfg: DictConfig) -> None:
         )
     begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
     if begun:
-        run.refuse_changes(begun.config, options(cfg), free=MAY_CHANGE)
-    graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, options(cfg)["task"]["graph"])
+        run.refuse_changes(begun.config, cfg, free=MAY_CHANGE)
+    graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, plain_config(cfg)["task"]["graph"])
     if cfg.evaluate_on and cfg.agent.policy != "graph":
         raise ValueError("Only a graph network drives other bodies; evaluate_on needs agent.policy=graph.")
-    more = options(cfg.agent)
+    more = plain_config(cfg.agent)
     if cfg.horizon == 0:
         more["model"] = None
     learned = cfg.task.reward == "learned" and cfg.horizon > 0
@@ -116,9 +111,9 @@ def main(cfg: DictConfig) -> None:
             lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
             make_agent_optimizer(losses, policy_lr=cfg.policy_lr, value_lr=cfg.value_lr, model_lr=cfg.model_lr),
             seed=cfg.seed,
-            **options(cfg.trainer),
+            **plain_config(cfg.trainer),
         )
-        learn_with_progress(trainer, run.checkpoint, begun, tracker, config=options(cfg))
+        learn_with_progress(trainer, run.checkpoint, begun, tracker, config=plain_config(cfg))
     returns = {}
     for name, (other, env) in tqdm(others.items(), desc="other bodies", leave=False, disable=not others):
         returns[f"return/{name}"] = mean_return(env, agent.policy_for(other), cfg.task.steps, seed=10_000)

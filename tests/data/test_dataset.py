@@ -263,7 +263,7 @@ def test_resuming_with_other_versions_is_refused(
 
     with pytest.raises(KeyboardInterrupt):
         create_dataset(tmp_path / "d", pendulum, **SIZES, progress=interrupt)
-    monkeypatch.setattr(dataset, "package_versions", lambda: {"mujoco": "9"})
+    monkeypatch.setattr(dataset, "simulation_versions", lambda: {"mujoco": "9"})
     with pytest.raises(DatasetError, match="would go on differently with {'mujoco': '9'}"):
         create_dataset(tmp_path / "d", pendulum, **SIZES)
 

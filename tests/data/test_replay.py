@@ -152,3 +152,13 @@ def test_shards_are_the_parts_of_one_draw() -> None:
         trajectory_buffer(_counting(5, 8), batch_size=10, shard=(0, 4))
     with pytest.raises(ValueError, match=r"shard must be a rank and a size above it, got \(2, 2\)"):
         trajectory_buffer(_counting(5, 8), batch_size=10, shard=(2, 2))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_samples_lie_where_the_data_do() -> None:
+    data = _counting(5, 7)
+    for window in (1, 3):
+        here, there = (
+            trajectory_buffer(of, batch_size=20, window=window, seed=0).sample() for of in (data, data.cuda())
+        )
+        assert there["state"].is_cuda and torch.equal(there["state"].cpu(), here["state"])

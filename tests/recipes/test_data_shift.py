@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 from omegaconf import OmegaConf
 
 from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import RunFolder
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_the_gait_that_is_found_carries_the_swimmer(load):
@@ -20,3 +26,13 @@ def test_the_gait_that_is_found_carries_the_swimmer(load):
     # Joints that move all at once carry it nowhere.
     still = recipe.swim(scene, np.array([gait[0], gait[1], 0.0]), 6, 200, np.random.default_rng(1))
     assert recipe.distance(swimming["state"]).mean() > 5 * recipe.distance(still["state"]).mean()
+
+
+def test_other_data_are_no_continuation(call, tmp_path):
+    hydra = pytest.importorskip("hydra")
+    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+        config = OmegaConf.to_yaml(hydra.compose("data_shift", overrides=["system=swimmer4"]))
+    RunFolder(tmp_path, "data_shift").write_config(config)
+    code, _, errors = call("search.generations=9", "seed=7", "minutes=9", f"run_dir={tmp_path}", recipe="data_shift")
+    assert code == 1 and "search.generations=9 (was " in errors and "seed=7 (was 0), system=swimmer6 (was" in errors
+    assert (tmp_path / "config.yaml").read_text().endswith(config) and "minutes" not in errors

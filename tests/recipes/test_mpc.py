@@ -7,12 +7,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from torchrl_gn.data import Simulator, collect_trajectories, spline_controls
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.modules import FeatureSet, ForwardModel
+from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import save_checkpoint
 
@@ -153,3 +155,17 @@ def test_bad_options_are_named(tmp_path, call):
         folder = tmp_path / option.split("=")[0]
         code, _, errors = call(*SMALL[:1], *option.split(), f"run_dir={folder}", recipe="mpc")
         assert code == 1 and message in errors and "Traceback" not in errors, errors
+
+
+def test_planners_that_go_on_draw_other_numbers(load):
+    recipe = load("mpc")
+    env = SceneEnv(load_scene("pendulum"), make_reward("balance", load_scene("pendulum")))
+    cfg = OmegaConf.create({"seed": 3, "horizon": 2, "episodes": 1, "steps": 9})
+    cfg.cem = {"iterations": 1, "top_k": 2, "candidates": 4}
+    drawn = []
+    for played in (0, 5, 5):
+        recipe.make_planner("cem_true", cfg, env, None, played)
+        drawn.append(torch.rand(3))
+    assert torch.equal(drawn[1], drawn[2]) and not torch.equal(drawn[0], drawn[1])
+    torch.manual_seed(3)
+    assert torch.equal(torch.rand(3), drawn[0])  # whoever played before

@@ -88,3 +88,9 @@ def test_success_returns_the_result_and_keeps_the_name():
 
     assert main(3) == 3
     assert (main.__name__, main.__doc__) == ("main", "Recipe.")
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no kernel"), NotImplementedError("no kernel"), RecursionError()])
+def test_what_is_a_bug_keeps_its_traceback(error):
+    with pytest.raises(type(error)):
+        ending(error)()

@@ -61,7 +61,10 @@ defaults:
 
 @pytest.mark.parametrize("word", ["--help", "-h", "size=4"])
 def test_help_is_the_first_lines_and_the_options(word, tmp_path, monkeypatch, capsys):
-    (tmp_path / "config").mkdir()
+    group = tmp_path / "config" / "task"
+    group.mkdir(parents=True)
+    (group / "swimmer6.yaml").write_text("steps: 200   # in an episode\n")
+    (group / "whole.yaml").write_text("# @package _global_\nsize: 5\n")
     (tmp_path / "config" / "small_recipe.yaml").write_text(YAML)
     (tmp_path / "small_recipe.py").write_text(RECIPE)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -73,4 +76,12 @@ def test_help_is_the_first_lines_and_the_options(word, tmp_path, monkeypatch, ca
     if word == "size=4":
         assert recipe.ran and not said
     else:
-        assert not recipe.ran and said == f"What it does.\n\n    how it is called\n\n{commented_options(YAML)}"
+        options = f"What it does.\n\n    how it is called\n\n{commented_options(YAML)}\n"
+        task = "What task=swimmer6 sets, named task.<option>:\n\nsteps: 200   # in an episode\n"
+        assert not recipe.ran and said == options + task
+        monkeypatch.setattr(sys, "argv", ["small_recipe.py", "task=whole", word])
+        recipe.main()
+        assert capsys.readouterr().out == options + "What task=whole sets:\n\nsize: 5\n"
+        monkeypatch.setattr(sys, "argv", ["small_recipe.py", "task=none", word])
+        with pytest.raises(SystemExit, match=r"task=none is not known; use one of \['swimmer6', 'whole'\]"):
+            recipe.main()

@@ -27,14 +27,14 @@ def test_only_files_that_exist_are_listed_once_and_in_order(tmp_path):
     folder.file("never.png")
     folder.write_metrics({}, seed=0)
     assert folder.written == [tmp_path / "run" / "config.yaml", tmp_path / "run" / "metrics.json"]
-    assert folder.written[0].read_text() == "a: 2\n"
+    assert folder.written[0].read_text() == "# A run of train\na: 2\n"
     assert folder.checkpoint.is_relative_to(folder.path) and folder.data.is_relative_to(folder.path)
 
 
 def test_a_run_is_continued_in_its_folder(tmp_path):
     RunFolder(tmp_path, "train").write_config("a: 1\n")
     again = RunFolder(tmp_path, "train")
-    assert (again.path / "config.yaml").read_text() == "a: 1\n"
+    assert (again.path / "config.yaml").read_text() == "# A run of train\na: 1\n"
 
 
 def test_the_default_folder_is_named_after_recipe_and_time(tmp_path, monkeypatch):
@@ -70,3 +70,12 @@ def test_single_options_of_a_group_may_be_free(tmp_path):
             run.refuse_changes(before, more, free=free)
     with pytest.raises(ValueError, match=r"options: frames=6 \(was 5\), trainer\.seed=2 \(was 1\)\. Name"):
         run.refuse_changes(before, {"trainer": {"frames": 3, "seed": 2}, "frames": 6}, free=["trainer.frames"])
+
+
+def test_a_run_of_another_recipe_is_not_written_over(tmp_path):
+    RunFolder(tmp_path, "forward_model").write_config("seed: 0\n")
+    RunFolder(tmp_path, "forward_model")
+    with pytest.raises(ValueError, match="holds a run of forward_model, not of evaluate. Name a new run_dir"):
+        RunFolder(tmp_path, "evaluate")
+    (tmp_path / "config.yaml").write_text("seed: 0\n")  # of whoever wrote it
+    RunFolder(tmp_path, "evaluate")

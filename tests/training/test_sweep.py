@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import time
@@ -12,7 +13,7 @@ from threading import Thread
 
 import pytest
 
-from torchrl_gn.training.sweep import Run, best, folder_name, run_all
+from torchrl_gn.training.sweep import Run, best, folder_name, refuse_changes, run_all
 
 RECIPE = """
 import json, pathlib, sys
@@ -103,3 +104,24 @@ def test_an_interrupt_ends_the_runs(tmp_path, jobs):
     finally:
         signal.signal(signal.SIGINT, before)
     assert (run.folder / "ended").exists()
+
+
+def test_numbers_of_a_run_say_what_diverged(make_run):
+    runs = {value: make_run(value) for value in ("3", "null")}
+    assert runs["3"].number("error") is None
+    run_all(runs.values(), 1)
+    assert runs["3"].number("error") == 3.0 and runs["3"].number("other") is None
+    assert runs["null"].number("error") == math.inf and runs["null"].number("error", -1.0) == -1.0
+
+
+def test_a_finished_run_goes_on_where_it_may(make_run):
+    run = replace(make_run("1"), goes_on=("minutes",))
+    refuse_changes([run])
+    run_all([run], 1)
+    longer = replace(run, overrides=("value=1", "minutes=9"))
+    assert run_all([longer], 1) == [] and (run.folder / "times").read_text() == "xx" and longer.done
+    assert run_all([longer], 1) == [] and (run.folder / "times").read_text() == "xx"
+    with pytest.raises(ValueError, match="with value=1, not value=2"):
+        refuse_changes([replace(longer, overrides=("value=2", "minutes=9"))])
+    failing = replace(longer, overrides=("value=oops", "minutes=9"), goes_on=("value",))
+    assert run_all([failing], 1) == [failing] and failing.metrics is None  # and not what others had measured

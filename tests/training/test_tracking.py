@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import struct
 import time
 
@@ -57,10 +58,15 @@ def read_wandb(folder):
             items = record.history.item
             history.append({".".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items})
         elif kind == "request" and record.request.HasField("log_artifact"):
-            artifacts.append([entry.path for entry in record.request.log_artifact.artifact.manifest.contents])
+            artifacts.append(read_artifact(record.request.log_artifact.artifact))
         elif kind == "artifact":
-            artifacts.append([entry.path for entry in record.artifact.manifest.contents])
+            artifacts.append(read_artifact(record.artifact))
     return config, history, {file.name.split("_")[0] for file in path.parent.glob("files/media/*/*")}, artifacts
+
+
+def read_artifact(artifact) -> tuple[str, str, list[str]]:
+    """What follows the run in an artifact's name, its type, and names of its files."""
+    return artifact.name.partition("-")[2], artifact.type, [entry.path for entry in artifact.manifest.contents]
 
 
 @pytest.fixture
@@ -80,7 +86,8 @@ def video(tmp_path):
 
 @pytest.fixture
 def checkpoint(tmp_path):
-    path = tmp_path / "checkpoint.safetensors"
+    path = tmp_path / "recurrent" / "checkpoint" / "checkpoint.safetensors"
+    path.parent.mkdir(parents=True)
     save_file({"weight": torch.ones(2)}, path)
     return path
 
@@ -92,7 +99,9 @@ def test_offline_wandb_run_holds_everything(tmp_path, monkeypatch, picture, vide
     tracker.log({"train/loss": 0.5, "version/torch": "no number"}, step=1)
     tracker.log({"train/loss": 0.25}, step=2)
     tracker.log_table("errors", [["error", "one step"], ["total", "0.1"]])
-    tracker.log_files([picture, video, checkpoint])
+    episodes = checkpoint.rename(tmp_path / "ilqg.safetensors")
+    shutil.copy(episodes, checkpoint)
+    tracker.log_files([picture, video, checkpoint, episodes])
     tracker.close()
 
     config, history, media, artifacts = read_wandb(tmp_path / "log")
@@ -103,7 +112,8 @@ def test_offline_wandb_run_holds_everything(tmp_path, monkeypatch, picture, vide
     assert losses == [0.5, 0.25]
     assert not any("version/torch" in row for row in history)
     assert {"errors", "prediction", "rollout"} <= media
-    assert ["checkpoint.safetensors"] in artifacts
+    assert ("recurrent-checkpoint-checkpoint", "model", ["checkpoint.safetensors"]) in artifacts
+    assert ("ilqg", "episodes", ["ilqg.safetensors"]) in artifacts
 
 
 def test_csv_run_holds_the_numbers(tmp_path):

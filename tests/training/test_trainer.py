@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_gn.modules import fast_matmul
-from torchrl_gn.training import Budget
+from torchrl_gn.training import Budget, Workers
 from torchrl_gn.training.checkpoint import load_checkpoint, save_checkpoint
 
 
@@ -227,3 +227,16 @@ def test_callers_see_their_own_precision_between_steps(make_trainer):
     before = torch.backends.mkldnn.matmul.fp32_precision
     for _ in make_trainer(Budget(steps=2)).run():
         assert torch.backends.mkldnn.matmul.fp32_precision == before
+
+
+def test_workers_that_go_on_draw_noise_of_their_own(make_trainer):
+    first = make_trainer(Budget(steps=4))
+    list(first.run())
+    state = first.state_dict()
+    noises = []
+    for rank in (0, 1, 2):
+        worker = make_trainer(Budget(steps=8), workers=Workers(rank, 3))
+        worker.load_state_dict(state)
+        noises.append(worker.loss.generator.get_state())
+    assert torch.equal(noises[0], first.loss.generator.get_state())
+    assert not any(torch.equal(noises[one], noises[other]) for one, other in ((0, 1), (0, 2), (1, 2)))

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.data.collect import CHUNK, collect_chunk, collect_trajectories, static_values
 from torchrl_gn.data.controls import check_knot_interval
-from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, package_versions
+from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, simulation_versions
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.errors import SceneError
@@ -153,7 +153,7 @@ def create_dataset(
                     "physics": [steps + 1, scene.physics_size],
                     **({} if ranges is None else _variant_entries(scene, len(ranges))),
                 },
-                "versions": package_versions(),
+                "versions": simulation_versions(),
                 "chunks": {split: [] for split in SPLITS},
             }
             files.create(manifest)
@@ -209,7 +209,7 @@ def _collect_missing(
     progress: Callable[[int, int], None] | None,
     map_chunks: Callable[[Callable, Iterable], Iterable],
 ) -> None:
-    request, versions = manifest["request"], package_versions()
+    request, versions = manifest["request"], simulation_versions()
     if manifest["versions"] != versions:
         raise DatasetError(
             f"{files.manifest_path}: the data set was begun with {manifest['versions']} and would go on "

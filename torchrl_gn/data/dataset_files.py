@@ -32,7 +32,7 @@ SPLITS = ("train", "validation", "test")
 _KEYS = {"format", "request", "description", "entries", "versions", "chunks"}
 
 
-def package_versions() -> dict[str, str]:
+def simulation_versions() -> dict[str, str]:
     """Versions of the packages that the numbers depend on."""
     return {package: version(package) for package in ("mujoco", "numpy", "scipy")}
 

@@ -233,7 +233,7 @@ def _rows(values: Tensor, row: Tensor) -> Tensor:
         # a hundred times longer when another process has the cores.
         picked = torch.from_numpy(np.take(flat.numpy(), row.reshape(-1).numpy(), axis=0))
     else:
-        picked = flat.index_select(0, row.reshape(-1))
+        picked = flat.index_select(0, row.reshape(-1).to(flat.device))
     return picked.view(*row_shape, *values.shape[2:])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from torchrl_gn.data.controls import spline_controls
+from torchrl_gn.data.errors import UnstableSimulationError
 from torchrl_gn.data.robot_log import RobotLog
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import sample_start_states
@@ -50,6 +51,7 @@ def simulate_log(
 
     Raises:
         ValueError: if the scene has other joints than hinges, or no motors.
+        UnstableSimulationError: if a simulation becomes unstable.
     """
     model = scene.model
     if (model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE).any() or not scene.num_actions:
@@ -58,6 +60,8 @@ def simulate_log(
     command = spline_controls(scene, episodes, steps, rng)
     acting = _motors(command, scene, delay, time_constant, play)
     found = Simulator(scene).rollout(sample_start_states(scene, episodes, rng), acting)
+    if unstable := int((~found["stable"]).sum()):
+        raise UnstableSimulationError(f"{unstable} of {episodes} episodes became unstable; try another seed.")
     physics: np.ndarray = cast(torch.Tensor, found.get("physics")).numpy()
     angle = physics[:, :, 1 : 1 + model.nq]  # after the time
     measured = angle + noise * rng.normal(size=angle.shape)

@@ -21,7 +21,7 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
     What its user can mend (a bad option, file or data set, an unstable simulation) is one line
     on standard error and exit code 1, without a traceback. Ctrl-C is exit code 130, and being told to
     end (SIGTERM, as a cluster does) 143, after the recipe has saved what it has, and said where. Anything else is
-    a bug and keeps its traceback.
+    a bug and keeps its traceback, as do torch's own RuntimeErrors.
     """
 
     @functools.wraps(main)
@@ -34,7 +34,7 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
             sys.stderr.write(f"Interrupted; {RunFolder.what_is_kept()}\n")
             raise SystemExit(128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)) from None
         except (ValueError, OSError, RuntimeError, FloatingPointError, ImportError) as error:
-            if type(error) is RuntimeError:
+            if type(error) in (RuntimeError, NotImplementedError, RecursionError):
                 raise
             sys.stderr.write(f"{type(error).__name__}: {error}\n")
             raise SystemExit(1) from error

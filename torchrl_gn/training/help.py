@@ -6,7 +6,7 @@ import functools
 import inspect
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
@@ -18,7 +18,8 @@ def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
     """Let `--help` show what a recipe's first lines say, and its options with the comments beside them.
 
     Put it above ``@hydra.main``, whose own help has neither. Options are read from ``config/<recipe>.yaml`` beside the
-    recipe's file.
+    recipe's file, and from the file of each group that it names (``config/task/swimmer6.yaml``, or of another one that
+    stands beside ``--help``).
     """
 
     @functools.wraps(main)
@@ -27,8 +28,8 @@ def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
             return main(*args, **kwargs)
         recipe = Path(inspect.getfile(inspect.unwrap(main)))
         said = (sys.modules[main.__module__].__doc__ or "").strip()
-        options = commented_options((recipe.parent / "config" / f"{recipe.stem}.yaml").read_text())
-        sys.stdout.write(f"{said}\n\n{options}")
+        text = (recipe.parent / "config" / f"{recipe.stem}.yaml").read_text()
+        sys.stdout.write("\n".join([f"{said}\n", commented_options(text), *_groups(text, recipe.parent / "config")]))
 
     return wrapped
 
@@ -39,3 +40,16 @@ def commented_options(text: str) -> str:
     text = re.sub(r"^ *- (?:_self_|override hydra/).*\n?", "", text, flags=re.MULTILINE)
     text = re.sub(r"^defaults:[^\n]*\n(?![ \t]*- )", "", text, flags=re.MULTILINE)
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
+
+
+def _groups(text: str, folder: Path) -> Iterator[str]:
+    """What the files of a recipe's groups say, of those that are its defaults or asked for."""
+    asked = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
+    for group, default in re.findall(r"^ *- (\w+): (\w+)", text, flags=re.MULTILINE):
+        name = asked.get(group, default)
+        if not (file := folder / group / f"{name}.yaml").exists():
+            others = sorted(path.stem for path in (folder / group).glob("*.yaml"))
+            raise SystemExit(f"{group}={name} is not known; use one of {others}.")
+        of, marker = file.read_text(), "# @package _global_\n"
+        named = "" if of.startswith(marker) else f", named {group}.<option>"
+        yield f"What {group}={name} sets{named}:\n\n{of.removeprefix(marker)}"

@@ -12,8 +12,11 @@ from typing import Any, ClassVar
 
 from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
+from torchrl_gn.training.config import plain_config
 
 CONFIG_FILE = "config.yaml"
+METRICS_FILE = "metrics.json"
+_RECIPE = "# A run of "  # begins that file, and the recipe's name
 
 
 class RunFolder:
@@ -27,6 +30,7 @@ class RunFolder:
 
     Raises:
         NotADirectoryError: if ``path`` is a file.
+        ValueError: if it holds a run of another recipe, which would be written over.
     """
 
     _latest: ClassVar[RunFolder | None] = None
@@ -36,10 +40,18 @@ class RunFolder:
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"run_dir={self.path} is a file; name a folder.")
         self.name = name
+        self._refuse_another_recipe()
         self.path.mkdir(parents=True, exist_ok=True)
         self._start = time.perf_counter()
         self._written: list[Path] = []
         RunFolder._latest = self
+
+    def _refuse_another_recipe(self) -> None:
+        config = self.path / CONFIG_FILE
+        first = config.read_text().partition("\n")[0] if config.exists() else ""
+        if first.startswith(_RECIPE) and first != _RECIPE + self.name:
+            other = first.removeprefix(_RECIPE)
+            raise ValueError(f"run_dir={self.path} holds a run of {other}, not of {self.name}. Name a new run_dir.")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -86,7 +98,7 @@ class RunFolder:
         Raises:
             ValueError: naming every other option that differs.
         """
-        old, new = _flat(before), _flat(now)
+        old, new = _flat(plain_config(before)), _flat(plain_config(now))
         changed = [
             f"{name}={new.get(name)} (was {old.get(name)})"
             for name in sorted(old.keys() | new.keys())
@@ -98,9 +110,9 @@ class RunFolder:
             )
 
     def write_config(self, text: str) -> None:
-        """Write ``config.yaml``."""
+        """Write ``config.yaml``, with the recipe's name in its first line."""
         with atomic_path(self.file(CONFIG_FILE)) as temporary:
-            temporary.write_text(text)
+            temporary.write_text(f"{_RECIPE}{self.name}\n{text}")
 
     def write_metrics(self, metrics: Mapping[str, Any], *, seed: int) -> dict[str, Any]:
         """Write ``metrics.json``: flat names and plain numbers, versions, seed and seconds.
@@ -118,7 +130,7 @@ class RunFolder:
             "wall_clock_seconds": round(time.perf_counter() - self._start, 3),
             **{f"version/{name}": version for name, version in package_versions().items()},
         }
-        write_json(self.file("metrics.json"), everything)
+        write_json(self.file(METRICS_FILE), everything)
         return everything
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 import subprocess
@@ -19,7 +20,7 @@ from tqdm import tqdm
 from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.evaluation import plot_bars
 from torchrl_gn.training.ray_cluster import RayCluster
-from torchrl_gn.training.run_folder import RunFolder
+from torchrl_gn.training.run_folder import METRICS_FILE, RunFolder
 from torchrl_gn.training.tracking import Tracker
 
 OPTIONS_FILE = "options.json"
@@ -35,33 +36,46 @@ class Run:
         folder: its run folder, and what tells it from other runs.
         overrides: options of the recipe.
         name: what a person is told that it is.
+        goes_on: options, as ``"minutes"``, with other values of which a finished run goes on instead of being refused.
     """
 
     recipe: Path
     folder: Path
     overrides: tuple[str, ...]
     name: str
+    goes_on: tuple[str, ...] = ()
+
+    def number(self, name: str, diverged: float = math.inf) -> float | None:
+        """A number that it measured, ``diverged`` where it was none that is finite; None if there is none (yet)."""
+        metrics = self.metrics or {}
+        if name not in metrics:
+            return None
+        return diverged if metrics[name] is None else float(metrics[name])
 
     @property
     def metrics(self) -> dict[str, Any] | None:
         """What it measured, if it is done."""
-        path = self.folder / "metrics.json"
+        path = self.folder / METRICS_FILE
         return json.loads(path.read_text()) if path.exists() else None
 
-    def refuse_changes(self) -> None:
-        """Refuse to take what was measured with other options for this run, which is done.
+    @property
+    def done(self) -> bool:
+        """Whether it has finished, with these options.
 
         Raises:
-            ValueError: naming the options that differ.
+            ValueError: if it has finished with others, naming those that differ: what they gave is not this run's.
         """
         path = self.folder / OPTIONS_FILE
-        if not path.exists():
-            return
+        if self.metrics is None or not path.exists():
+            return self.metrics is not None
         both = json.loads(path.read_text()), self.overrides
         before, now = ({option for option in options if not option.startswith(MAY_DIFFER)} for options in both)
-        if before != now:
-            was, wanted = (", ".join(sorted(options)) or "none of these" for options in (before - now, now - before))
-            raise ValueError(f"{self.folder} holds a finished run with {was}, not {wanted}. Name a new run_dir.")
+        if before == now:
+            return True
+        if all(option.split("=", 1)[0] in self.goes_on for option in before ^ now):
+            return False
+        was, wanted = (", ".join(sorted(options)) or "none of these" for options in (before - now, now - before))
+        raise ValueError(f"{self.folder} holds a finished run with {was}, not {wanted}. Name a new run_dir.")
 
 
 def folder_name(text: str) -> str:
@@ -87,12 +101,8 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
     Raises:
         ValueError: if a finished run was made with other options.
     """
-    runs, left, failed = list(dict.fromkeys(runs)), [], []
-    for run in runs:
-        if run.metrics is None:
-            left.append(run)
-        else:
-            run.refuse_changes()
+    runs, failed = list(dict.fromkeys(runs)), []
+    left = [run for run in runs if not run.done]
     if not left:
         return []  # without starting a cluster
     pool = _Threads(jobs) if isinstance(jobs, int) else _OnRay(jobs)
@@ -109,6 +119,16 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
             pool.stop()
             raise
     return failed
+
+
+def refuse_changes(runs: Iterable[Run]) -> None:
+    """Refuse what :func:`run_all` would, before anything is written.
+
+    Raises:
+        ValueError: if a finished run was made with other options.
+    """
+    for run in runs:
+        _ = run.done
 
 
 def refuse_failures(failed: Sequence[Run]) -> None:
@@ -160,6 +180,7 @@ def _start(run: Run, folder: Path) -> subprocess.Popen:
     """Start a run's process in a working folder; what it prints goes to its log."""
     place = folder / run.folder
     place.mkdir(parents=True, exist_ok=True)
+    (place / METRICS_FILE).unlink(missing_ok=True)  # of other options, which the run goes on from
     write_json(place / OPTIONS_FILE, list(run.overrides))
     command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]
     with (place / "log.txt").open("a") as log:
@@ -222,7 +243,6 @@ def _run_and_wait(run: Run, folder: Path) -> int:
 
 def best(runs: Sequence[Run], metric: str, count: int = 1) -> list[Run]:
     """The ``count`` finished runs with the smallest ``metric``, best first; those without a number come last."""
-    done = [(run, run.metrics) for run in runs]
-    values = [(run, metrics[metric]) for run, metrics in done if metrics is not None]
-    ranked = sorted(values, key=lambda entry: float("inf") if entry[1] is None else entry[1])
-    return [run for run, _ in ranked[:count]]
+    values = [(run, run.number(metric)) for run in runs]
+    done = [(run, value) for run, value in values if value is not None]
+    return [run for run, _ in sorted(done, key=lambda entry: entry[1])[:count]]

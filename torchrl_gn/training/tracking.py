@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from torchrl_gn.training.checkpoint import package_versions
+from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
+from torchrl_gn.training.config import plain_config
 
 LoggerKind = Literal["none", "csv", "tensorboard", "wandb"]
 
@@ -36,7 +37,7 @@ class Tracker:
         self._logger: Any = None
         if kind == "none":
             return
-        config = _plain(config)
+        config = plain_config(config)
         from torchrl.record.loggers import get_logger
 
         options: dict[str, Any] = {}
@@ -96,7 +97,9 @@ class Tracker:
         elif path.suffix in (".gif", ".mp4"):
             run.log({self._tag(path): wandb.Video(str(path), format="gif" if path.suffix == ".gif" else "mp4")})
         elif path.suffix == ".safetensors":
-            artifact = wandb.Artifact(f"{run.id}-{path.parent.name}", type="model")
+            # By all of its place: a run of several models has a checkpoint of each, and episodes of each planner.
+            kind = "model" if path.name == CHECKPOINT_FILE.name else "episodes"
+            artifact = wandb.Artifact(f"{run.id}-{self._tag(path).replace('/', '-')}", type=kind)
             artifact.add_file(str(path))
             run.log_artifact(artifact)
 
@@ -128,15 +131,6 @@ class Tracker:
             self._logger.experiment.finish()
         elif self.kind == "tensorboard":
             self._logger.experiment.close()
-
-
-def _plain(value: Any) -> Any:
-    """Nested mappings and lists of any kind as dictionaries and lists."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(each) for each in value]
-    return value
 
 
 def _has_account() -> bool:

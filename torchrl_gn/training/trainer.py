@@ -196,6 +196,7 @@ class Trainer:
         """Go on from what :meth:`state_dict` gave."""
         self.optimizer.load_state_dict(state["optimizer"])
         self.loss.load_training_state(state["loss"])
+        self._draw_own_noise()
         self.buffer.sampler.load_state_dict(state["samplers"]["main"])
         if self.unroll is not None and "unroll" in state["samplers"]:
             self.unroll.sampler.load_state_dict(state["samplers"]["unroll"])
@@ -206,3 +207,11 @@ class Trainer:
         self.since_best = progress["since_best"]
         # Of a larger budget less is spent: its own validations are still to come.
         self.validated = min(progress["validated"], math.floor(self.fraction * self.validations))
+
+    def _draw_own_noise(self) -> None:
+        """Of several workers each goes on with noise of its own: what is loaded is the first one's."""
+        for module in () if self.workers.first else self.loss.modules():
+            if isinstance(own := getattr(module, "generator", None), torch.Generator):
+                # Drawn from the state, which no two resumed runs share.
+                fresh = torch.randint(2**62, (self.workers.size,), generator=own)
+                own.manual_seed(int(fresh[self.workers.rank]))
