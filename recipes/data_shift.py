@@ -111,10 +111,8 @@ def swim_by_policy(scene: Scene, agent: Agent, hold: int, count: int, steps: int
                 now = policy(now)
             actions.append(now["action"].double())
             now.update(env.step(now)["next"].select("state", "physics", "terminated"))
-            if bool(now["terminated"].any()):
-                raise ValueError(
-                    f"{int(now['terminated'].sum())} of {count} simulations became unstable; try another seed."
-                )
+            if unstable := int(now["terminated"].sum()):
+                raise UnstableSimulationError(f"{unstable} of {count} swimmers became unstable; try another seed.")
     kept = {"state": torch.stack(states[going:], 1), "action": torch.stack(actions[going:-1], 1)}
     return TensorDict(kept, [count])
 
