@@ -6,9 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.data import UnstableSimulationError
+from torchrl_gn.envs import SceneEnv
+from torchrl_gn.modules import Agent
+from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import RunFolder
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +30,20 @@ def test_the_gait_that_is_found_carries_the_swimmer(load):
     # Joints that move all at once carry it nowhere.
     still = recipe.swim(scene, np.array([gait[0], gait[1], 0.0]), 6, 200, np.random.default_rng(1))
     assert recipe.distance(swimming["state"]).mean() > 5 * recipe.distance(still["state"]).mean()
+
+
+def test_a_policys_actions_are_held_and_unstable_swims_are_no_data(load, monkeypatch):
+    recipe, scene = load("data_shift"), load_scene("swimmer3")
+    agent = Agent(ObservationGraph.swimmer(3), model=None)
+    swimming = recipe.swim_by_policy(scene, agent, 5, 2, 10, 0)
+    assert swimming["state"].shape == (2, 11, scene.num_nodes, 13) and swimming["action"].shape == (2, 10, 2)
+    held = swimming["action"].unflatten(1, (2, 5))
+    assert torch.equal(held, held[:, :, :1].expand_as(held)) and not torch.equal(held[:, 0], held[:, 1])
+    step = SceneEnv._step
+    ended = torch.ones(2, 1, dtype=torch.bool)
+    monkeypatch.setattr(SceneEnv, "_step", lambda env, now: step(env, now).set("terminated", ended))
+    with pytest.raises(UnstableSimulationError, match="2 of 2 swimmers became unstable"):
+        recipe.swim_by_policy(scene, agent, 5, 2, 10, 0)
 
 
 def test_other_data_are_no_continuation(call, tmp_path):
