@@ -71,12 +71,11 @@ def main(cfg: DictConfig) -> None:
         planner = label if label in cfg.rivals else "gn"
         times, rewards, spreads = [], [], []
         for iterations, run in of.items():
-            # A reward is no number where every episode became unstable.
-            reward, spread, ms = (
-                run.number(f"{planner}/{key}", math.nan) for key in ("mean_reward", "mean_reward_std", "planning_ms")
-            )
-            if reward is None or spread is None or ms is None:
+            if not (found := run.numbers(math.nan)):  # not one: a reward where every episode became unstable
                 continue
+            reward, spread, ms = (
+                found[f"{planner}/{key}"] for key in ("mean_reward", "mean_reward_std", "planning_ms")
+            )
             for values, value in ((times, ms), (rewards, reward), (spreads, spread)):
                 values.append(value)
             name = f"{label}/{iterations}"

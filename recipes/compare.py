@@ -69,8 +69,9 @@ class Training:
 
     def value(self, system: str, key: str) -> float | None:
         """Number of a system that it measured; infinite if it diverged, None if there is none."""
+        numbers = self.run.numbers()
         names = [f"{system}/{key}", f"{system} (zero-shot)/{key}", *([key] if self.systems == (system,) else [])]
-        return next((value for name in names if (value := self.run.number(name)) is not None), None)
+        return next((numbers[name] for name in names if name in numbers), None)
 
 
 def all_trainings(cfg: DictConfig, folder: Path) -> list[Training]:
@@ -114,7 +115,7 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
             for system in columns:
                 own = [t for t in trainings if t.variant == variant]
                 if key == "steps":
-                    found = [t.run.number(key) for t in own if system in t.systems]
+                    found = [t.run.numbers().get(key) for t in own if system in t.systems]
                 else:
                     found = [t.value(system, key) for t in own]
                 values = [value for value in found if value is not None]

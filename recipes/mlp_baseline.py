@@ -49,7 +49,7 @@ def candidates(cfg: DictConfig) -> dict[str, list[str]]:
 
 def values(runs: list[Run], key: str) -> list[float]:
     """One number of every finished run; infinite where it diverged."""
-    return [value for run in runs if (value := run.number(key)) is not None]
+    return [numbers[key] for run in runs if (numbers := run.numbers())]
 
 
 @with_help

@@ -78,15 +78,15 @@ def main(cfg: DictConfig) -> None:
             failed = run_all([learn], 1, desc=learn.name)
             if failed:
                 break
-            errors = {name: learn.number(name) for name in ("one_step_error", "rollout_error_100")}
-            metrics |= {f"round {index}/{name}": value for name, value in errors.items() if value is not None}
+            measured = learn.numbers()
+            errors = {name: measured[name] for name in ("one_step_error", "rollout_error_100")}
+            metrics |= {f"round {index}/{name}": value for name, value in errors.items()}
         failed = run_all([play], 1, desc=play.name)
         if failed:
             break
-        names = [name for name in play.metrics or {} if name.startswith("gn/")]
-        # A reward is no number where every episode became unstable.
-        found = {name.removeprefix("gn/"): play.number(name, math.nan) for name in names}
-        metrics |= {f"round {index}/{name}": value for name, value in found.items() if value is not None}
+        measured = play.numbers(math.nan)  # not one: a reward where every episode became unstable
+        found = {name.removeprefix("gn/"): value for name, value in measured.items() if name.startswith("gn/")}
+        metrics |= {f"round {index}/{name}": value for name, value in found.items()}
         reward = f"{found['mean_reward']:.3g} ({found['mean_reward_std']:.2g})"
         cells = [f"{value:.1e}" for value in errors.values()] or ["", ""]
         lines.append(f"| {index} | {reward} | {found['planning_ms']:.0f} | " + " | ".join(cells) + " |")

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -81,15 +82,24 @@ def load() -> Callable[[str], ModuleType]:
     return _load
 
 
-@pytest.fixture
-def call(capfd) -> Callable[..., tuple[int, str, str]]:
-    """As ``run``, in this process and without Hydra's command line: for runs shorter than the recipe's imports."""
+@pytest.fixture(scope="session")
+def compose() -> Callable[..., Any]:
+    """A recipe's configuration, with options."""
     hydra = pytest.importorskip("hydra")
 
-    def call(*options: str, recipe: str) -> tuple[int, str, str]:
-        module = _load(recipe)
+    def compose(recipe: str, *options: str) -> Any:
         with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-            config = hydra.compose(recipe, overrides=list(options))
+            return hydra.compose(recipe, overrides=list(options))
+
+    return compose
+
+
+@pytest.fixture
+def call(capfd, compose) -> Callable[..., tuple[int, str, str]]:
+    """As ``run``, in this process and without Hydra's command line: for runs shorter than the recipe's imports."""
+
+    def call(*options: str, recipe: str) -> tuple[int, str, str]:
+        module, config = _load(recipe), compose(recipe, *options)
         capfd.readouterr()
         code = 0
         try:

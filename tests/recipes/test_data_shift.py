@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -14,8 +12,6 @@ from torchrl_gn.envs import SceneEnv
 from torchrl_gn.modules import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import RunFolder
-
-ROOT = Path(__file__).parents[2]
 
 
 def test_the_gait_that_is_found_carries_the_swimmer(load):
@@ -46,10 +42,8 @@ def test_a_policys_actions_are_held_and_unstable_swims_are_no_data(load, monkeyp
         recipe.swim_by_policy(scene, agent, 5, 2, 10, 0)
 
 
-def test_other_data_are_no_continuation(call, tmp_path):
-    hydra = pytest.importorskip("hydra")
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        config = OmegaConf.to_yaml(hydra.compose("data_shift", overrides=["system=swimmer4"]))
+def test_other_data_are_no_continuation(call, compose, tmp_path):
+    config = OmegaConf.to_yaml(compose("data_shift", "system=swimmer4"))
     RunFolder(tmp_path, "data_shift").write_config(config)
     code, _, errors = call("search.generations=9", "seed=7", "minutes=9", f"run_dir={tmp_path}", recipe="data_shift")
     assert code == 1 and "search.generations=9 (was " in errors and "seed=7 (was 0), system=swimmer6 (was" in errors

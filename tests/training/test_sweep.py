@@ -108,10 +108,10 @@ def test_an_interrupt_ends_the_runs(tmp_path, jobs):
 
 def test_numbers_of_a_run_say_what_diverged(make_run):
     runs = {value: make_run(value) for value in ("3", "null")}
-    assert runs["3"].number("error") is None
+    assert runs["3"].numbers() == {}
     run_all(runs.values(), 1)
-    assert runs["3"].number("error") == 3.0 and runs["3"].number("other") is None
-    assert runs["null"].number("error") == math.inf and runs["null"].number("error", -1.0) == -1.0
+    assert runs["3"].numbers() == {"error": 3.0}
+    assert runs["null"].numbers() == {"error": math.inf} and runs["null"].numbers(-1.0) == {"error": -1.0}
 
 
 def test_a_finished_run_goes_on_where_it_may(make_run):
@@ -119,7 +119,7 @@ def test_a_finished_run_goes_on_where_it_may(make_run):
     refuse_changes([run])
     run_all([run], 1)
     longer = replace(run, overrides=("value=1", "minutes=9"))
-    assert run_all([longer], 1) == [] and (run.folder / "times").read_text() == "xx" and longer.done
+    assert run_all([longer], 1) == [] and (run.folder / "times").read_text() == "xx" and longer.is_done()
     assert run_all([longer], 1) == [] and (run.folder / "times").read_text() == "xx"
     with pytest.raises(ValueError, match="with value=1, not value=2"):
         refuse_changes([replace(longer, overrides=("value=2", "minutes=9"))])

@@ -45,12 +45,10 @@ class Run:
     name: str
     goes_on: tuple[str, ...] = ()
 
-    def number(self, name: str, diverged: float = math.inf) -> float | None:
-        """A number that it measured, ``diverged`` where it was none that is finite; None if there is none (yet)."""
-        metrics = self.metrics or {}
-        if name not in metrics:
-            return None
-        return diverged if metrics[name] is None else float(metrics[name])
+    def numbers(self, diverged: float = math.inf) -> dict[str, float]:
+        """Numbers that it measured, ``diverged`` for those that were not finite; none if it is not done."""
+        found = {name: diverged if value is None else value for name, value in (self.metrics or {}).items()}
+        return {name: float(value) for name, value in found.items() if isinstance(value, (int, float))}
 
     @property
     def metrics(self) -> dict[str, Any] | None:
@@ -58,16 +56,16 @@ class Run:
         path = self.folder / METRICS_FILE
         return json.loads(path.read_text()) if path.exists() else None
 
-    @property
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         """Whether it has finished, with these options.
 
         Raises:
             ValueError: if it has finished with others, naming those that differ: what they gave is not this run's.
         """
-        path = self.folder / OPTIONS_FILE
-        if self.metrics is None or not path.exists():
-            return self.metrics is not None
+        if not (self.folder / METRICS_FILE).exists():
+            return False
+        if not (path := self.folder / OPTIONS_FILE).exists():
+            return True
         both = json.loads(path.read_text()), self.overrides
         before, now = ({option for option in options if not option.startswith(MAY_DIFFER)} for options in both)
         if before == now:
@@ -102,7 +100,7 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
         ValueError: if a finished run was made with other options.
     """
     runs, failed = list(dict.fromkeys(runs)), []
-    left = [run for run in runs if not run.done]
+    left = [run for run in runs if not run.is_done()]
     if not left:
         return []  # without starting a cluster
     pool = _Threads(jobs) if isinstance(jobs, int) else _OnRay(jobs)
@@ -128,7 +126,7 @@ def refuse_changes(runs: Iterable[Run]) -> None:
         ValueError: if a finished run was made with other options.
     """
     for run in runs:
-        _ = run.done
+        run.is_done()
 
 
 def refuse_failures(failed: Sequence[Run]) -> None:
@@ -243,6 +241,5 @@ def _run_and_wait(run: Run, folder: Path) -> int:
 
 def best(runs: Sequence[Run], metric: str, count: int = 1) -> list[Run]:
     """The ``count`` finished runs with the smallest ``metric``, best first; those without a number come last."""
-    values = [(run, run.number(metric)) for run in runs]
-    done = [(run, value) for run, value in values if value is not None]
+    done = [(run, numbers[metric]) for run in runs if (numbers := run.numbers())]
     return [run for run, _ in sorted(done, key=lambda entry: entry[1])[:count]]
