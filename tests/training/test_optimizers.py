@@ -11,6 +11,7 @@ from torch import nn
 from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
 from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.training.muon import Muon
 from torchrl_gn.training.optimizers import ScheduledOptimizer, make_agent_optimizer, make_optimizer
 
 
@@ -67,7 +68,7 @@ def test_rates_fall_to_zero_as_a_cosine(preset):
 def test_muon_takes_the_matrices_and_adam_the_rest():
     module = network()
     muon, adam = make_optimizer(module, "muon").optimizers
-    assert isinstance(muon, torch.optim.Muon) and isinstance(adam, torch.optim.Adam)
+    assert isinstance(muon, Muon) and isinstance(adam, torch.optim.Adam)
     by_optimizer = [{id(p) for group in one.param_groups for p in group["params"]} for one in (muon, adam)]
     assert by_optimizer[0] == {id(p) for p in module.parameters() if p.ndim == 2}
     assert by_optimizer[1] == {id(p) for p in module.parameters() if p.ndim == 1}
@@ -118,6 +119,26 @@ def test_zero_grad_forgets():
     give_gradients(module)
     make_optimizer(module).zero_grad()
     assert all(parameter.grad is None for parameter in module.parameters())
+
+
+def test_an_optimiser_of_torch_keeps_its_rates_and_sees_whole_gradients():
+    ours, theirs = network(), network()
+    wrapped, plain = (torch.optim.SGD(module.parameters(), lr=0.1) for module in (ours, theirs))
+    for module in (ours, theirs):
+        give_gradients(module, 1e3)
+    ScheduledOptimizer.of(wrapped).step(5, 1.0)
+    plain.step()
+    assert all(map(torch.equal, ours.parameters(), theirs.parameters()))
+    give_gradients(ours, math.inf)
+    with pytest.raises(FloatingPointError, match="not finite at step 6"):
+        ScheduledOptimizer.of(wrapped).step(6, 1.0)
+
+
+def test_one_of_ours_is_taken_as_it_is_and_other_things_are_refused():
+    ours = make_optimizer(network())
+    assert ScheduledOptimizer.of(ours) is ours
+    with pytest.raises(TypeError, match=r"make_optimizer\(...\) or a torch.optim.Optimizer, not str"):
+        ScheduledOptimizer.of("adam")
 
 
 def test_bad_choices_are_named():

@@ -10,6 +10,8 @@ import torch
 from torch import nn
 from torchrl.objectives import LossModule
 
+from torchrl_gn.training.muon import Muon
+
 Preset = Literal["muon", "adam", "paper"]
 
 
@@ -20,7 +22,8 @@ class ScheduledOptimizer:
         optimizers: the optimisers, each with its own parameters; the learning rates they
             are made with are the highest.
         schedule: factor on all learning rates from ``(step, fraction)``, where
-            ``fraction`` of the training budget is spent.
+            ``fraction`` of the training budget is spent; None leaves the rates alone (to a scheduler of
+            ``torch.optim.lr_scheduler``, say).
         max_norm: norm that the gradient of all parameters together is clipped to; infinite: never.
 
     Raises:
@@ -30,7 +33,7 @@ class ScheduledOptimizer:
     def __init__(
         self,
         optimizers: list[torch.optim.Optimizer],
-        schedule: Callable[[int, float], float],
+        schedule: Callable[[int, float], float] | None,
         *,
         max_norm: float = 1.0,
     ) -> None:
@@ -39,6 +42,17 @@ class ScheduledOptimizer:
         self.optimizers, self.schedule, self.max_norm = optimizers, schedule, max_norm
         self._highest = [[group["lr"] for group in optimizer.param_groups] for optimizer in optimizers]
         self._parameters = [p for o in optimizers for group in o.param_groups for p in group["params"]]
+
+    @classmethod
+    def of(cls, optimizer: ScheduledOptimizer | torch.optim.Optimizer) -> ScheduledOptimizer:
+        """An optimiser of ``torch.optim`` as it is: its own rates, and gradients that are not clipped."""
+        if isinstance(optimizer, cls):
+            return optimizer
+        if not isinstance(optimizer, torch.optim.Optimizer):
+            raise TypeError(
+                f"optimizer must be of make_optimizer(...) or a torch.optim.Optimizer, not {type(optimizer).__name__}."
+            )
+        return cls([optimizer], None, max_norm=math.inf)
 
     def zero_grad(self) -> None:
         """Forget all gradients."""
@@ -61,10 +75,11 @@ class ScheduledOptimizer:
         norm = float(nn.utils.clip_grad_norm_(self._parameters, self.max_norm))
         if not math.isfinite(norm):
             raise FloatingPointError(f"The gradient is not finite at step {step}; lower the learning rate.")
-        factor = self.schedule(step, fraction)
+        factor = None if self.schedule is None else self.schedule(step, fraction)
         for optimizer, rates in zip(self.optimizers, self._highest, strict=True):
-            for group, rate in zip(optimizer.param_groups, rates, strict=True):
-                group["lr"] = rate * factor
+            if factor is not None:
+                for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                    group["lr"] = rate * factor
             optimizer.step()
         return norm
 
@@ -107,7 +122,7 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
     rest = [parameter for parameter in parameters if parameter.ndim != 2]
     optimizers: list[torch.optim.Optimizer] = []
     if matrices:
-        optimizers.append(torch.optim.Muon(matrices, lr=lr or 1e-2, weight_decay=0.0))
+        optimizers.append(Muon(matrices, lr=lr or 1e-2))
     if rest:
         optimizers.append(torch.optim.Adam(rest, lr=1e-3, fused=True))
     return ScheduledOptimizer(optimizers, _cosine)

@@ -1,0 +1,123 @@
+"""Muon: its updates are the matrices nearest to orthogonal, those of torch's own, in full digits."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from torchrl_gn.training.muon import Muon, orthogonalize
+
+SHAPES = [(8, 8), (8, 20), (20, 8), (8, 11), (1, 5), (12, 128), (128, 782)]
+
+
+def matrices(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_singular_values_become_about_one_and_their_vectors_stay(shape):
+    given = matrices(3, *shape, dtype=torch.float64)
+    out = orthogonalize(given)
+    assert out.shape == given.shape
+    left, _, right = torch.linalg.svd(given, full_matrices=False)
+    values = left.mT @ out @ right.mT
+    diagonal = values.diagonal(dim1=-2, dim2=-1)
+    assert (values - torch.diag_embed(diagonal)).abs().max() < 1e-9
+    assert diagonal.min() > 0.6 and diagonal.max() < 1.4
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_float32_keeps_its_digits_at_any_scale(shape, scale):
+    given = scale * matrices(2, *shape)
+    exact = orthogonalize(given.double())
+    assert (orthogonalize(given) - exact).norm() < 1e-4 * exact.norm()
+
+
+def test_matrices_without_full_rank_or_of_zeros_stay_finite():
+    thin = matrices(2, 16, 2) @ matrices(2, 2, 64)
+    out = orthogonalize(thin)
+    values = torch.linalg.svdvals(out)
+    assert values[:, :2].min() > 0.6 and values[:, :2].max() < 1.4 and values[:, 2:].max() < 0.05
+    assert torch.equal(orthogonalize(torch.zeros(2, 4, 9)), torch.zeros(2, 4, 9))
+
+
+@pytest.mark.skipif(not hasattr(torch.optim, "Muon"), reason="this torch has no Muon to compare with")
+def test_updates_point_where_torchs_do():
+    """Torch multiplies in bfloat16 by other polynomials; both leave singular values between 0.68 and 1.32."""
+    torch.manual_seed(0)
+    modules = [nn.ModuleList([nn.Linear(30, 12), nn.Linear(12, 30), nn.Linear(12, 12)]) for _ in range(2)]
+    modules[1].load_state_dict(modules[0].state_dict())
+    ours = Muon([p for p in modules[0].parameters() if p.ndim == 2], lr=0.1)
+    theirs = torch.optim.Muon([p for p in modules[1].parameters() if p.ndim == 2], lr=0.1, weight_decay=0.0)
+    for step in range(4):
+        generator = torch.Generator().manual_seed(step)
+        before = [[p.detach().clone() for p in module.parameters()] for module in modules]
+        for mine, other in zip(*(module.parameters() for module in modules), strict=True):
+            mine.grad = torch.randn(mine.shape, generator=generator)
+            other.grad = mine.grad.clone()
+        ours.step()
+        theirs.step()
+        updates = [
+            [new.detach() - old for new, old in zip(module.parameters(), olds, strict=True) if new.ndim == 2]
+            for module, olds in zip(modules, before, strict=True)
+        ]
+        for mine, other in zip(*updates, strict=True):
+            assert torch.cosine_similarity(mine.flatten(), other.flatten(), dim=0) > 0.9
+            assert 0.7 < mine.norm() / other.norm() < 1.5
+
+
+def test_a_batch_gives_what_each_matrix_alone_gives():
+    given = [matrices(1, 16, 16)[0] * (index + 1) for index in range(3)] + [matrices(1, 16, 40)[0]]
+    together = [nn.Parameter(torch.zeros_like(matrix)) for matrix in given]
+    alone = [nn.Parameter(torch.zeros_like(matrix)) for matrix in given]
+    for parameters in (together, alone):
+        for parameter, matrix in zip(parameters, given, strict=True):
+            parameter.grad = matrix.clone()
+    Muon(together, lr=0.1).step()
+    for parameter in alone:
+        Muon([parameter], lr=0.1).step()
+    torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-6)
+
+
+def test_float64_stays_float64_and_halves_are_multiplied_in_float32():
+    for dtype, digits in ((torch.float64, 1e-12), (torch.bfloat16, 1e-2)):
+        parameter = nn.Parameter(torch.zeros(6, 9, dtype=dtype))
+        parameter.grad = matrices(6, 9, dtype=dtype)
+        Muon([parameter], lr=1.0, momentum=0.0).step()
+        exact = -orthogonalize(parameter.grad.double()[None])[0]
+        assert parameter.dtype == dtype
+        assert (parameter.detach().double() - exact).norm() < digits * exact.norm()
+
+
+def test_closures_frozen_weights_and_saved_moments():
+    torch.manual_seed(0)
+    layer, idle = nn.Linear(4, 4, bias=False), nn.Linear(4, 4, bias=False)
+    optimizer = Muon([layer.weight, idle.weight], lr=0.01)
+    before = idle.weight.clone()
+
+    def closure() -> float:
+        optimizer.zero_grad()
+        loss = layer(torch.ones(1, 4)).square().sum()
+        loss.backward()
+        return loss.item()
+
+    losses = [optimizer.step(closure) for _ in range(20)]
+    assert losses[-1] < losses[0]
+    assert torch.equal(idle.weight, before)
+    again = Muon([layer.weight, idle.weight], lr=0.5)
+    again.load_state_dict(optimizer.state_dict())
+    assert again.param_groups[0]["lr"] == 0.01
+    buffers = [one.state[layer.weight]["momentum_buffer"] for one in (again, optimizer)]
+    assert torch.equal(*buffers)
+
+
+def test_what_is_no_matrix_and_bad_rates_are_named():
+    with pytest.raises(ValueError, match=r"matrices, not a parameter of shape \[3\]"):
+        Muon([nn.Parameter(torch.zeros(3))])
+    matrix = [nn.Parameter(torch.zeros(3, 3))]
+    with pytest.raises(ValueError, match="lr=-1 must be finite and not negative"):
+        Muon(matrix, lr=-1)
+    with pytest.raises(ValueError, match="momentum=1 must be from 0 to below 1"):
+        Muon(matrix, momentum=1)
