@@ -65,7 +65,7 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[Path]:
     for hidden in cfg.mlps:
         variants[f"mlp_{len(hidden)}x{hidden[0]}"] = ["model.core=mlp", f"model.mlp_hidden={list(hidden)}"]
     shared = [f"system={cfg.system}", f"data.folder={run.data}", f"seed={cfg.seed}", f"threads={cfg.threads}"]
-    shared += [f"minutes={cfg.minutes}", "clock=processor", *cfg.training]
+    shared += ["steps=null", f"minutes={cfg.minutes}", "clock=processor", *cfg.training]
     runs = [Run(RECIPE, run.path / "models" / name, (*shared, *sizes), name) for name, sizes in variants.items()]
     refuse_failures(run_all(runs, 1))
     return [each.folder for each in runs]

@@ -124,7 +124,8 @@ def make_runs(cfg: DictConfig, folder: Path, swimming: Path) -> dict[tuple[str, 
     data = {"random": [], "mixture": [f"data.extra={swimming}"]}
     for network, trained_on in itertools.product(networks, data):
         place = folder / f"{network}_{trained_on}"
-        options = (f"system={cfg.system}", f"minutes={cfg.minutes}", f"clock={cfg.clock}", f"threads={cfg.threads}")
+        minutes = ("steps=null", f"minutes={cfg.minutes}", f"clock={cfg.clock}")
+        options = (f"system={cfg.system}", *minutes, f"threads={cfg.threads}")
         options += (*(f"data.{name}={size}" for name, size in cfg.random.items()), f"data.length={cfg.length}")
         options += (f"data.folder={cfg.data_dir}", *as_list(cfg.overrides), *networks[network], *data[trained_on])
         runs[network, trained_on] = [

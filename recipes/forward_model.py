@@ -1,6 +1,6 @@
 """Train a graph-network forward model and say how well it predicts.
 
-    python recipes/forward_model.py [system=swimmer6] [minutes=4] [key=value ...]
+    python recipes/forward_model.py [system=swimmer6] [steps=3000] [minutes=8] [key=value ...]
     python recipes/forward_model.py system=[pendulum,cartpole,acrobot,swimmer6] zero_shot=[swimmer9]
 
 Collects random trajectories of the true physics, trains the forward model on them, and
@@ -54,7 +54,7 @@ from torchrl_gn.training import (
     plain_config,
     with_help,
 )
-from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
+from torchrl_gn.training.progress import cut_short_note, dataset_with_progress, train_with_progress
 
 # A run may go on with more time, another logger or other threads, and nothing else.
 MAY_CHANGE = (
@@ -200,6 +200,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
         Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
         unroll_fraction=cfg.unroll_fraction,
+        unroll_cost=cfg.unroll_batch_size * cfg.unroll_steps / cfg.batch_size,
         validate=validate,
         patience=cfg.patience,
         workers=workers,
@@ -283,6 +284,8 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
         tracker.log_table(f"errors of {name}", table.rows())
     tracker.finish(metrics, [*files, run.checkpoint], trainer.step)
     print(tables[scenes[0].name] if len(tables) == 1 else summary(tables))
+    if note := cut_short_note(trainer, run.path):
+        print(note)
     for path in [*files, run.path / "metrics.json", run.checkpoint]:
         print(path)
 

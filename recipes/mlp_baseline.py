@@ -31,7 +31,8 @@ ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout
 
 def make_run(cfg: DictConfig, folder: Path, system: str, name: str, options: list[str], minutes: float, seed: int):
     """A training of one network on one system."""
-    shared = [f"system={system}", f"minutes={minutes}", f"seed={seed}", f"clock={cfg.clock}", f"threads={cfg.threads}"]
+    shared = [f"system={system}", "steps=null", f"minutes={minutes}", f"clock={cfg.clock}"]
+    shared += [f"seed={seed}", f"threads={cfg.threads}"]
     place = folder / system / folder_name(name) / f"minutes{minutes}_seed{seed}"
     overrides = (*shared, f"data.folder={cfg.data_dir}", *as_list(cfg.overrides), *options)
     return Run(RECIPE, place, overrides, f"{system}, {name}, {minutes} minutes, seed {seed}")

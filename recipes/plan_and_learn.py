@@ -40,7 +40,8 @@ def playing(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
 def learning(cfg: DictConfig, folder: Path, index: int, model: str, played: list[Run]) -> Run:
     """A training that goes on from a model, with episodes as half of its data."""
     extra = ",".join(str(run.folder / "gn.safetensors") for run in played)
-    options = (f"system={cfg.system}", f"start_from={model}", f"data.extra=[{extra}]", f"minutes={cfg.minutes}")
+    options = (f"system={cfg.system}", f"start_from={model}", f"data.extra=[{extra}]")
+    options += ("steps=null", f"minutes={cfg.minutes}")
     options += (f"clock={cfg.clock}", f"lr={cfg.lr}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
     options += (f"data.folder={folder / 'data' if cfg.data_dir is None else cfg.data_dir}", *as_list(cfg.training))
     return Run(RECIPES / "forward_model.py", folder / f"learned{index}", options, f"learning, round {index}")

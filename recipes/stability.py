@@ -339,7 +339,8 @@ def main(cfg: DictConfig) -> None:
     tracker = Tracker(cfg.logger, run.path / "log", name="stability", config=cfg)
     checkpoint = cfg.checkpoint or run.path / "model"
     if not cfg.checkpoint:
-        options = (f"system={cfg.system}", f"minutes={cfg.minutes}", f"seed={cfg.seed}", f"threads={cfg.threads}")
+        minutes = ("steps=null", f"minutes={cfg.minutes}")
+        options = (f"system={cfg.system}", *minutes, f"seed={cfg.seed}", f"threads={cfg.threads}")
         refuse_failures(run_all([Run(RECIPE, run.path / "model", options, cfg.system)], 1))
     prepared = settings(cfg, checkpoint)
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_gn.modules import fast_matmul
-from torchrl_gn.training import Budget, Workers
+from torchrl_gn.training import Budget, Trainer, Workers
 from torchrl_gn.training.checkpoint import load_checkpoint, save_checkpoint
 
 
@@ -183,6 +183,27 @@ def test_a_finished_training_with_a_larger_budget_is_validated_on(make_trainer):
     assert_same(weights(more), trained)
 
 
+def test_minutes_cap_a_budget_of_steps(make_trainer):
+    trainer = make_trainer(Budget(steps=10**6, minutes=0.2 / 60))
+    last = list(trainer.run())[-1]
+    assert last.fraction == 1 and 0.2 <= last.seconds < 5 and trainer.cut_short
+    done = make_trainer(Budget(steps=3, minutes=5))
+    assert len(list(done.run())) == 3 and not done.cut_short
+
+
+def test_an_optimiser_of_torch_trains(make_trainer):
+    trainer = make_trainer(Budget(steps=60), noise=0.0)
+    trainer = Trainer(
+        trainer.loss, trainer.buffer, torch.optim.AdamW(trainer.model.core.parameters(), lr=3e-3), trainer.budget
+    )
+    losses = [progress.loss for progress in trainer.run()]
+    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+    assert trainer.optimizer.optimizers[0].param_groups[0]["lr"] == 3e-3
+    saved = trainer.state_dict()
+    trainer.load_state_dict(saved)
+    assert trainer.step == 60
+
+
 def test_windows_are_unrolled_at_the_end(make_trainer):
     trainer = make_trainer(Budget(steps=10), unroll=0.3)
     shapes, inner = [], trainer.loss.forward
@@ -190,6 +211,17 @@ def test_windows_are_unrolled_at_the_end(make_trainer):
     for _ in trainer.run():
         pass
     assert shapes == [(32,)] * 7 + [(8, 3)] * 3
+
+
+def test_costly_windows_get_fewer_steps_for_their_share(make_trainer):
+    trainer = make_trainer(Budget(steps=17), unroll=0.2)
+    trainer.unroll_cost = 4.0
+    shapes, inner = [], trainer.loss.forward
+    trainer.loss.forward = lambda batch: shapes.append(tuple(batch.shape)) or inner(batch)
+    assert [progress.fraction for progress in trainer.run()][-1] == 1
+    assert shapes == [(32,)] * 16 + [(8, 3)]
+    with pytest.raises(ValueError, match="unroll_cost=0 must be positive"):
+        Trainer(trainer.loss, trainer.buffer, trainer.optimizer, trainer.budget, unroll_cost=0)
 
 
 def test_a_loss_that_is_not_finite_stops_before_any_weight_changes(make_trainer):

@@ -67,6 +67,22 @@ def dataset_with_progress(
             return create_dataset(folder / name, scene, **sizes, **options, progress=show)
 
 
+def cut_short_note(trainer: Trainer, folder: Path) -> str | None:
+    """Tell how to go on with a training whose minutes were over before its steps were done; None for another.
+
+    Args:
+        trainer: what has trained.
+        folder: the run's folder.
+    """
+    budget = trainer.budget
+    if not trainer.cut_short or budget.steps is None or budget.minutes is None:
+        return None
+    return (
+        f"Cut short by minutes={budget.minutes:g}, at {trainer.step:,} of {budget.steps:,} steps: the errors are larger"
+        f" than they would be. To go on: the same command with run_dir={folder} minutes={2 * budget.minutes:g}"
+    )
+
+
 @contextmanager
 def saving(save: Callable[[], None], seconds: Callable[[], float], every: float) -> Iterator[Callable[[], None]]:
     """Save on Ctrl-C, and whenever what this yields is called and enough time has passed since the last time.
@@ -132,10 +148,11 @@ def train_with_progress(
         save_checkpoint(path, trainer.model, scene=scene, config=config, training=state)
 
     losses: list[float] = []
+    start = 100 * trainer.fraction
+    # Equal shares take equal time, so that the remaining time is what the bar says.
+    style = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
     with (
-        tqdm(
-            total=100, initial=int(100 * trainer.fraction), unit="%", desc=f"training {name}".strip(), leave=False
-        ) as bar,
+        tqdm(total=100, initial=start, bar_format=style, desc=f"training {name}".strip(), leave=False) as bar,
         saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
     ):
         for progress in trainer.run():
@@ -146,8 +163,8 @@ def train_with_progress(
                 curves["seconds"].append(progress.seconds)
                 curves["loss"].append(mean)
                 tracker.log({f"{prefix}train/loss": mean, f"{prefix}train/seconds": progress.seconds}, progress.step)
-                bar.set_postfix(step=progress.step, loss=f"{mean:.2e}", best_error=f"{trainer.best:.2e}")
-                bar.update(int(100 * progress.fraction) - bar.n)
+                bar.set_postfix(step=progress.step, loss=f"{mean:.2e}", best_error=f"{trainer.best:.2e}", refresh=False)
+            bar.update(100 * progress.fraction - bar.n)
             if progress.validation is not None:
                 tracker.log({f"{prefix}validation/rollout_error": progress.validation}, progress.step)
             save_when_due()

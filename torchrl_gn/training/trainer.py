@@ -49,10 +49,13 @@ class Trainer:
     Args:
         loss: the loss, of one scene or several; its model is what is trained.
         buffer: replay buffer of transitions.
-        optimizer: optimiser of the model's weights.
+        optimizer: optimiser of the model's weights: of :func:`~torchrl_gn.training.make_optimizer`, or any of
+            ``torch.optim``, which keeps its rates and gets unclipped gradients.
         budget: when to stop.
         unroll: buffer of windows of several steps, used at the end of the training.
-        unroll_fraction: share of the budget spent on the windows of ``unroll``.
+        unroll_fraction: share of the work that goes to the windows of ``unroll``.
+        unroll_cost: work of an update on windows, in updates on transitions of ``buffer``: with budgets of steps it
+            makes a share of the work, and so of the time, out of fewer steps.
         validate: error on data that is not trained on; the weights with the lowest one
             seen are kept (paper: 20-step rollouts of the validation set).
         validations: how often to validate over the whole budget.
@@ -60,18 +63,19 @@ class Trainer:
         workers: the processes that train together. Default: this one alone.
 
     Raises:
-        ValueError: if ``unroll_fraction`` is no share.
+        ValueError: if ``unroll_fraction`` is no share, or ``unroll_cost`` not positive.
     """
 
     def __init__(
         self,
         loss: ForwardModelLoss | SeveralScenesLoss | IdentificationLoss,
         buffer: ReplayBuffer,
-        optimizer: ScheduledOptimizer,
+        optimizer: ScheduledOptimizer | torch.optim.Optimizer,
         budget: Budget,
         *,
         unroll: ReplayBuffer | None = None,
         unroll_fraction: float = 0.0,
+        unroll_cost: float = 1.0,
         validate: Callable[[], float] | None = None,
         validations: int = 20,
         patience: int | None = None,
@@ -79,8 +83,11 @@ class Trainer:
     ) -> None:
         if not 0 <= unroll_fraction <= 1:
             raise ValueError(f"unroll_fraction={unroll_fraction} must be a share, 0 to 1.")
-        self.loss, self.buffer, self.optimizer, self.budget = loss, buffer, optimizer, budget
-        self.unroll, self.unroll_fraction = unroll, unroll_fraction
+        if not 0 < unroll_cost < math.inf:
+            raise ValueError(f"unroll_cost={unroll_cost} must be positive and finite.")
+        self.loss, self.buffer, self.budget = loss, buffer, budget
+        self.optimizer = ScheduledOptimizer.of(optimizer)
+        self.unroll, self.unroll_fraction, self.unroll_cost = unroll, unroll_fraction, unroll_cost
         self.validate, self.validations, self.patience = validate, validations, patience
         self.workers = workers or Workers()
         self.model = loss.trained
@@ -94,7 +101,13 @@ class Trainer:
     @property
     def fraction(self) -> float:
         """Share of the budget that is spent, 0 to 1."""
-        return self.budget.fraction(self.step, self.seconds)
+        windows = 0.0 if self.unroll is None else self.unroll_fraction
+        return self.budget.fraction(self.step, self.seconds, windows=windows, window_cost=self.unroll_cost)
+
+    @property
+    def cut_short(self) -> bool:
+        """Whether the budget's minutes ended the training before its steps were done."""
+        return self.budget.is_cut_short(self.step, self.seconds)
 
     def run(self) -> Iterator[Progress]:
         """Train until the budget is spent, yielding after every step.
@@ -118,7 +131,7 @@ class Trainer:
     def _update(self, module: nn.Module, fraction: float) -> float:
         clock = self.budget.now()
         buffer = self.buffer
-        if self.unroll is not None and fraction >= 1 - self.unroll_fraction:
+        if self.unroll is not None and fraction >= 1 - self.unroll_fraction - 1e-9:  # but for rounding
             buffer = self.unroll
         batch = buffer.sample().to(self.device)
         clock = self._lap("sampling", clock)
