@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
 import pytest
+import torch
 from PIL import Image
 
 from torchrl_gn.__main__ import main
@@ -53,6 +55,22 @@ def test_show_draws_a_file_of_ones_own(tmp_path, capsys):
         assert min(picture.size) > 400
         panel = picture.convert("RGB").crop((20, 70, 460, 510))
         assert len(panel.getcolors(1 << 20)) > 20, "nothing is drawn"
+
+
+@pytest.mark.slow
+def test_doctor_says_what_there_is_and_what_to_switch_on(capsys):
+    assert main(["doctor"]) == 0
+    sections = dict(part.split("\n", 1) for part in capsys.readouterr().out.strip().split("\n\n"))
+    assert {"System", "Versions", "Libraries", "GPU and rendering"} <= sections.keys()
+    assert re.search(rf"torch +{re.escape(torch.__version__)}", sections["Versions"])
+    assert re.search(r"instruction sets +\w", sections["System"])
+    products = sections["Matrix products on one thread, GFLOP/s"]
+    assert all(
+        float(re.search(rf"  {name} +([\d.]+)", products)[1]) >= 0 for name in ("float64", "float32", "bfloat16")
+    )
+    advice = sections["What to switch on here"]
+    assert ("- dtype=torch.bfloat16" in advice) != ("- no dtype=torch.bfloat16" in advice)
+    assert "specialize(model" in advice and "device=" in advice
 
 
 @pytest.mark.parametrize(

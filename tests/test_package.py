@@ -29,7 +29,7 @@ ALLOWED = {
     "evaluation": {"scenes", "data", "modules", "rewards", "objectives", "envs", "planners"},
     "training": {"scenes", "data", "modules", "rewards", "objectives", "envs", "planners", "evaluation"},
 }
-ANYWHERE = {"atomic", "finite"}  # modules beside the folders
+ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders
 
 
 def imports(tree: ast.AST) -> list[str]:

@@ -1,7 +1,8 @@
-"""Command line: what systems and trained models there are, and what a scene looks like as a graph.
+"""Command line: built-in systems and trained models, a scene as a graph, and what this machine can do.
 
     torchrl-gn [list]
     torchrl-gn show NAME_OR_MJCF [--image FILE]
+    torchrl-gn doctor
 
 The same as ``python -m torchrl_gn``. Everything that takes long to import is imported when it is needed.
 """
@@ -28,11 +29,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     try:
-        text = _show(options.scene, options.image) if options.command == "show" else f"{_systems()}\n\n{_models()}"
+        text = _text(options)
     except (ValueError, OSError, ImportError) as error:
         parser.exit(2, f"{parser.prog}: {error}\n")
     print(text)
     return 0
+
+
+def _text(options: argparse.Namespace) -> str:
+    """What a command prints."""
+    if options.command == "show":
+        return _show(options.scene, options.image)
+    if options.command == "doctor":
+        from torchrl_gn.doctor import diagnose
+
+        return diagnose()
+    return f"{_systems()}\n\n{_models()}"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -42,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     show = commands.add_parser("show", help="one scene as a graph: nodes, joints, motors, what moves")
     show.add_argument("scene", metavar="NAME_OR_MJCF", help="a built-in system, or the path of an MJCF file")
     show.add_argument("--image", metavar="FILE", help="also draw its start state into this file (.png, .jpg, ...)")
+    commands.add_parser("doctor", help="what this machine has, how fast it multiplies, and what to switch on here")
     return parser
 
 

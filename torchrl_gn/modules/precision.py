@@ -2,46 +2,41 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import torch
+
+from torchrl_gn.processor import onednn_precision, product_speeds
 
 
 @contextmanager
 def fast_matmul(*, rounding: bool = False) -> Iterator[None]:
     """Let the hardware choose how float32 matrices are multiplied.
 
-    On a CPU the products go through oneDNN, which on some processors is faster than the default library
-    with the same digits (measured: twice on an AMD EPYC). Processors with matrix units (AMX)
-    would round to bfloat16 there, which no training to errors below a millionth survives, so that is asked for
-    by ``rounding``, and so is TF32 on an NVIDIA GPU. The settings are put back after.
+    On a CPU the products go through oneDNN where that was timed to be faster with the same digits
+    (:func:`~torchrl_gn.processor.product_speeds`; nearly twice on an AMD EPYC with AVX-512, no gain with AVX2).
+    Processors with matrix units (AMX) would round to bfloat16 there, which no training to errors below a millionth
+    survives, so that is asked for by ``rounding``, and so is TF32 on an NVIDIA GPU. The settings are put back after.
+    Before torch 2.9, which has no such setting for a CPU, its products stay as they are.
 
     Args:
         rounding: allow products of factors that are rounded to 8 (CPU) or 11 (GPU) bits.
     """
-    cpu, cuda = torch.backends.mkldnn.matmul, torch.backends.cuda.matmul  # pyright: ignore
-    before = cpu.fp32_precision, cuda.fp32_precision
-    if rounding or _onednn_keeps_digits():
-        cpu.fp32_precision = "bf16"
-    if rounding:
-        cuda.fp32_precision = "tf32"
+    with ExitStack() as settings:
+        cpu, cuda = onednn_precision(), torch.backends.cuda.matmul
+        if cpu is not None and (rounding or product_speeds().onednn_pays):
+            settings.enter_context(_set(cpu, "bf16"))
+        if rounding and hasattr(cuda, "fp32_precision"):
+            settings.enter_context(_set(cuda, "tf32"))
+        yield
+
+
+@contextmanager
+def _set(backend: Any, precision: str) -> Iterator[None]:
+    before, backend.fp32_precision = backend.fp32_precision, precision
     try:
         yield
     finally:
-        cpu.fp32_precision, cuda.fp32_precision = before
-
-
-@functools.cache
-def _onednn_keeps_digits() -> bool:
-    """Whether oneDNN multiplies in full float32 when it may round; tried once, as processors differ."""
-    cpu = torch.backends.mkldnn.matmul  # pyright: ignore
-    factor = torch.randn(256, 256, generator=torch.Generator().manual_seed(0))
-    exact, before = factor.double() @ factor.double(), cpu.fp32_precision
-    cpu.fp32_precision = "bf16"
-    try:
-        error = (factor @ factor - exact).norm() / exact.norm()
-    finally:
-        cpu.fp32_precision = before
-    return bool(error < 1e-5)
+        backend.fp32_precision = before

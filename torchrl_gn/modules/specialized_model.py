@@ -20,6 +20,7 @@ from torchrl_gn.modules.local_frame import Seen
 from torchrl_gn.modules.mlp_core import FoldedMLP
 from torchrl_gn.modules.recurrent_core import RecurrentCore
 from torchrl_gn.modules.unseen_features import UnseenFeatureWarning
+from torchrl_gn.processor import SlowDtypeWarning, product_speeds
 from torchrl_gn.scenes.scene_values import SceneValues
 
 
@@ -214,8 +215,9 @@ def specialize(
 
     Args:
         bound: the forward model of the scene.
-        dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster
-            where the processor multiplies it; states keep their dtype.
+        dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster where the processor
+            has instructions for it (``torchrl-gn doctor`` tells) and many times slower elsewhere, which warns
+            (:class:`~torchrl_gn.processor.SlowDtypeWarning`). States keep their dtype.
         compile: compile ``step`` and ``rollout`` with ``torch.compile``, at their first call with
             every new shape: half a minute then, minutes for a gradient, and much faster steps of small batches.
 
@@ -229,6 +231,14 @@ def specialize(
     if isinstance(bound.model.core, (AblatedCore, RecurrentCore)):
         kind = "the ablation study" if isinstance(bound.model.core, AblatedCore) else "recurrent models"
         raise TypeError(f"The cores of {kind} cannot be specialised; use the bound model.")
+    slowdown = 1.0 if dtype is None or bound.live.device.type != "cpu" else product_speeds().slowdown(dtype)
+    if slowdown > 1.2:  # not by noise
+        warnings.warn(
+            f"This processor multiplies {str(dtype).removeprefix('torch.')} {slowdown:.1f} times more slowly than"
+            " float32: leave out dtype.",
+            SlowDtypeWarning,
+            stacklevel=2,
+        )
     return SpecializedForwardModel(bound, dtype=dtype, compile=compile)
 
 

@@ -1,0 +1,162 @@
+"""Matrix products that this processor computes fast: timed once, kept for later processes."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import platform
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchrl_gn.atomic import write_json
+
+_ROWS, _SIZE = 1400, 128  # a layer of 200 Swimmer6 states
+_FLOP = 2 * _ROWS * _SIZE**2
+_ROUNDS = 7
+_LIMITS = ("ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA", "MKL_ENABLE_INSTRUCTIONS")
+"""Environment variables that restrict a process's instruction sets."""
+
+
+class SlowDtypeWarning(UserWarning):
+    """A dtype was asked for that this processor multiplies more slowly than float32."""
+
+
+@dataclass(frozen=True)
+class ProductSpeeds:
+    """Speed of matrix products on one thread, GFLOP/s.
+
+    Attributes:
+        float64: in float64.
+        float32: in float32, by torch's default library.
+        onednn: in float32, by oneDNN; 0 if this torch cannot choose it.
+        bfloat16: in bfloat16.
+        float16: in float16.
+        onednn_error: relative error of a product of oneDNN's, above 1e-5 where it rounds the factors.
+    """
+
+    float64: float
+    float32: float
+    onednn: float
+    bfloat16: float
+    float16: float
+    onednn_error: float
+
+    @property
+    def onednn_pays(self) -> bool:
+        """Whether oneDNN is faster in float32 with the same digits."""
+        return self.onednn_error < 1e-5 and self.onednn > 1.1 * self.float32
+
+    def slowdown(self, dtype: torch.dtype) -> float:
+        """How many times longer a product takes in a dtype of 16 bits than in float32; 1 for other dtypes."""
+        speed = {torch.bfloat16: self.bfloat16, torch.float16: self.float16}.get(dtype)
+        return 1.0 if speed is None else max(self.float32, self.onednn if self.onednn_pays else 0.0) / speed
+
+
+@functools.cache
+def product_speeds() -> ProductSpeeds:
+    """Time products of 1,400 x 128 by 128 x 128, or read what an earlier process measured.
+
+    Kept in ``$XDG_CACHE_HOME/torchrl_gn`` (``~/.cache/torchrl_gn``) by processor, restriction of instruction sets and
+    torch version; where that cannot be written, every process measures for itself (a tenth of a second).
+    """
+    key = "\n".join([processor_name(), instruction_sets(), torch.__version__, *restrictions()])
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
+    file = folder / f"products-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
+    try:
+        return ProductSpeeds(**json.loads(file.read_text()))
+    except (OSError, ValueError, TypeError):  # not there, damaged, or of an older version of this package
+        pass
+    speeds = _measure()
+    try:
+        write_json(file, asdict(speeds))
+    except OSError:
+        pass
+    return speeds
+
+
+def processor_name() -> str:
+    """Name of the processor's model, ``"AMD EPYC"`` for example."""
+    fields = _cpuinfo()
+    return fields.get("model name") or platform.processor() or platform.machine()
+
+
+def instruction_sets() -> str:
+    """The vector and matrix instructions that matter here and that the processor has, ``"AVX2, FMA"`` for example."""
+    flags = set((_cpuinfo().get("flags") or _cpuinfo().get("Features") or "").split())
+    known = {
+        "avx2": "AVX2",
+        "fma": "FMA",
+        "avx512f": "AVX-512",
+        "avx512_bf16": "AVX-512 BF16",
+        "avx512_fp16": "AVX-512 FP16",
+        "amx_tile": "AMX",
+        "amx_bf16": "AMX BF16",
+        "asimd": "NEON",
+        "sve": "SVE",
+        "bf16": "BF16",
+    }
+    return ", ".join(name for flag, name in known.items() if flag in flags) or "not known"
+
+
+def restrictions() -> list[str]:
+    """Environment variables that keep this process from using all instruction sets, as ``NAME=VALUE``."""
+    return [f"{name}={os.environ[name]}" for name in _LIMITS if os.environ.get(name)]
+
+
+@functools.cache
+def _cpuinfo() -> dict[str, str]:
+    """Fields of the first core in Linux's ``/proc/cpuinfo``; empty on other systems."""
+    try:
+        first = Path("/proc/cpuinfo").read_text().split("\n\n")[0]
+    except OSError:
+        return {}
+    pairs = (line.partition(":") for line in first.splitlines())
+    return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def onednn_precision():
+    """What sets the precision of oneDNN's products in float32 (``fp32_precision``), or None before torch 2.9."""
+    settings = getattr(torch.backends.mkldnn, "matmul", None)
+    usable = torch.backends.mkldnn.is_available() and hasattr(settings, "fp32_precision")
+    return settings if usable else None
+
+
+@torch.no_grad()
+def _measure() -> ProductSpeeds:
+    generator = torch.Generator().manual_seed(0)
+    exact = [torch.randn(size, _SIZE, generator=generator, dtype=torch.float64) for size in (_ROWS, _SIZE)]
+    dtypes = {"float64": torch.float64, "float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+    factors = {name: [factor.to(dtype) for factor in exact] for name, dtype in dtypes.items()}
+    precision, threads = onednn_precision(), torch.get_num_threads()
+    seconds = dict.fromkeys(factors, float("inf"))
+    onednn, error = float("inf"), 0.0
+    torch.set_num_threads(1)
+    try:
+        # In turn, so that all meet the same load; the first round warms up.
+        for _ in range(_ROUNDS):
+            for name, pair in factors.items():
+                seconds[name] = min(seconds[name], _seconds(pair)[0])
+            if precision is not None:
+                before, precision.fp32_precision = precision.fp32_precision, "bf16"
+                try:
+                    took, product = _seconds(factors["float32"])
+                finally:
+                    precision.fp32_precision = before
+                onednn, truth = min(onednn, took), exact[0] @ exact[1]
+                error = float((product - truth).norm() / truth.norm())
+    finally:
+        torch.set_num_threads(threads)
+    speeds = {name: _FLOP / took / 1e9 for name, took in seconds.items()}
+    return ProductSpeeds(**speeds, onednn=_FLOP / onednn / 1e9, onednn_error=error)
+
+
+def _seconds(factors: list[Tensor]) -> tuple[float, Tensor]:
+    start = time.perf_counter()
+    product = factors[0] @ factors[1]
+    return time.perf_counter() - start, product
