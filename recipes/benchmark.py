@@ -4,10 +4,10 @@
 
 Every contestant predicts the same rollouts (starts and random controls of the dataset's kind) and is compared with
 a finely stepped MuJoCo: GN forward models of several sizes and MLPs, trained here for `minutes` each (or
-`checkpoints=[FOLDER,...]`), evaluated plain, specialised (with `fast_matmul`) and in bfloat16; and MuJoCo at its own
-and at coarser time steps and solver settings. Errors are relative to the constant prediction, over equal simulated
-time. Run time is wall time per simulated second of one trajectory, on `threads` threads, at every batch size:
-medians, all contestants in turn.
+`checkpoints=[FOLDER,...]`), evaluated plain, specialised (with `fast_matmul`) and, where this processor is fast at
+it, in bfloat16; and MuJoCo at its own and at coarser time steps and solver settings. Errors are relative to the
+constant prediction, over equal simulated time. Run time is wall time per simulated second of one trajectory, on
+`threads` threads, at every batch size: medians, all contestants in turn.
 A contestant is on the Pareto front of a batch size if nothing is both faster and more accurate.
 
 Writes config.yaml, metrics.json, the figure work_precision.png and the trained models to its run folder; the same
@@ -35,6 +35,7 @@ from tqdm import tqdm
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.evaluation import plot_loglog, squared_errors
 from torchrl_gn.modules import fast_matmul, specialize
+from torchrl_gn.processor import product_speeds
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.systems import find_system
 from torchrl_gn.training import RunFolder, Tracker, clean_exit, load_checkpoint, with_help
@@ -89,8 +90,9 @@ def learned(folders: list[Path], scene: Scene) -> list[Contestant]:
         ways = {
             "plain": (model.bind(scene, plain=True), False),
             "specialised": (specialize(bound), True),
-            "bfloat16": (specialize(bound, dtype=torch.bfloat16), True),
         }
+        if product_speeds().pays(torch.bfloat16):
+            ways["bfloat16"] = (specialize(bound, dtype=torch.bfloat16), True)
         for way, (module, fast) in ways.items():
 
             def rollout(physics: Tensor, state: Tensor, actions: Tensor, module=module, fast=fast) -> Tensor:

@@ -5,11 +5,11 @@
 Measures one step, rollouts, gradients through rollouts and a training step of one forward model (random weights,
 true static features) as it is evaluated in different ways: `plain` (PyG message passing, eager: the rival),
 `folded` (what training uses), `specialised`, and on top of it oneDNN's matrix products (`fast`), bfloat16
-products and `torch.compile`. Each way does each piece of work in turn, several times; the table shows medians,
-speed-ups over `plain` and errors against the plain model in float64. The share of the limit is that of the
-specialised model's FLOPs at the rate of a large matrix product measured beside it. `curves=true` draws the cost of
-a step over links, batch sizes and hidden sizes, and of a rollout's gradient over its length. Takes about ten
-minutes, half of it compiling; results: docs/performance.md.
+products (where this processor is fast at them) and `torch.compile`. Each way does each piece of work in turn,
+several times; the table shows medians, speed-ups over `plain` and errors against the plain model in float64. The
+share of the limit is that of the specialised model's FLOPs at the rate of a large matrix product measured beside it.
+`curves=true` draws the cost of a step over links, batch sizes and hidden sizes, and of a rollout's gradient over its
+length. Takes about ten minutes, half of it compiling; results: docs/performance.md.
 
 Writes config.yaml, metrics.json and with curves the figure speed.png to its run folder.
 """
@@ -39,6 +39,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.evaluation import plot_loglog
 from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, fast_matmul, specialize
 from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.processor import product_speeds
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, Tracker, clean_exit, make_optimizer, with_help
 
@@ -114,13 +115,16 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
         "folded, fast": Way(bound, fast=True),
         "specialised": Way(specialize(bound)),
         "specialised, fast": Way(specialize(bound), fast=True),
-        "specialised, bfloat16": Way(specialize(bound, dtype=torch.bfloat16)),
     }
+    rounded = product_speeds().pays(torch.bfloat16)
+    if rounded:
+        ways["specialised, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16))
     if cfg.compile:
         compiled = specialize(bound, compile=True)
         ways["compiled"] = Way(compiled)
         ways["compiled, fast"] = Way(compiled, fast=True)
-        ways["compiled, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, compile=True))
+        if rounded:
+            ways["compiled, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, compile=True))
     return ways
 
 

@@ -42,6 +42,7 @@ from torchrl_gn.modules import (
 )
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.pretrained import load_model
+from torchrl_gn.processor import SlowDtypeWarning
 from torchrl_gn.scenes import Scene, has_variants, load_scene, make_variants, parameter_ranges
 from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.sweep import Run, refuse_failures, run_all
@@ -323,7 +324,10 @@ def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
     largest = true.flatten(0, -2).amax(0)
     exact = copy.deepcopy(loaded.model).double().requires_grad_(False).bind(scene)
     single = loaded.model.requires_grad_(False).bind(scene)
-    models = {"float32": single, "float64": exact, "bfloat16": specialize(single, dtype=torch.bfloat16)}
+    with warnings.catch_warnings():  # its digits are wanted here, however slow
+        warnings.simplefilter("ignore", SlowDtypeWarning)
+        rounded = specialize(single, dtype=torch.bfloat16)
+    models = {"float32": single, "float64": exact, "bfloat16": rounded}
     inputs = scene, states[:, -2], actions[:, -1], largest, cfg
     return {name: Setting(model, exact, *inputs) for name, model in models.items()}
 

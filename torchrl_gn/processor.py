@@ -57,6 +57,10 @@ class ProductSpeeds:
         speed = {torch.bfloat16: self.bfloat16, torch.float16: self.float16}.get(dtype)
         return 1.0 if speed is None else max(self.float32, self.onednn if self.onednn_pays else 0.0) / speed
 
+    def pays(self, dtype: torch.dtype) -> bool:
+        """Whether a dtype is no slower than float32, but for noise."""
+        return self.slowdown(dtype) < 1.2
+
 
 @functools.cache
 def product_speeds() -> ProductSpeeds:

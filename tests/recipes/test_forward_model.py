@@ -25,7 +25,7 @@ SMALL = ("system=pendulum", "data.train=20", "data.validation=5", "data.test=5")
 def interrupted(tmp_path_factory, start) -> Path:
     """Folder of a run that Ctrl-C stopped in the middle of its training."""
     folder = tmp_path_factory.mktemp("run")
-    process = start(*SMALL, "minutes=5", "checkpoint_seconds=0", f"run_dir={folder}")
+    process = start(*SMALL, "steps=null", "minutes=5", "checkpoint_seconds=0", f"run_dir={folder}")
     deadline = time.monotonic() + 60
     while not list(folder.glob("checkpoint/*.safetensors")):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
@@ -40,7 +40,7 @@ def interrupted(tmp_path_factory, start) -> Path:
 def test_an_interrupted_run_goes_on_to_its_end(interrupted, run):
     done = load_checkpoint(interrupted).training["progress"]["step"]
     assert done > 0
-    code, output, errors = run(*SMALL, "minutes=null", f"steps={done + 5}", f"run_dir={interrupted}", "logger=wandb")
+    code, output, errors = run(*SMALL, f"steps={done + 5}", f"run_dir={interrupted}", "logger=wandb")
     assert code == 0, errors
     assert "warning" not in errors.lower()
     metrics = json.loads((interrupted / "metrics.json").read_text())
@@ -56,7 +56,7 @@ def test_bad_options_end_in_one_line_and_touch_nothing(interrupted, call):
     before = {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()}
     for options, message in (
         (("noise=0.5", "minutes=9"), "other options: noise=0.5"),
-        (("minutes=null",), "either steps or minutes"),
+        (("steps=null", "minutes=null"), "needs a limit: give steps, minutes or both"),
     ):
         code, _, errors = call(*SMALL, *options, f"run_dir={interrupted}", recipe="forward_model")
         assert code == 1
@@ -65,8 +65,21 @@ def test_bad_options_end_in_one_line_and_touch_nothing(interrupted, call):
     assert {path: path.stat().st_mtime_ns for path in interrupted.rglob("*") if path.is_file()} == before
 
 
+def test_a_run_that_its_minutes_cut_short_says_so_and_how_to_go_on(tmp_path, call):
+    options = (*SMALL, f"run_dir={tmp_path}")
+    code, output, errors = call(*options, "steps=100000", "minutes=0.01", recipe="forward_model")
+    assert code == 0, errors
+    done = json.loads((tmp_path / "metrics.json").read_text())["steps"]
+    note = f"Cut short by minutes=0.01, at {done:,} of 100,000 steps"
+    assert note in output and f"the same command with run_dir={tmp_path} minutes=0.02" in output
+    code, output, errors = call(*options, f"steps={done + 3}", "minutes=5", recipe="forward_model")
+    assert code == 0, errors
+    assert "Cut short" not in output
+    assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == done + 3
+
+
 def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_path, call):
-    options = (*SMALL, "parametrized=true", "minutes=null", "steps=5", f"run_dir={tmp_path}")
+    options = (*SMALL, "parametrized=true", "steps=5", f"run_dir={tmp_path}")
     code, output, errors = call(*options, recipe="forward_model")
     assert code == 0, errors
     assert "warning" not in errors.lower() and "standard pendulum" in output
@@ -77,7 +90,7 @@ def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_pa
 
 
 def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path, call):
-    small = (*SMALL[1:], "system=[swimmer3,pendulum]", "zero_shot=[swimmer4]", "minutes=null")
+    small = (*SMALL[1:], "system=[swimmer3,pendulum]", "zero_shot=[swimmer4]")
     options = (*small, "steps=5", "parametrized=true", f"run_dir={tmp_path}")
     code, output, errors = call(*options, recipe="forward_model")
     assert code == 0, errors
@@ -96,7 +109,7 @@ def test_a_model_goes_on_from_another_with_episodes_as_half_of_its_data(tmp_path
     episodes = collect_trajectories(scene, 3, 120, seed=9)
     episodes["state"][2, 50:] = torch.nan  # its simulation became unstable
     save_file({"state": episodes["state"], "action": episodes["action"].float()}, tmp_path / "gn.safetensors")
-    small = (*SMALL, "minutes=null", "steps=3", "lr=1e-6", "start_from=pendulum")
+    small = (*SMALL, "steps=3", "lr=1e-6", "start_from=pendulum")
     options = (*small, f"data.extra=[{tmp_path / 'gn.safetensors'}]")
     code, _, errors = call(*options, f"run_dir={tmp_path / 'run'}", recipe="forward_model")
     assert code == 0, errors

@@ -11,7 +11,6 @@ from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_checkpoint
 
 SMALL = (
-    "minutes=null",
     "steps=2",
     "length=12",
     "warm_up=4",

@@ -231,11 +231,10 @@ def specialize(
     if isinstance(bound.model.core, (AblatedCore, RecurrentCore)):
         kind = "the ablation study" if isinstance(bound.model.core, AblatedCore) else "recurrent models"
         raise TypeError(f"The cores of {kind} cannot be specialised; use the bound model.")
-    slowdown = 1.0 if dtype is None or bound.live.device.type != "cpu" else product_speeds().slowdown(dtype)
-    if slowdown > 1.2:  # not by noise
+    if dtype is not None and bound.live.device.type == "cpu" and not product_speeds().pays(dtype):
         warnings.warn(
-            f"This processor multiplies {str(dtype).removeprefix('torch.')} {slowdown:.1f} times more slowly than"
-            " float32: leave out dtype.",
+            f"This processor multiplies {str(dtype).removeprefix('torch.')} {product_speeds().slowdown(dtype):.1f}"
+            " times more slowly than float32: leave out dtype.",
             SlowDtypeWarning,
             stacklevel=2,
         )

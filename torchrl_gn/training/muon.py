@@ -68,8 +68,9 @@ class Muon(torch.optim.Optimizer):
                 if not self.state[parameter]:
                     self.state[parameter]["momentum_buffer"] = torch.zeros_like(parameter)
             moments = [self.state[parameter]["momentum_buffer"] for parameter in parameters]
-            torch._foreach_lerp_(moments, gradients, 1 - group["momentum"])
-            updates = _orthogonalize_all(torch._foreach_lerp(gradients, moments, group["momentum"]))
+            torch._foreach_lerp_(moments, gradients, 1 - group["momentum"])  # pyright: ignore
+            nesterov = torch._foreach_lerp(gradients, moments, group["momentum"])  # pyright: ignore
+            updates = _orthogonalize_all(nesterov)
             for parameter, update in zip(parameters, updates, strict=True):
                 rows, columns = parameter.shape
                 parameter.sub_(update, alpha=group["lr"] * math.sqrt(max(1, rows / columns)))

@@ -152,7 +152,9 @@ def train_with_progress(
     # Equal shares take equal time, so that the remaining time is what the bar says.
     style = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
     with (
-        tqdm(total=100, initial=start, bar_format=style, desc=f"training {name}".strip(), leave=False) as bar,
+        tqdm(
+            total=100, initial=start, smoothing=0, bar_format=style, desc=f"training {name}".strip(), leave=False
+        ) as bar,
         saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
     ):
         for progress in trainer.run():

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from torchrl_gn.atomic import atomic_path, write_json
+from torchrl_gn.processor import instruction_sets, processor_name, restrictions
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
 from torchrl_gn.training.config import plain_config
 
@@ -115,7 +116,7 @@ class RunFolder:
             temporary.write_text(f"{_RECIPE}{self.name}\n{text}")
 
     def write_metrics(self, metrics: Mapping[str, Any], *, seed: int) -> dict[str, Any]:
-        """Write ``metrics.json``: flat names and plain numbers, versions, seed and seconds.
+        """Write ``metrics.json``: flat names and plain numbers, processor, versions, seed and seconds.
 
         JSON has no infinity: a number that is not finite (the error of a diverged
         rollout) is written as null.
@@ -128,6 +129,7 @@ class RunFolder:
             **numbers,
             "seed": seed,
             "wall_clock_seconds": round(time.perf_counter() - self._start, 3),
+            "processor": ", ".join([processor_name(), instruction_sets(), *restrictions()]),
             **{f"version/{name}": version for name, version in package_versions().items()},
         }
         write_json(self.file(METRICS_FILE), everything)
