@@ -37,8 +37,8 @@ def test_one_process_trains_the_same_but_for_rounding(results, preset):
     alone, together = train(Workers(), preset), results[0][preset]
     assert len(alone["losses"]) == 24  # patience ended it: at 80 % of 30 steps, five validations after the best
     assert alone["best"] == 1.0
-    # Muon makes its steps orthogonal in bfloat16: a gradient that differs in its last bit may be rounded the other way.
-    rounded = {"core": 2e-2, "losses": 1e-3} if preset == "muon" else {}
+    # Muon lifts the smallest parts of a gradient to the size of the largest, and their rounding with them.
+    rounded = {"core": 1e-3, "losses": 3e-4} if preset == "muon" else {}
     for name, value in alone.items():
         if within := rounded.get(name.split(".")[0]):
             assert (together[name] - value).norm() <= within * value.norm(), name
