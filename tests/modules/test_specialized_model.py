@@ -315,6 +315,7 @@ def has_compiler() -> bool:
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
 def test_compiled_rollouts_and_their_gradients(scenes, make_model, random_states, random_actions):
     scene = scenes["pendulum"]

@@ -339,8 +339,8 @@ def test_batches_that_do_not_fit_are_named(make_loss, windows):
     [
         "cartpole",
         "swimmer3",
-        "cheetah",
-        "jaco",
+        pytest.param("cheetah", marks=pytest.mark.slow),
+        pytest.param("jaco", marks=pytest.mark.slow),
     ],
 )
 def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):

@@ -69,6 +69,7 @@ def test_a_random_number_of_steps_is_identified_from_the_last_of_the_phase(make_
             make_loss(phase=6, shortest=shortest)
 
 
+@pytest.mark.slow
 def test_one_loss_trains_both_models_and_identification_pays(make_loss, trajectories):
     loss = make_loss(phase=10, parts=4)
     buffer = trajectory_buffer(trajectories, batch_size=16, window=10, elsewhere=(4, 1), seed=0)
