@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
+
 import torch
 
 # Small tensors gain nothing from more threads, and threads on a busy machine wait for each other.
-torch.set_num_threads(1)
+torch.set_num_threads(int(os.environ.get("TORCHRL_GN_TEST_THREADS", "1")))

@@ -24,6 +24,7 @@ def examples(page: Path) -> list[str]:
     return ["\n" * text.count("\n", 0, match.start(2)) + match[2] for match in blocks]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if examples(page)], ids=name)
 def test_examples_run(page, tmp_path, monkeypatch):
     """The blocks of one page share their names and run from top to bottom in an empty folder."""
@@ -60,8 +61,9 @@ def test_named_files_exist(page):
 def test_readme_has_two_setup_commands_and_ci_runs_its_test_command():
     commands = [line for line in (ROOT / "README.md").read_text().splitlines() if "-m venv" in line]
     assert len(commands) == 2
-    assert "recipes/forward_model.py" in commands[0] and "-m pytest" in commands[1]
-    assert "README.md" in (ROOT / ".ci" / "run").read_text()
+    assert "recipes/forward_model.py" in commands[0] and commands[1].endswith('-m "not slow"')
+    ci = (ROOT / ".ci" / "run").read_text()
+    assert "README.md" in ci and "-m slow" in ci  # together all of the tests
 
 
 def test_every_page_is_in_the_menu_of_the_site():

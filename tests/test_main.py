@@ -101,6 +101,7 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.slow
 def test_it_runs_as_a_module():
     done = subprocess.run(
         [sys.executable, "-m", "torchrl_gn", "show", "nothing_like_it"], capture_output=True, text=True, timeout=120

@@ -93,6 +93,7 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_importing_everything_is_silent_and_leaves_the_recipes_libraries_alone():
     folders = [f"torchrl_gn.{folder}" for folder in ALLOWED if (PACKAGE / folder / "__init__.py").exists()]
     done = run(

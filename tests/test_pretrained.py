@@ -12,8 +12,12 @@ from torchrl_gn.pretrained import WEIGHTS, load_model, load_pretrained, pretrain
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import CheckpointError, save_checkpoint
 
+QUICK = {"pendulum", "cartpole", "acrobot"}
 
-@pytest.mark.parametrize("name", pretrained_names())
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in pretrained_names()]
+)
 def test_a_shipped_model_has_the_errors_that_it_states(name):
     loaded = load_pretrained(name)
     trained, stated = loaded.trained, dict(loaded.metrics)

@@ -83,6 +83,7 @@ def test_starts_are_of_the_variants_own_model() -> None:
         assert -0.1 < height < 0.05, scene.origin  # settled on the ground, however long the legs
 
 
+@pytest.mark.slow
 def test_variants_are_stable() -> None:
     for system in SYSTEMS:
         scenes = sample_variants(system, 12 if system == "jaco" else 60, 5)  # an arm takes its time

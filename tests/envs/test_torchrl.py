@@ -159,6 +159,7 @@ def test_same_seed_same_run(env):
     assert (run() == run()).all()
 
 
+@pytest.mark.slow
 def test_cem_on_the_true_physics_keeps_the_pendulum_balanced(pendulum):
     # From up to 6 degrees: beyond about 11 the motor cannot hold the pole against gravity.
     def starts(n, rng):

@@ -22,6 +22,7 @@ torch.save([step(state, action) for state, action in given], found)
 """
 
 
+@pytest.mark.slow
 def test_a_program_predicts_as_its_model_for_any_batch_without_the_package(
     scenes, make_model, random_states, random_actions, tmp_path
 ):

@@ -27,6 +27,7 @@ def robot():
     return log_chain(log, "jaco"), log_trajectories(log, 40)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("core", ["gn", "recurrent"])
 def test_it_trains_is_saved_and_evaluated_like_any_scene(robot, core, tmp_path):
     chain, data = robot

@@ -20,7 +20,7 @@ def gap(scene, states, arms):
     return (states[..., parent, :3] + upper - states[..., :3] - lower)[..., pinned, :].abs().max()
 
 
-@pytest.fixture(params=["swimmer6", "cheetah", "jaco"])
+@pytest.fixture(scope="module", params=["swimmer6", "cheetah", "jaco"])
 def moving(request):
     """A system, and how ten of its variants move, from 100 states each."""
     scene = load_scene(request.param)
@@ -33,7 +33,9 @@ def test_twenty_steps_tell_where_pins_are(moving):
     usual = finder.usual.expand(10, -1, -1).split(3, dim=-1)
     found = finder.solve(finder.sums(data["state"][:, :21]))
     assert gap(scene, data["state"][:, 21:], found) < 1e-5
-    torch.testing.assert_close(found, (data["static", "parent_arm"], data["static", "arm"]), rtol=0, atol=1e-4)
+    # Of jaco's shorter turns the last bits of the states count: up to 1e-4 on one processor, less on another.
+    close = 5e-4 if scene.name == "jaco" else 1e-5
+    torch.testing.assert_close(found, (data["static", "parent_arm"], data["static", "arm"]), rtol=0, atol=close)
     if scene.name != "jaco":  # whose variants have other masses and motors, and the same lengths
         assert gap(scene, data["state"][:, 21:], usual) > 1e-2
 

@@ -132,6 +132,7 @@ def test_teacher_forcing_feeds_true_states_first(bound, trajectories, forced):
         ForwardModelLoss(bound, forced=0)
 
 
+@pytest.mark.slow
 def test_it_learns_what_a_state_does_not_say():
     """A pendulum whose motor acts a step late: only what remembers the action can know."""
     torch.manual_seed(0)

@@ -54,13 +54,14 @@ def test_a_random_number_of_steps_is_identified_from_the_last_of_the_phase(make_
     loss = make_loss(phase=6, shortest=4, parts=1, generator=torch.Generator().manual_seed(0))
     batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(1, 1), seed=0).sample()
     fewer = [make_loss(phase=steps)(batch[:, 6 - steps :])["loss_forward_model"].item() for steps in (4, 5, 6)]
-    drawn = [loss(batch)["loss_forward_model"].item() for _ in range(20)]
-    assert {round(value, 6) for value in drawn} == {round(value, 6) for value in fewer}
+    drawn = [loss(batch)["loss_forward_model"].item() for _ in range(12)]
+    nearest = [min(fewer, key=lambda one: abs(one - value)) for value in drawn]
+    assert drawn == pytest.approx(nearest, rel=1e-9) and set(nearest) == set(fewer)
     state = loss.training_state()
-    assert [loss(batch)["loss_forward_model"].item() for _ in range(9)] != drawn[:9]
+    assert [loss(batch)["loss_forward_model"].item() for _ in range(5)] != drawn[:5]
     after = loss(batch)["loss_forward_model"].item()
     loss.load_training_state(state)
-    assert [loss(batch)["loss_forward_model"].item() for _ in range(10)][-1] == after
+    assert [loss(batch)["loss_forward_model"].item() for _ in range(6)][-1] == after
     loss.eval()
     assert loss(batch)["loss_forward_model"].item() == pytest.approx(fewer[-1])
     for shortest in (0, 7):
@@ -68,6 +69,7 @@ def test_a_random_number_of_steps_is_identified_from_the_last_of_the_phase(make_
             make_loss(phase=6, shortest=shortest)
 
 
+@pytest.mark.slow
 def test_one_loss_trains_both_models_and_identification_pays(make_loss, trajectories):
     loss = make_loss(phase=10, parts=4)
     buffer = trajectory_buffer(trajectories, batch_size=16, window=10, elsewhere=(4, 1), seed=0)

@@ -175,6 +175,7 @@ def test_the_next_call_goes_on_from_the_last_plan():
     assert (fresh(alone)["action"].double() - optimum[0]).abs() > (played["action"][0, 0].double() - optimum[0]).abs()
 
 
+@pytest.mark.slow
 def test_steps_shrink_where_they_gain_nothing_and_grow_where_they_do():
     env, error, sizes = point_env(20.0), {}, {}
     for shrink in (1.0, 0.7):

@@ -141,6 +141,7 @@ def test_limits_that_are_hit_equal_a_bounded_optimiser():
     np.testing.assert_allclose(plan, wanted, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_swings_the_pendulum_up():
     scene = load_scene("pendulum")
     env = SceneEnv(scene, make_reward("balance", scene), num_threads=1, seed=0)

@@ -71,6 +71,7 @@ def test_every_recipe_helps_and_logs(recipe):
     assert re.search(r"tracker\.finish\(|report_sweep\(.* tracker,|report_learning\(.* tracker,", source.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if scripts(page)], ids=lambda page: str(page.relative_to(ROOT))
 )

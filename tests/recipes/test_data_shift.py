@@ -14,6 +14,7 @@ from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import RunFolder
 
 
+@pytest.mark.slow
 def test_the_gait_that_is_found_carries_the_swimmer(load):
     recipe = load("data_shift")
     scene, rng = load_scene("swimmer6"), np.random.default_rng(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -18,6 +19,7 @@ SMALL = (
 )
 
 
+@pytest.mark.slow
 def test_a_run_is_learned_gone_on_with_and_kept_from_other_options(tmp_path, call):
     for frames, updates in ((80, 4), (120, 8)):
         code, _, errors = call(*SMALL, f"trainer.frames={frames}", f"run_dir={tmp_path}", recipe="ddpg")

@@ -17,6 +17,8 @@ from torchrl_gn.pretrained import load_pretrained
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_checkpoint
 
+pytestmark = pytest.mark.slow  # programs from start to end
+
 ROOT = Path(__file__).parents[2]
 SMALL = ("system=pendulum", "data.train=20", "data.validation=5", "data.test=5")
 

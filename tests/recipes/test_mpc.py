@@ -22,6 +22,7 @@ SMALL = ("episodes=2", "horizon=4", "gn.warm_up=2", "gn.samples=3", "gn.iteratio
 SAMPLED = ("cem.iterations=1", "cem.candidates=4", "cem.top_k=2", "mppi.iterations=1", "mppi.candidates=4")
 
 
+@pytest.mark.slow
 def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, call):
     options = (*SMALL, *SAMPLED, "mppi.top_k=2", f"run_dir={tmp_path}")
     code, output, errors = run(*options, "steps=2", "planner=[gn,random]", "video=false", recipe="mpc")
@@ -48,6 +49,7 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, cal
     assert code == 1 and "random.safetensors has 4 steps, more than steps=3" in errors
 
 
+@pytest.mark.slow
 def test_variants_start_alike_whoever_plans(tmp_path, call):
     """They are identified first, whether somebody plans with the model or not."""
     options = (*SMALL, "variants=true", "phase=5", "steps=1", "video=false", f"run_dir={tmp_path}")
@@ -71,6 +73,7 @@ def test_targets_that_are_poses(tmp_path, call):
         assert kept["now.target"].shape == (2, 10, 13) and kept["state"].shape[1] == steps + 1
 
 
+@pytest.mark.slow
 def test_an_episode_ends_where_its_simulation_becomes_unstable(tmp_path, call, monkeypatch):
     """Instead of standing still for a million each step; the others go on."""
     step, threads = SceneEnv._step, []
@@ -111,6 +114,7 @@ def test_a_system_that_explodes_is_not_identified(tmp_path, call, monkeypatch):
     assert code == 1 and "1 of 2 simulations became unstable under the 20 random controls" in errors
 
 
+@pytest.mark.slow
 def test_a_recurrent_model_plans_too_and_videos_show_plans(tmp_path, call):
     torch.manual_seed(0)
     scene = load_scene("pendulum")
@@ -140,6 +144,7 @@ def test_a_recurrent_model_plans_too_and_videos_show_plans(tmp_path, call):
     assert torch.equal(kept["foreseen"], kept["state"][0, 1:])  # of one step on the true physics, that comes true
 
 
+@pytest.mark.slow
 def test_bad_options_are_named(tmp_path, call):
     for option, message in (
         ("planner=gradient", "There is no planner 'gradient'"),

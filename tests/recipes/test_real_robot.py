@@ -37,6 +37,7 @@ def pendulum(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_double_pendulum_needs_options_alone(pendulum, call, tmp_path):
     names, run = "names={angle: q, velocity: dq, command: u}", tmp_path / "run"
     code, output, errors = call(f"log={pendulum}", names, f"run_dir={run}", *SMALL, recipe="real_robot")
@@ -57,6 +58,7 @@ def test_a_double_pendulum_needs_options_alone(pendulum, call, tmp_path):
     assert (run / "config.yaml").read_text() == before and not any((run / "feed-forward" / "checkpoint").iterdir())
 
 
+@pytest.mark.slow
 def test_a_robot_without_motors_at_other_steps(pendulum, call, tmp_path):
     names = "names={angle: q, velocity: dq, command: '', u: ''}"
     run = tmp_path / "run"

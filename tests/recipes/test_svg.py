@@ -20,6 +20,7 @@ SMALL = (
 )
 
 
+@pytest.mark.slow
 def test_a_run_is_learned_gone_on_with_and_kept_from_other_options(tmp_path, call):
     options = (*SMALL, "task.name=swimmer3", f"run_dir={tmp_path}", "logger=csv")
     code, _, errors = call(*options, "trainer.frames=80", recipe="svg")
@@ -48,6 +49,7 @@ def test_a_run_is_learned_gone_on_with_and_kept_from_other_options(tmp_path, cal
     assert (tmp_path / "checkpoint" / "checkpoint.safetensors").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "has"),
     [
@@ -64,6 +66,7 @@ def test_other_agents_and_tasks_learn_too(tmp_path, call, options, has):
     assert json.loads((tmp_path / "metrics.json").read_text())["updates"] == 4
 
 
+@pytest.mark.slow
 def test_what_cannot_be_is_one_line(tmp_path, call):
     for number, (option, message) in enumerate(
         (

@@ -123,6 +123,7 @@ def test_dynamics_of_dm_control(name):
     np.testing.assert_allclose(*trajectories, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_loading_is_silent_and_leaves_the_environment_alone():
     code = (
         "import os, sys; from torchrl_gn.scenes import SYSTEMS, load_scene\n"

@@ -38,6 +38,7 @@ def test_the_points_are_an_environment(point_env):
     check_env_specs(point_env())
 
 
+@pytest.mark.slow
 def test_svg_learns_to_hold_a_point(make_learner):
     trainer = make_learner(frames=400, updates_per_frame=0.3, target_interval=10, lr=2e-2)
     progress = spend(trainer)
@@ -57,6 +58,7 @@ def test_updates_come_at_the_stated_ratio_and_evaluations_where_they_are_due(mak
     assert all(each.evaluation is not None for each in progress if each.frames in trainer.curve.frames)
 
 
+@pytest.mark.slow
 def test_compiled_updates_are_the_same(make_learner, monkeypatch):
     # Inductor would take a minute and draw other numbers; that all is one graph is shown all the same.
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="aot_eager"))

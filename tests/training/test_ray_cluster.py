@@ -17,6 +17,8 @@ from torchrl_gn.training import OffPolicyTrainer, RayCluster
 
 pytest.importorskip("ray")
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def cluster():

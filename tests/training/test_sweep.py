@@ -36,7 +36,7 @@ def make_run(tmp_path):
     return make
 
 
-@pytest.mark.parametrize("jobs", [2, "local"])
+@pytest.mark.parametrize("jobs", [2, pytest.param("local", marks=pytest.mark.slow)])
 def test_each_runs_once_and_failures_do_not_stop_the_others(make_run, capsys, jobs):
     if jobs == "local":
         pytest.importorskip("ray")
@@ -81,7 +81,7 @@ time.sleep(300)
 """
 
 
-@pytest.mark.parametrize("jobs", [2, "local"])
+@pytest.mark.parametrize("jobs", [2, pytest.param("local", marks=pytest.mark.slow)])
 def test_an_interrupt_ends_the_runs(tmp_path, jobs):
     if jobs == "local":
         pytest.importorskip("ray")

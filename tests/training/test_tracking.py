@@ -92,6 +92,7 @@ def checkpoint(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_offline_wandb_run_holds_everything(tmp_path, monkeypatch, picture, video, checkpoint):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")

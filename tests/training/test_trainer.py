@@ -24,6 +24,7 @@ def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
         assert torch.equal(a[name], b[name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["muon", "adam"])
 def test_the_loss_falls(make_trainer, preset):
     trainer = make_trainer(Budget(steps=200), preset=preset, noise=0.0)

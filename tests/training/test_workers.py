@@ -25,6 +25,7 @@ def results(tmp_path_factory) -> list[dict[str, dict[str, torch.Tensor]]]:
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_all_end_with_the_same_weights_and_statistics(results, preset):
     first, second = (result[preset] for result in results)
@@ -32,6 +33,7 @@ def test_all_end_with_the_same_weights_and_statistics(results, preset):
         assert torch.equal(first[name], second[name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_one_process_trains_the_same_but_for_rounding(results, preset):
     alone, together = train(Workers(), preset), results[0][preset]
