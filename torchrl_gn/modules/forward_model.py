@@ -241,6 +241,14 @@ class ForwardModel(nn.Module):
             "globals_": self.static_global_normalizer,
         }
 
+    @property
+    def fitted(self) -> bool:
+        """Whether the normalisers of all that the model reads and predicts have seen data. Waits for the device."""
+        read = [self.node_normalizer, self.edge_normalizer, self.residual_normalizer, self.delta_normalizer]
+        if self.static == "scene":  # an inferred graph is read as it is
+            read += self.static_normalizers.values()
+        return all(normalizer.fitted for normalizer in read)
+
     def values_of(self, scene: Scene) -> SceneValues:
         """What the model reads of a scene; zeros where it reads an inferred graph.
 
