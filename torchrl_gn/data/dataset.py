@@ -140,7 +140,6 @@ def create_dataset(
         if files.exists():
             manifest = files.read()
             _check_same(files, manifest, request)
-            _check_model(files, manifest, scene)
             files.verify(manifest)
         else:
             manifest = {
@@ -171,8 +170,8 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
         verify: compare every file with its checksums (reads all of it once).
 
     Raises:
-        DatasetError: it is missing, unfinished, damaged, of another scene, of another MJCF of it or made by a newer
-            version of this library. The message names the file and what to do.
+        DatasetError: it is missing, unfinished, damaged, of another scene, of other physics of it or made by an older
+            or newer version of this library. The message names the file and what to do.
     """
     files = DatasetFiles(Path(path))
     manifest = files.read()
@@ -196,8 +195,6 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
             f"(fingerprint {manifest['request']['fingerprint']}), not of {scene.name!r} "
             f"({scene.fingerprint()}). Load the data set of that scene, or create one in another folder."
         )
-    else:
-        _check_model(files, manifest, scene)
     return _open(files, manifest, scene)
 
 
@@ -323,16 +320,6 @@ def _check_same(files: DatasetFiles, manifest: dict, request: dict) -> None:
         what = ", ".join(f"{key} is {there.get(key)}, not {request[key]}" for key in differing)
         raise DatasetError(
             f"{files.manifest_path}: another data set is there ({what}). Use another folder, or delete this one."
-        )
-
-
-def _check_model(files: DatasetFiles, manifest: dict, scene: Scene) -> None:
-    """Refuse an edited model: friction, contacts, tendons, ... are in no fingerprint."""
-    there = manifest["description"] or {}
-    if any(there[key] != scene.origin[key] for key in ("mjcf", "assets") if key in there and key in scene.origin):
-        raise DatasetError(
-            f"{files.manifest_path}: another data set is there: the MJCF of {scene.name!r}, or a file that it reads,"
-            " changed since. Use another folder, or delete this one."
         )
 
 
