@@ -198,7 +198,15 @@ def _newer(folder: Path) -> Path:
     return file
 
 
-@pytest.mark.parametrize("damage", [_truncate, _extend, _flip, _remove, _break_manifest, _drop_from_manifest, _newer])
+def _older(folder: Path) -> Path:
+    file = folder / "manifest.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "format": 2}))
+    return file
+
+
+@pytest.mark.parametrize(
+    "damage", [_truncate, _extend, _flip, _remove, _break_manifest, _drop_from_manifest, _newer, _older]
+)
 def test_damaged_is_refused_named_and_kept(damage, tmp_path: Path, pendulum: Scene) -> None:
     create_dataset(tmp_path / "d", pendulum, **SIZES)
     file = damage(tmp_path / "d")
