@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -154,17 +153,6 @@ def test_damaged_and_other_data_are_refused(tmp_path: Path) -> None:
     file.write_bytes(content)
     with pytest.raises(DatasetError, match="nodes.bin.*do not have their checksum"):
         load_dataset(tmp_path / "d")
-
-
-def test_a_data_set_of_one_scene_made_before_variants_is_still_read(tmp_path: Path) -> None:
-    scene = load_scene("pendulum")
-    made = create_dataset(tmp_path / "d", scene, **SIZES)
-    assert "static" not in made.train and made.scene_of("train", 2) is scene
-    file = tmp_path / "d" / "manifest.json"
-    manifest = json.loads(file.read_text())
-    del manifest["request"]["variants"], manifest["request"]["parameters"]
-    file.write_text(json.dumps({**manifest, "format": 1}))
-    assert _equal(create_dataset(tmp_path / "d", scene, **SIZES).train, made.train)
 
 
 def test_scenes_without_variants_are_refused(tmp_path: Path, swimmer: Scene) -> None:

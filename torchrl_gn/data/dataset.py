@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from operator import index
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, simulati
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.errors import SceneError
+from torchrl_gn.scenes.feature_set import FeatureSet
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.scene_values import SceneValues
@@ -44,6 +45,9 @@ class TrajectoryDataset:
         test: sequences to report errors on.
         rejected: for each split, how many simulations were unstable and drawn again.
         manifest: the data set's manifest: seed, steps, package versions, checksums.
+        features: names of the static features in ``static``, for :meth:`ForwardModel.bind
+            <torchrl_gn.modules.ForwardModel.bind>`: those of this version of the library, in its order, that the data
+            set was made with; None if it is not of variants.
     """
 
     scene: Scene
@@ -52,6 +56,7 @@ class TrajectoryDataset:
     test: TensorDict
     rejected: dict[str, int]
     manifest: dict = field(repr=False)
+    features: FeatureSet | None = field(default=None, repr=False)
 
     def scene_of(self, split: str, index: int) -> Scene:
         """The scene of one sequence, built again if it is a variant.
@@ -140,7 +145,6 @@ def create_dataset(
         if files.exists():
             manifest = files.read()
             _check_same(files, manifest, request)
-            _check_model(files, manifest, scene)
             files.verify(manifest)
         else:
             manifest = {
@@ -153,6 +157,7 @@ def create_dataset(
                     "physics": [steps + 1, scene.physics_size],
                     **({} if ranges is None else _variant_entries(scene, len(ranges))),
                 },
+                "features": None if ranges is None else asdict(FeatureSet.of(scene)),
                 "versions": simulation_versions(),
                 "chunks": {split: [] for split in SPLITS},
             }
@@ -171,8 +176,8 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
         verify: compare every file with its checksums (reads all of it once).
 
     Raises:
-        DatasetError: it is missing, unfinished, damaged, of another scene, of another MJCF of it or made by a newer
-            version of this library. The message names the file and what to do.
+        DatasetError: it is missing, unfinished, damaged, of another scene, of other physics of it or made by an older
+            or newer version of this library. The message names the file and what to do.
     """
     files = DatasetFiles(Path(path))
     manifest = files.read()
@@ -196,8 +201,6 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
             f"(fingerprint {manifest['request']['fingerprint']}), not of {scene.name!r} "
             f"({scene.fingerprint()}). Load the data set of that scene, or create one in another folder."
         )
-    else:
-        _check_model(files, manifest, scene)
     return _open(files, manifest, scene)
 
 
@@ -219,7 +222,15 @@ def _collect_missing(
     done = sum(min(len(manifest["chunks"][split]) * CHUNK, size) for split, size in request["sizes"].items())
     chunks = list(_missing_chunks(manifest, scene))
     collector = _ChunkCollector(scene, request["steps"], request["seed"], request["knot_interval"], num_threads)
+    stored, here = _stored_features(manifest), FeatureSet.of(scene)
+    if stored and (missing := stored.missing_in(here)):
+        raise DatasetError(
+            f"{files.manifest_path}: the data set was begun with static features {missing}, which this version of"
+            " torchrl_gn does not have. Finish it with that version, or use another folder."
+        )
     for chunk, (data, rejected) in zip(chunks, map_chunks(collector, chunks), strict=True):
+        if stored:
+            _take_columns(data, stored.columns_in(here))
         arrays = {name: data.get(tuple(name.split("/"))).numpy() for name in manifest["entries"]}
         files.append(manifest, SPLITS[chunk.key[0]], arrays, rejected)
         done += chunk.count
@@ -313,7 +324,25 @@ def _variant_entries(scene: Scene, parameters: int) -> dict[str, list[int]]:
 def _open(files: DatasetFiles, manifest: dict, scene: Scene) -> TrajectoryDataset:
     rejected = {split: sum(chunk["rejected"] for chunk in chunks) for split, chunks in manifest["chunks"].items()}
     splits = {split: files.open(manifest, split) for split in SPLITS}
-    return TrajectoryDataset(scene=scene, rejected=rejected, manifest=manifest, **splits)
+    features = _stored_features(manifest)
+    if features:
+        # In the order in which samples that are collected now have them.
+        stored, features = features, FeatureSet.of(scene).common(features)
+        for data in splits.values():
+            _take_columns(data, features.columns_in(stored))
+    return TrajectoryDataset(scene=scene, rejected=rejected, manifest=manifest, features=features, **splits)
+
+
+def _stored_features(manifest: dict) -> FeatureSet | None:
+    return None if manifest["features"] is None else FeatureSet.from_names(manifest["features"])
+
+
+def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
+    """Keep some columns of the static features, in another order; what is right already stays mapped from disk."""
+    for part, wanted in columns.items():
+        values = data["static", part]
+        if wanted != list(range(values.shape[-1])):
+            data["static", part] = values[..., wanted]
 
 
 def _check_same(files: DatasetFiles, manifest: dict, request: dict) -> None:
@@ -323,16 +352,6 @@ def _check_same(files: DatasetFiles, manifest: dict, request: dict) -> None:
         what = ", ".join(f"{key} is {there.get(key)}, not {request[key]}" for key in differing)
         raise DatasetError(
             f"{files.manifest_path}: another data set is there ({what}). Use another folder, or delete this one."
-        )
-
-
-def _check_model(files: DatasetFiles, manifest: dict, scene: Scene) -> None:
-    """Refuse an edited model: friction, contacts, tendons, ... are in no fingerprint."""
-    there = manifest["description"] or {}
-    if any(there[key] != scene.origin[key] for key in ("mjcf", "assets") if key in there and key in scene.origin):
-        raise DatasetError(
-            f"{files.manifest_path}: another data set is there: the MJCF of {scene.name!r}, or a file that it reads,"
-            " changed since. Use another folder, or delete this one."
         )
 
 

@@ -27,9 +27,9 @@ from tensordict import TensorDict
 
 from torchrl_gn.data.errors import DatasetError
 
-FORMAT = 2
+FORMAT = 3
 SPLITS = ("train", "validation", "test")
-_KEYS = {"format", "request", "description", "entries", "versions", "chunks"}
+_KEYS = {"format", "request", "description", "entries", "features", "versions", "chunks"}
 
 
 def simulation_versions() -> dict[str, str]:
@@ -92,7 +92,7 @@ class DatasetFiles:
         """The manifest.
 
         Raises:
-            DatasetError: it is missing, damaged or of a newer format.
+            DatasetError: it is missing, damaged or of another format.
         """
         try:
             manifest = json.loads(self.manifest_path.read_text(encoding="utf-8"))
@@ -106,8 +106,13 @@ class DatasetFiles:
             raise DatasetError(f"{self.manifest_path}: damaged (no format number). {_REMEDY}")
         if manifest["format"] > FORMAT:
             raise DatasetError(
-                f"{self.manifest_path}: format {manifest['format']} is newer than {FORMAT}, the newest that "
+                f"{self.manifest_path}: format {manifest['format']} is newer than {FORMAT}, the only one that "
                 "this version reads. Update torchrl_gn."
+            )
+        if manifest["format"] < FORMAT:
+            raise DatasetError(
+                f"{self.manifest_path}: format {manifest['format']} is older than {FORMAT}, the only one that this "
+                "version reads. Delete the data set's folder and create it again, with the same seed, or use another."
             )
         if missing := _KEYS - manifest.keys():
             raise DatasetError(f"{self.manifest_path}: damaged (no {sorted(missing)}). {_REMEDY}")

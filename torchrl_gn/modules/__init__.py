@@ -6,7 +6,6 @@ from torchrl_gn.modules.bound_forward_model import BoundForwardModel as BoundFor
 from torchrl_gn.modules.bound_recurrent_model import BoundRecurrentModel as BoundRecurrentModel
 from torchrl_gn.modules.core import GNCore as GNCore
 from torchrl_gn.modules.export import export_step as export_step
-from torchrl_gn.modules.forward_model import FeatureSet as FeatureSet
 from torchrl_gn.modules.forward_model import ForwardModel as ForwardModel
 from torchrl_gn.modules.gn_block import GNBlock as GNBlock
 from torchrl_gn.modules.graph import Graph as Graph
@@ -35,3 +34,4 @@ from torchrl_gn.modules.state_layout import StateLayout as StateLayout
 from torchrl_gn.modules.state_layout import joint_layout as joint_layout
 from torchrl_gn.modules.swimmer_observation import SwimmerObservation as SwimmerObservation
 from torchrl_gn.modules.unseen_features import UnseenFeatureWarning as UnseenFeatureWarning
+from torchrl_gn.scenes import FeatureSet as FeatureSet

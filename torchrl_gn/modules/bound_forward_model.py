@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from torchrl_gn.modules.folded_core import FoldedCore
     from torchrl_gn.modules.forward_model import ForwardModel
     from torchrl_gn.modules.mlp_core import FoldedMLP
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import FeatureSet, Scene
 
 
 class Folded(NamedTuple):
@@ -67,6 +67,7 @@ class BoundForwardModel(TensorDictModuleBase):
         state_key: where to read the state.
         action_key: where to read the action.
         static_key: where to read each sample's static values; None: they are the scene's.
+        static_features: names of the static features that samples bring there; None: all that the scene has.
 
     Raises:
         ValueError: if the scene lacks features that the model reads, or is a variant whose parameters must be hidden
@@ -86,6 +87,7 @@ class BoundForwardModel(TensorDictModuleBase):
         state_key: NestedKey = "state",
         action_key: NestedKey = "action",
         static_key: NestedKey | None = None,
+        static_features: FeatureSet | None = None,
     ) -> None:
         super().__init__()
         self.static_key = static_key
@@ -119,7 +121,13 @@ class BoundForwardModel(TensorDictModuleBase):
         self.linking = make_linking(scene) if model.link and pinned and not hidden else None
         self.arm_length = scene.linkage.arm_length
         self.statics = StaticValues(
-            model.values_of(scene), model.static, static_key, linked=self.linking is not None, scene=scene
+            model.values_of(scene),
+            model.static,
+            static_key,
+            linked=self.linking is not None,
+            scene=scene,
+            reads=model.features,
+            brought=static_features,
         )
         self.to(model.residual_normalizer.mean.device)
         check_seen(self, self.values, scene.name, stacklevel=4)
@@ -151,7 +159,7 @@ class BoundForwardModel(TensorDictModuleBase):
             )
         values = self.model.values_of(scene)
         check_seen(self, values, scene.name, stacklevel=3)
-        return values.tensordict().to(self.live.device)
+        return self.statics.of(scene, values)
 
     @property
     def network_dtype(self) -> torch.dtype:

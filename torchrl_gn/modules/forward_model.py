@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tensordict.utils import NestedKey
@@ -20,6 +20,7 @@ from torchrl_gn.modules.mlp_core import FoldedMLP, MLPCore
 from torchrl_gn.modules.normalizer import Normalizer
 from torchrl_gn.modules.recurrent_core import RecurrentCore
 from torchrl_gn.modules.state_layout import BODY_STATE, Component, Encoding, StateLayout
+from torchrl_gn.scenes.feature_set import FeatureSet
 from torchrl_gn.scenes.scene_values import SceneValues
 
 if TYPE_CHECKING:
@@ -35,42 +36,6 @@ CoreKind = Literal[
 _DYNAMIC_FLOOR = 1e-9
 # Bodies this many spreads from all that training saw are shown as if they were that far only.
 _STATIC_LIMIT = 20.0
-
-
-@dataclass(frozen=True)
-class FeatureSet:
-    """Names of the static features that a model reads, column by column.
-
-    Attributes:
-        nodes: names of the static node features.
-        edges: names of the static edge features.
-        globals_: names of the static global features.
-    """
-
-    nodes: tuple[str, ...] = ()
-    edges: tuple[str, ...] = ()
-    globals_: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, scene: Scene) -> FeatureSet:
-        """The static features that a scene has."""
-        static = scene.static
-        return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
-
-    def select(self, scene: Scene) -> SceneValues:
-        """The numbers of a scene, of its static features only these.
-
-        Raises:
-            ValueError: if the scene lacks one.
-        """
-        values, there = SceneValues.of(scene), asdict(FeatureSet.of(scene))
-        columns = {}
-        for part, wanted in asdict(self).items():
-            missing = [name for name in wanted if name not in there[part]]
-            if missing:
-                raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")
-            columns[part] = getattr(values, part)[..., [there[part].index(name) for name in wanted]]
-        return values._replace(**columns)
 
 
 class ForwardModel(nn.Module):
@@ -241,6 +206,14 @@ class ForwardModel(nn.Module):
             "globals_": self.static_global_normalizer,
         }
 
+    @property
+    def fitted(self) -> bool:
+        """Whether the normalisers of all that the model reads and predicts have seen data. Waits for the device."""
+        read = [self.node_normalizer, self.edge_normalizer, self.residual_normalizer, self.delta_normalizer]
+        if self.static == "scene":  # an inferred graph is read as it is
+            read += self.static_normalizers.values()
+        return all(normalizer.fitted for normalizer in read)
+
     def values_of(self, scene: Scene) -> SceneValues:
         """What the model reads of a scene; zeros where it reads an inferred graph.
 
@@ -257,7 +230,13 @@ class ForwardModel(nn.Module):
         return values._replace(**zeros)
 
     def bind(
-        self, scene: Scene, *, strict: bool = False, plain: bool = False, static_key: NestedKey | None = None
+        self,
+        scene: Scene,
+        *,
+        strict: bool = False,
+        plain: bool = False,
+        static_key: NestedKey | None = None,
+        static_features: FeatureSet | None = None,
     ) -> BoundForwardModel:
         """Join these weights to a scene.
 
@@ -268,15 +247,22 @@ class ForwardModel(nn.Module):
             plain: evaluate the core as the paper writes it, slowly: the reference for all that is faster.
             static_key: where each sample has its own static values (a variant's, or inferred); None: all have the
                 scene's.
+            static_features: names of the static features that samples bring there, a data set's ``features``, from
+                which the model takes its own by name. Default: all that the scene has, as samples of this version of
+                the library bring them.
 
         Returns:
             TensorDict module ``state, action -> ("next", "state")`` that shares these weights.
+
+        Raises:
+            ValueError: if the scene, or what samples bring, lacks features that the model reads; or with ``strict``.
         """
         from torchrl_gn.modules.bound_forward_model import BoundForwardModel
         from torchrl_gn.modules.bound_recurrent_model import BoundRecurrentModel
 
         kind = BoundRecurrentModel if isinstance(self.core, RecurrentCore) else BoundForwardModel
-        return kind(self, scene, strict=strict, plain=plain, static_key=static_key)
+        options = {"strict": strict, "plain": plain, "static_key": static_key, "static_features": static_features}
+        return kind(self, scene, **options)
 
     def fold(self, static: Graph, incidence: Incidence) -> FoldedCore | FoldedMLP | UnfoldedCore:
         """The core for one scene, differentiable in the weights.
@@ -306,6 +292,6 @@ class ForwardModel(nn.Module):
     @classmethod
     def from_description(cls, description: dict) -> ForwardModel:
         """Build the model that :meth:`description` described, with fresh weights."""
-        features = FeatureSet(**{key: tuple(names) for key, names in description["features"].items()})
+        features = FeatureSet.from_names(description["features"])
         layout = StateLayout(tuple(Component(**component) for component in description["layout"]["components"]))
         return cls(features, layout=layout, **description["options"])

@@ -53,6 +53,11 @@ class Normalizer(Float64Buffers):
         self.register_load_state_dict_post_hook(_refresh_derived)
 
     @property
+    def fitted(self) -> bool:
+        """Whether it has seen data, or has no features. Waits for the device: not for every step."""
+        return self.size == 0 or bool((self.count > 0).any())
+
+    @property
     def constant(self) -> Tensor:
         """``[F]`` bool, features that never varied in what was seen."""
         return self.std == 0

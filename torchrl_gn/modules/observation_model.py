@@ -64,6 +64,12 @@ class ObservationModel(TensorDictModuleBase):
         return model
 
     @property
+    def fitted(self) -> bool:
+        """Whether the normalisers have seen data. Waits for the device."""
+        changes = self.change_normalizer, self.global_change_normalizer
+        return self.network.fitted and all(each.fitted for each in changes)
+
+    @property
     def change_std(self) -> Tensor:
         """``[O]`` spread of each number's change, 0 where it never varied."""
         return self._flat(self.change_normalizer.std, self.global_change_normalizer.std)

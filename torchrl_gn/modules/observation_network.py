@@ -101,6 +101,11 @@ class ObservationNetwork(nn.Module):
         network.graph, network.places = graph, _Places(graph).to(self.places.slots.device)
         return network
 
+    @property
+    def fitted(self) -> bool:
+        """Whether the normalisers have seen data. Waits for the device."""
+        return all(each.fitted for each in (self.node_normalizer, self.edge_normalizer, self.global_normalizer))
+
     @torch.no_grad()
     def update_normalizers(self, observation: Tensor, action: Tensor | None = None) -> None:
         """Take observations ``[*B, O]`` and actions ``[*B, A]`` into the statistics.

@@ -74,7 +74,12 @@ class SpecializedForwardModel(BoundForwardModel):
         with warnings.catch_warnings():  # the bound model has warned
             warnings.simplefilter("ignore", UnseenFeatureWarning)
             super().__init__(
-                bound.model, bound.scene, state_key=state_key, action_key=action_key, static_key=bound.static_key
+                bound.model,
+                bound.scene,
+                state_key=state_key,
+                action_key=action_key,
+                static_key=bound.static_key,
+                static_features=bound.statics.brought,
             )
         self.strict = bound.strict
         if compile and bound.live.device.type == "cpu":

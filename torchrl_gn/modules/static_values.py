@@ -8,12 +8,13 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_gn.modules.float64_buffers import Float64Buffers
+from torchrl_gn.scenes.feature_set import FeatureSet
 from torchrl_gn.scenes.scene_values import SceneValues
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
 
-_INFERRED = ("nodes", "edges", "globals_")
+_PARTS = ("nodes", "edges", "globals_")
 _PINS = ("parent_arm", "arm")
 
 
@@ -26,13 +27,38 @@ class StaticValues(Float64Buffers):
         key: where samples bring their own; None: they are the scene's.
         linked: whether the model links bodies, for which it needs their pins.
         scene: the scene.
+        reads: names of the static features that the model reads.
+        brought: names of those that samples bring; None: all that the scene has.
+
+    Raises:
+        ValueError: if samples do not bring what the model reads.
     """
 
-    def __init__(self, own: SceneValues, kind: str, key: NestedKey | None, *, linked: bool, scene: Scene) -> None:
+    def __init__(
+        self,
+        own: SceneValues,
+        kind: str,
+        key: NestedKey | None,
+        *,
+        linked: bool,
+        scene: Scene,
+        reads: FeatureSet,
+        brought: FeatureSet | None = None,
+    ) -> None:
         super().__init__()
         self.kind, self.key, self.scene = kind, key, scene
-        self.inferred = (*_INFERRED, *_PINS) if linked else _INFERRED
+        self.inferred = (*_PARTS, *_PINS) if linked else _PARTS
         self.constants(own._asdict())
+        self.brought = (FeatureSet.of(scene) if brought is None else brought) if kind == "scene" else reads
+        if missing := reads.missing_in(self.brought):
+            raise ValueError(
+                f"The model reads the static features {missing}, which samples of {scene.name!r} do not bring. Collect"
+                " them anew, or build the model with the features of their data set."
+            )
+        # Where both have the same columns, nothing is gathered.
+        self.columns = None if reads == self.brought else tuple(f"{part}_columns" for part in _PARTS)
+        if self.columns is not None:
+            self.constants(dict(zip(self.columns, reads.columns_in(self.brought).values(), strict=True)))
 
     @property
     def own(self) -> SceneValues:
@@ -41,8 +67,19 @@ class StaticValues(Float64Buffers):
 
     def entries(self) -> TensorDict:
         """What a sample of the scene itself brings, without batch; zeros of an inferred graph."""
-        own = self.own.tensordict()
-        return own.select(*self.inferred) if self.kind == "inferred" else own
+        if self.kind == "inferred":
+            return self.own.tensordict().select(*self.inferred)
+        return self._brought_by(self.scene).tensordict().to(self.own.nodes.device)
+
+    def of(self, scene: Scene, values: SceneValues) -> TensorDict:
+        """What a sample of a variant brings, without batch; zeros, the model's ``values``, of an inferred graph."""
+        brought = self._brought_by(scene) if self.kind == "scene" else values
+        return brought.tensordict().to(self.own.nodes.device)
+
+    def _brought_by(self, scene: Scene) -> SceneValues:
+        if scene is self.scene and self.columns is None:
+            return self.own
+        return self.brought.select(scene)
 
     def read(self, static: TensorDictBase | None) -> SceneValues:
         """Numbers that samples bring, or the scene's own.
@@ -64,7 +101,27 @@ class StaticValues(Float64Buffers):
                     f"The model links bodies where an inference model finds their pins; {sorted(wanted - given)} are"
                     " missing. Give what this model's own inference model wrote."
                 )
-        return SceneValues.read(static, self.own)
+        return SceneValues.read(self._selected(static), self.own)
+
+    def _selected(self, static: TensorDictBase) -> TensorDictBase:
+        """Of the static features that samples bring those that the model reads."""
+        if self.kind != "scene":
+            return static
+        selected = static
+        for index, part in enumerate(_PARTS):
+            given, names = static.get(part, None), getattr(self.brought, part)
+            if given is None:
+                continue
+            if given.shape[-1] != len(names):
+                raise ValueError(
+                    f"Samples have {given.shape[-1]} static features in {part!r}, not the {len(names)} of scene"
+                    f" {self.scene.name!r}. Of a data set made with others give their names:"
+                    " bind(..., static_features=dataset.features)."
+                )
+            if self.columns is not None:
+                selected = static.copy() if selected is static else selected
+                selected.set(part, given[..., getattr(self, self.columns[index])])
+        return selected
 
     def find(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """The static values that samples bring; None where they are the scene's own.
@@ -90,14 +147,15 @@ class StaticValues(Float64Buffers):
         return None
 
     def _refuse_others(self, static: TensorDictBase) -> None:
-        for name, own in self.own._asdict().items():
+        for name, own in self._brought_by(self.scene)._asdict().items():
             given = static.get(name, None)
             if given is None:
                 continue
+            own = own.to(given.device)
             if given.shape[-1] != own.shape[-1]:  # all features of a scene, not only those that the model reads
-                own = getattr(SceneValues.of(self.scene), name).to(own.device)
+                own = getattr(SceneValues.of(self.scene), name).to(given.device)
             alike = given.shape[-1] == own.shape[-1]
-            if alike and bool((given.to(own.device) - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
+            if alike and bool((given - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
                 continue
             raise ValueError(
                 f"Samples have other static {name!r} than scene {self.scene.name!r}, which the model is bound to."

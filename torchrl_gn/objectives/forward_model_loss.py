@@ -20,6 +20,12 @@ from torchrl_gn.modules import (
     SpecializedForwardModel,
     quaternion,
 )
+from torchrl_gn.objectives.fitted import require_fitted
+
+FIT_NORMALIZERS = (
+    "Call fit_normalizers(transitions) of the loss with some thousands of clean transitions [B], once before training;"
+    " trajectory_buffer(trajectories, batch_size=5000).sample() draws them."
+)
 
 
 class ForwardModelLoss(LossModule):
@@ -56,7 +62,12 @@ class ForwardModelLoss(LossModule):
     static values ``[B, (H)]`` of every sample, the same for a whole window.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
+
+    Call :meth:`fit_normalizers` once before training. To go on from a trained model, whose statistics came with its
+    weights, nothing need be fitted without noise; with noise, or on other scenes, call :meth:`fit_scales`.
     """
+
+    _fitted = False  # until asked once: reading statistics waits for the device
 
     @dataclass
     class _AcceptedKeys:
@@ -126,9 +137,26 @@ class ForwardModelLoss(LossModule):
         Args:
             tensordict: ``[B]`` clean transitions, some thousands.
         """
-        model, layout = self.model, self.model.layout
+        model = self.model
         state, action, next_state = self._read(tensordict)
         static = self._read_static(tensordict) if model.model.static == "scene" else None
+        noisy = self._fit_scales(state, next_state)
+        model.update_static_normalizers(static)
+        model.update_dynamic_normalizers(noisy, action, next_state, static)
+
+    @torch.no_grad()
+    def fit_scales(self, tensordict: TensorDictBase) -> None:
+        """Set this loss's scales of noise and errors alone, to go on from a trained model.
+
+        Args:
+            tensordict: ``[B]`` clean transitions, some thousands.
+        """
+        state, _, next_state = self._read(tensordict)
+        self._fit_scales(state, next_state)
+
+    def _fit_scales(self, state: Tensor, next_state: Tensor) -> Tensor:
+        """Measure scales; the states with noise."""
+        model, layout = self.model, self.model.layout
         clean = Normalizer(layout.size, floor=1e-9)
         clean.update(self.model.frame.recentered(state)[..., model.incidence.predicted, :].cpu())
         scale = torch.ones(layout.delta_size, dtype=torch.float64)
@@ -137,12 +165,11 @@ class ForwardModelLoss(LossModule):
                 scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]]
         self.noise_scale.copy_(scale)
         noisy = self._perturb(state)
-        model.update_static_normalizers(static)
-        model.update_dynamic_normalizers(noisy, action, next_state, static)
         # The model's statistics are of all scenes that share it, and would make light of errors in slow ones.
         change = Normalizer(layout.delta_size, floor=1e-9)
         change.update(layout.delta(noisy, next_state).cpu(), model.live.cpu())
         self.error_weight.copy_(change.inverse_std)
+        return noisy
 
     def training_state(self) -> dict:
         """What a training that goes on later needs of this loss."""
@@ -164,7 +191,9 @@ class ForwardModelLoss(LossModule):
         Raises:
             KeyError: if the batch lacks an entry.
             ValueError: if an entry has a wrong shape, or holds NaN or Inf.
+            RuntimeError: if the model's normalisers have seen no data, or the noise has no scale.
         """
+        self._require_fitted()
         state, action, next_state = self._read(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
@@ -188,6 +217,17 @@ class ForwardModelLoss(LossModule):
             f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)
         }
         return TensorDict({"loss_forward_model": loss, **out}, [])
+
+    def _require_fitted(self) -> None:
+        if self._fitted or torch.compiler.is_compiling():
+            return
+        require_fitted(self, self.trained, remedy=FIT_NORMALIZERS)
+        if self.noise and not bool(self.noise_scale.any()):
+            raise RuntimeError(
+                f"{type(self).__name__}: noise={self.noise} is in standard deviations of the states, which are not"
+                " known. Call fit_scales(transitions) with some thousands of clean transitions [B], or use noise=0."
+            )
+        self._fitted = True
 
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         state, action, next_state = (tensordict.get(key) for key in self.in_keys[:3])

@@ -10,7 +10,8 @@ from torchrl.objectives import LossModule
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import BoundForwardModel, BoundInferenceModel, IdentifyingModel
-from torchrl_gn.objectives.forward_model_loss import ForwardModelLoss
+from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 from torchrl_gn.scenes import Scene
 
 
@@ -41,6 +42,7 @@ class IdentificationLoss(LossModule):
 
     prediction: ForwardModelLoss
     inference: BoundInferenceModel
+    _fitted = False  # until asked once: reading statistics waits for the device
 
     def __init__(
         self,
@@ -91,13 +93,21 @@ class IdentificationLoss(LossModule):
         """Set the models' normalisers from clean transitions ``[B]``, some thousands; once before training."""
         self.prediction.fit_normalizers(tensordict.select(*self.in_keys))
 
+    def fit_scales(self, tensordict: TensorDictBase) -> None:
+        """Set the loss's scales alone, to go on from trained models; see :meth:`ForwardModelLoss.fit_scales`."""
+        self.prediction.fit_scales(tensordict.select(*self.in_keys))
+
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Loss of a batch of sequences.
 
         Raises:
             KeyError: if the batch lacks an entry.
             ValueError: if it has no steps to predict, a shape is wrong, or it holds NaN or Inf.
+            RuntimeError: if the models' normalisers have seen no data, or noise has no scale.
         """
+        if not (self._fitted or torch.compiler.is_compiling()):
+            require_fitted(self, self.trained, remedy=FIT_NORMALIZERS)
+            self._fitted = True
         length = tensordict.shape[1] if tensordict.ndim == 2 else 0
         window, rest = divmod(max(length - self.phase, 0), self.parts)
         if window < 1 or rest:

@@ -12,6 +12,12 @@ from torchrl.objectives import LossModule
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import LearnedReward, ObservationModel
+from torchrl_gn.objectives.fitted import require_fitted
+
+UPDATE_NORMALIZERS = (
+    "Call update_normalizers(observation, action, next_observation) of the Agent, or of the model, with collected"
+    " transitions first."
+)
 
 
 class ObservationModelLoss(LossModule):
@@ -46,6 +52,7 @@ class ObservationModelLoss(LossModule):
     default_keys = _AcceptedKeys
     model: ObservationModel
     reward: LearnedReward | None
+    _fitted = False  # until asked once: reading statistics waits for the device
 
     def __init__(self, model: ObservationModel, reward: LearnedReward | None = None) -> None:
         super().__init__()
@@ -84,7 +91,11 @@ class ObservationModelLoss(LossModule):
         Raises:
             KeyError: if an entry is missing.
             ValueError: if a number is not finite, or rewards have another shape than those predicted.
+            RuntimeError: if the model's normalisers have seen no data.
         """
+        if not (self._fitted or torch.compiler.is_compiling()):
+            require_fitted(self, self.model, remedy=UPDATE_NORMALIZERS)
+            self._fitted = True
         observation, action, next_observation, *rewards = self._read(tensordict)
         inverse = torch.where(self.model.change_std > 0, 1 / self.model.change_std, 0).to(observation.dtype)
         target = (next_observation - observation) * inverse

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from torchrl_gn.modules import ForwardModel
-from torchrl_gn.objectives.forward_model_loss import ForwardModelLoss
+from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 
 
 class SeveralScenesLoss(LossModule):
@@ -33,6 +34,7 @@ class SeveralScenesLoss(LossModule):
     """
 
     losses: nn.ModuleList
+    _fitted = False  # until asked once: reading statistics waits for the device
 
     def __init__(self, losses: Sequence[ForwardModelLoss]) -> None:
         super().__init__()
@@ -77,14 +79,25 @@ class SeveralScenesLoss(LossModule):
         for loss, batch in zip(self.of_scenes, self._parts(batches), strict=True):
             loss.fit_normalizers(batch)
 
+    def fit_scales(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> None:
+        """Set every loss's scales alone, to go on from a trained model; see :meth:`ForwardModelLoss.fit_scales`."""
+        for loss, batch in zip(self.of_scenes, self._parts(batches), strict=True):
+            loss.fit_scales(batch)
+
     def forward(self, tensordict: TensorDictBase | Sequence[TensorDictBase]) -> TensorDict:
         """Loss of a sub-batch of every scene.
 
         Raises:
             KeyError: if a sub-batch lacks an entry.
             ValueError: if there is not one for every scene, an entry has a wrong shape, or holds NaN or Inf.
+            RuntimeError: if the model's normalisers have seen no data, or noise has no scale.
         """
-        outs = [loss(part) for loss, part in zip(self.of_scenes, self._parts(tensordict), strict=True)]
+        parts = self._parts(tensordict)
+        if not (self._fitted or torch.compiler.is_compiling()):
+            remedy = FIT_NORMALIZERS.replace("transitions [B]", "transitions [B] of each scene")
+            require_fitted(self, self.trained, remedy=remedy)
+            self._fitted = True
+        outs = [loss(part) for loss, part in zip(self.of_scenes, parts, strict=True)]
         means: dict[str, Tensor] = {key: torch.stack([out[key] for out in outs]).mean() for key in outs[0].keys()}
         own = {f"scene_{name}": out["loss_forward_model"].detach() for name, out in zip(self.names, outs, strict=True)}
         return TensorDict({**means, **own}, [])

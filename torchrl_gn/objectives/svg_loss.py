@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, cast
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
@@ -14,6 +15,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss
 
 from torchrl_gn.modules.weights import frozen, with_weights
+from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.objectives.observation_model_loss import UPDATE_NORMALIZERS
 
 ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Reward ``[*B, 1]`` of observations, actions and next observations."""
@@ -64,6 +67,7 @@ class SVGLoss(DDPGLoss):
     deterministic_sampling_mode: Any = ExplorationType.RANDOM  # actions are drawn
     model: TensorDictModuleBase | None
     reward: ObservedReward | None
+    _fitted = False  # until asked once: reading statistics waits for the device
 
     def __init__(
         self,
@@ -115,7 +119,12 @@ class SVGLoss(DDPGLoss):
         return self
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Loss of the value, and what to read along."""
+        """Loss of the value, and what to read along.
+
+        Raises:
+            RuntimeError: if normalisers of policy, value or model have seen no data.
+        """
+        self._require_fitted()
         with set_exploration_type(self.deterministic_sampling_mode):  # as in forward, where it is called alone
             return super().loss_value(tensordict)
 
@@ -124,7 +133,9 @@ class SVGLoss(DDPGLoss):
 
         Raises:
             ValueError: if the reward of an imagined step has another shape than ``[*B, 1]``.
+            RuntimeError: if normalisers of policy, value or model have seen no data.
         """
+        self._require_fitted()
         weights = self._maybe_get_priority_weight(tensordict)
         keys = [*self.actor_in_keys, *self.value_exclusive_keys]
         now = tensordict.select(*keys, *self._carried, strict=False).detach()
@@ -150,6 +161,13 @@ class SVGLoss(DDPGLoss):
             "actor_network_params",
         )
         return loss, {}
+
+    def _require_fitted(self) -> None:
+        if self._fitted or torch.compiler.is_compiling():
+            return
+        model = [self.model] if self.steps and self.model is not None else []
+        require_fitted(self, self.actor_network, self.value_network, *model, remedy=UPDATE_NORMALIZERS)
+        self._fitted = True
 
     def _act(self, now: TensorDictBase) -> TensorDictBase:
         """The policy's action beside what it read."""

@@ -8,6 +8,7 @@ Example:
 """
 
 from torchrl_gn.scenes.errors import SceneChangedWarning, SceneError, UnsupportedSceneError
+from torchrl_gn.scenes.feature_set import FeatureSet
 from torchrl_gn.scenes.joint_chain import JointChain, chain_states
 from torchrl_gn.scenes.load import load_scene, scene_from_description
 from torchrl_gn.scenes.observation_graph import ObservationGraph
@@ -19,6 +20,7 @@ from torchrl_gn.scenes.variants import has_variants, make_variants, parameter_ra
 __all__ = [
     "SYSTEMS",
     "Attachment",
+    "FeatureSet",
     "JointChain",
     "ObservationGraph",
     "ParameterRange",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.errors import SceneError
+from torchrl_gn.scenes.fingerprint import fingerprint
 from torchrl_gn.scenes.heading import Heading
 from torchrl_gn.scenes.linkage import Linkage
 
@@ -178,12 +178,11 @@ class Scene:
         }
 
     def fingerprint(self) -> str:
-        """Hash of topology, static features (six digits) and bounds: equal physics, equal hash."""
-        static = self.static
-        values = (static.nodes, static.edges, static.globals_, self.action_low, self.action_high)
-        text = [*self.node_names, *self.joint_names, *self.actuator_names, str(self.substeps)]
-        text += [f"{value:.6g}" for array in values for value in array.ravel() + 0.0]
-        return hashlib.sha256("\n".join(text).encode()).hexdigest()[:16]
+        """Hash of names, control step, bounds and physical parameters (six digits): equal physics, equal hash.
+
+        Static features have no part in it; :class:`~torchrl_gn.scenes.FeatureSet` has their names.
+        """
+        return fingerprint(self)
 
     def __str__(self) -> str:
         """Readable summary: time steps, nodes, joints, motors, what moves, where it is invariant."""

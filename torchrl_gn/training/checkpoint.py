@@ -24,7 +24,7 @@ from torchrl_gn.scenes import Scene, scene_from_description
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
 """Where a run folder keeps its checkpoint."""
 
-FORMAT = 2
+FORMAT = 3
 """Version of the checkpoint format that this package writes and reads."""
 
 _PACKAGES = (

@@ -1,0 +1,70 @@
+"""Names of static features: what a column means, whatever its place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+from torchrl_gn.scenes.scene_values import SceneValues
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.scene import Scene
+
+
+@dataclass(frozen=True)
+class FeatureSet:
+    """Names of static features, column by column: of a scene, of a data set, or those that a model reads.
+
+    Columns are found by these names alone, so that a version of the library with more static features, or in another
+    order, reads data sets and weights of before.
+
+    Attributes:
+        nodes: names of the static node features.
+        edges: names of the static edge features.
+        globals_: names of the static global features.
+    """
+
+    nodes: tuple[str, ...] = ()
+    edges: tuple[str, ...] = ()
+    globals_: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, scene: Scene) -> FeatureSet:
+        """The static features that a scene has."""
+        static = scene.static
+        return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
+
+    @classmethod
+    def from_names(cls, names: Mapping[str, Sequence[str]]) -> FeatureSet:
+        """From what ``dataclasses.asdict`` gave, perhaps through JSON."""
+        return cls(**{part: tuple(of_part) for part, of_part in names.items()})
+
+    def common(self, other: FeatureSet) -> FeatureSet:
+        """Those that another set has too, in the order of this one."""
+        others = asdict(other)
+        return FeatureSet(
+            **{part: tuple(name for name in names if name in others[part]) for part, names in asdict(self).items()}
+        )
+
+    def missing_in(self, other: FeatureSet) -> list[str]:
+        """Those that another set lacks."""
+        others = asdict(other)
+        return [name for part, names in asdict(self).items() for name in names if name not in others[part]]
+
+    def columns_in(self, other: FeatureSet) -> dict[str, list[int]]:
+        """Column in another set, which has them all, of each of these, by part."""
+        others = asdict(other)
+        return {part: [others[part].index(name) for name in names] for part, names in asdict(self).items()}
+
+    def select(self, scene: Scene) -> SceneValues:
+        """The numbers of a scene, of its static features only these.
+
+        Raises:
+            ValueError: if the scene lacks one.
+        """
+        values, there = SceneValues.of(scene), FeatureSet.of(scene)
+        if missing := self.missing_in(there):
+            raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")
+        columns = self.columns_in(there)
+        return values._replace(**{part: getattr(values, part)[..., columns[part]] for part in columns})
