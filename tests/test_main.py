@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 import subprocess
 import sys
@@ -15,10 +17,16 @@ from torchrl_gn.pretrained import load_pretrained, pretrained_names
 from torchrl_gn.scenes import SYSTEMS, load_scene
 
 
-@pytest.mark.parametrize("arguments", [[], ["list"]], ids=["nothing", "list"])
-def test_list_names_every_system_and_model(arguments, capsys):
-    assert main(arguments) == 0
-    systems, models = capsys.readouterr().out.split("\n\n")
+@pytest.fixture(scope="module")
+def listed() -> str:
+    """What ``torchrl-gn list`` prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main(["list"]) == 0
+    return out.getvalue()
+
+
+def test_list_names_every_system_and_model(listed):
+    systems, models = listed.split("\n\n")
     rows = {line.split()[0]: line.split()[1:] for line in systems.splitlines()}
     assert set(SYSTEMS) <= rows.keys()
     assert rows["cheetah"] == ["8", "9", "6", "10", "ms", "yes"]  # nine joints: three of the root, six of the legs
@@ -26,9 +34,13 @@ def test_list_names_every_system_and_model(arguments, capsys):
     assert {line.split()[0] for line in models.splitlines()} >= set(pretrained_names())
 
 
-def test_list_states_the_errors_of_the_checkpoints(capsys):
-    main(["list"])
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+def test_without_a_word_it_lists(listed, capsys):
+    assert main([]) == 0
+    assert capsys.readouterr().out == listed
+
+
+def test_list_states_the_errors_of_the_checkpoints(listed):
+    rows = [line.split() for line in listed.splitlines()]
     stated = load_pretrained("swimmer6").metrics["swimmer6"]
     (row,) = [row for row in rows if row[:2] == ["swimmer6", "swimmer6"]]
     assert row[2] == "yes"
