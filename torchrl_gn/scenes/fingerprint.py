@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -74,7 +74,7 @@ def physics(scene: Scene) -> list[str]:
 def _options(model: mujoco.MjModel) -> Iterable[str]:
     option = model.opt
     for name in _OPTIONS:
-        yield from _line(name, _digits(getattr(option, name)))
+        yield from _line(name, _digits(_field(option, name)))
     yield from (mujoco.mjtIntegrator(option.integrator).name, mujoco.mjtCone(option.cone).name)
     yield mujoco.mjtSolver(option.solver).name
     flags = [
@@ -115,7 +115,7 @@ def _joints(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
         yield from _line(f"{of} pos", _places(model.jnt_pos[joint]))
         if numbers == 1:
             yield from _line(f"{of} reference", _places(model.qpos0[qpos]))
-        if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
+        if np.any(model.jnt_stiffness[joint]) or np.any(_field(model, "jnt_stiffnesspoly", joint)):
             yield from _line(f"{of} spring", _places(model.qpos_spring[qpos : qpos + numbers]))
         yield from _arrays(of, model, "jnt", joint, _JOINTS)
         yield from _arrays(f"{of} freedom", model, "dof", slice(dof, dof + dofs), _DOFS)
@@ -124,7 +124,7 @@ def _joints(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
 
 def _actuators(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
     kinds = (("trntype", mujoco.mjtTrn), ("gaintype", mujoco.mjtGain), ("biastype", mujoco.mjtBias))
-    for motor in range(model.nactuator):
+    for motor in range(len(model.actuator_trntype)):
         of = f"actuator {names.of(_OBJECT.mjOBJ_ACTUATOR, motor)}"
         types = [kind(getattr(model, f"actuator_{name}")[motor]).name for name, kind in kinds]
         group = int(model.actuator_group[motor])
@@ -196,7 +196,7 @@ def _tendons(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
                 yield from names.element(_OBJECT.mjOBJ_SITE, int(model.wrap_prm[wrap]))
             else:
                 yield from _line(f"{of} factor", _digits(model.wrap_prm[wrap]))
-        if model.tendon_stiffness[tendon] or model.tendon_stiffnesspoly[tendon].any():
+        if np.any(model.tendon_stiffness[tendon]) or np.any(_field(model, "tendon_stiffnesspoly", tendon)):
             yield from _line(f"{of} spring", _places(model.tendon_lengthspring[tendon]))
         yield from _arrays(of, model, "tendon", tendon, _TENDONS)
         yield from _limits(of, model, "tendon", tendon, ("range", "limited"), ("actfrcrange", "actfrclimited"))
@@ -265,7 +265,13 @@ class _Names:
 
 def _arrays(of: str, model: mujoco.MjModel, prefix: str, index: int | slice, names: Iterable[str]) -> Iterable[str]:
     for name in names:
-        yield from _line(f"{of} {name}", _digits(getattr(model, f"{prefix}_{name}")[index]))
+        yield from _line(f"{of} {name}", _digits(_field(model, f"{prefix}_{name}", index)))
+
+
+def _field(owner: mujoco.MjModel | mujoco.MjOption, name: str, index: int | slice | None = None) -> Any:
+    """A field, or zero where this version of MuJoCo has no such quantity yet."""
+    values = getattr(owner, name, None)
+    return 0.0 if values is None else values if index is None else values[index]
 
 
 def _limits(of: str, model: mujoco.MjModel, prefix: str, index: int, *limits: tuple[str, str]) -> Iterable[str]:
