@@ -93,7 +93,9 @@ class Task:
 
     def bind(self, model: ForwardModel) -> BoundForwardModel:
         """Join the weights to the scene, or to its variants, whose numbers come with the samples."""
-        return model.bind(self.scene, static_key="static" if self.parametrized else None)
+        if not self.parametrized:
+            return model.bind(self.scene)
+        return model.bind(self.scene, static_key="static", static_features=self.dataset.features)
 
 
 def load_scenes(names: str | ListConfig, timestep: float | None) -> list[Scene]:
@@ -208,13 +210,11 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
 
 
 def fit_normalizers(cfg: DictConfig, trainer: Trainer, tasks: list[Task]) -> None:
-    """Take samples of every system into the statistics."""
+    """Take samples of every system into the statistics; of a model to start from, into the scale of the noise."""
     buffers = [trajectory_buffer(task.train, batch_size=20_000, seed=cfg.seed) for task in tasks]
     samples = [buffer.sample().to(trainer.device) for buffer in buffers]
-    if isinstance(trainer.loss, SeveralScenesLoss):
-        trainer.loss.fit_normalizers(samples)
-    else:
-        trainer.loss.fit_normalizers(samples[0])
+    fit = trainer.loss.fit_normalizers if cfg.start_from is None else trainer.loss.fit_scales
+    fit(samples if isinstance(trainer.loss, SeveralScenesLoss) else samples[0])
 
 
 def evaluate(
@@ -258,7 +258,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     with workers.first_goes_first():
         tasks = make_tasks(cfg, scenes, Path(cfg.data.folder) if cfg.data.folder else run.data)
     trainer = make_trainer(cfg, model, tasks, workers)
-    if not begun and cfg.start_from is None:
+    if not begun and (cfg.start_from is None or cfg.noise > 0):
         fit_normalizers(cfg, trainer, tasks)
     curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scenes, config=plain_config(cfg))
     if not workers.first:

@@ -111,7 +111,7 @@ def test_a_model_goes_on_from_another_with_episodes_as_half_of_its_data(tmp_path
     episodes = collect_trajectories(scene, 3, 120, seed=9)
     episodes["state"][2, 50:] = torch.nan  # its simulation became unstable
     save_file({"state": episodes["state"], "action": episodes["action"].float()}, tmp_path / "gn.safetensors")
-    small = (*SMALL, "steps=3", "lr=1e-6", "start_from=pendulum")
+    small = (*SMALL, "steps=3", "lr=1e-6", "noise=1e-3", "start_from=pendulum")
     options = (*small, f"data.extra=[{tmp_path / 'gn.safetensors'}]")
     code, _, errors = call(*options, f"run_dir={tmp_path / 'run'}", recipe="forward_model")
     assert code == 0, errors
