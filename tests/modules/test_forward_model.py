@@ -152,7 +152,7 @@ def test_values_that_training_never_saw_are_named(scenes, make_model):
     scene = scenes["swimmer6"]
     model = make_model(scene)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", UnseenFeatureWarning)
         model.bind(scene)
         model.bind(scene, strict=True)
         make_model(scene, fitted=False).bind(thick_swimmer())  # no training yet, nothing to compare
@@ -214,6 +214,16 @@ def test_statics_are_read_by_name(scenes, make_model, random_states, random_acti
     assert bound.values.globals_.tolist() == [scene.timestep]
     with pytest.raises(ValueError, match=r"'swimmer6' lacks the static features \['charm'\]"):
         ForwardModel(FeatureSet(nodes=("mass", "charm"))).bind(scene)
+
+
+def test_types_and_flags_of_another_mujoco_are_off(scenes):
+    scene = scenes["swimmer6"]
+    features = FeatureSet(("mass",), ("actuator_gaintype[NEW]", "direction"), ("enableflags[NEW]",))
+    bound = ForwardModel(features).bind(scene)
+    direction = scene.static.edge_names.index("direction")
+    assert torch.equal(bound.values.edges[:, 0], torch.zeros(scene.num_edges, dtype=torch.float64))
+    assert torch.equal(bound.values.edges[:, 1], torch.as_tensor(scene.static.edges[:, direction]))
+    assert bound.values.globals_.tolist() == [0]
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,12 @@ def test_loading_leaves_a_spec_as_it_was():
         ),
         ('<intvelocity name="i" joint="j" ctrlrange="-1 1" actrange="-1 1"/>', "", ["'i'", "activation"]),
         ('<motor joint="j" ctrlrange="-1 1"/><motor tendon="t" ctrlrange="-1 1"/>', _TENDON, ["'actuator1'"]),
-        ('<motor name="late" joint="j" ctrlrange="-1 1" delay=".01" nsample="9"/>', "", ["'late'", "delay"]),
+        pytest.param(
+            '<motor name="late" joint="j" ctrlrange="-1 1" delay=".01" nsample="9"/>',
+            "",
+            ["'late'", "delay"],
+            marks=pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_history"), reason="needs MuJoCo 3.5"),
+        ),
     ],
 )
 def test_refusals_name_the_element(actuators, rest, named):
@@ -200,6 +205,7 @@ def test_unnamed_elements_get_names():
     assert scene.joint_names == ("j", "joint1")
 
 
+@pytest.mark.skipif(not hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP"), reason="needs MuJoCo 3.4")
 def test_sleeping_and_disabled_sensors_are_undone():
     text = GOOD.replace("<worldbody>", '<option><flag sensor="disable" sleep="enable"/></option><worldbody>')
     flags = load_scene(text).model.opt

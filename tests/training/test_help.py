@@ -30,6 +30,8 @@ defaults:
 RECIPE = """'''What it does.
 
     how it is called
+
+What came out.
 '''
 from functools import wraps
 from torchrl_gn.training import with_help
@@ -76,7 +78,7 @@ def test_help_is_the_first_lines_and_the_options(word, tmp_path, monkeypatch, ca
     if word == "size=4":
         assert recipe.ran and not said
     else:
-        options = f"What it does.\n\n    how it is called\n\n{commented_options(YAML)}\n"
+        options = f"What it does.\n\n    how it is called\n\nWhat came out.\n\n{commented_options(YAML)}\n"
         task = "What task=swimmer6 sets, named task.<option>:\n\nsteps: 200   # in an episode\n"
         assert not recipe.ran and said == options + task
         monkeypatch.setattr(sys, "argv", ["small_recipe.py", "task=whole", word])

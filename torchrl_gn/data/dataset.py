@@ -19,7 +19,7 @@ from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, simulati
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.errors import SceneError
-from torchrl_gn.scenes.feature_set import FeatureSet
+from torchrl_gn.scenes.feature_set import FeatureSet, take_columns
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.scene_values import SceneValues
@@ -342,7 +342,7 @@ def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
     for part, wanted in columns.items():
         values = data["static", part]
         if wanted != list(range(values.shape[-1])):
-            data["static", part] = values[..., wanted]
+            data["static", part] = take_columns(values, wanted)
 
 
 def _check_same(files: DatasetFiles, manifest: dict, request: dict) -> None:

@@ -20,6 +20,7 @@ from torchrl.envs import (
 )
 
 from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.scenes.systems.system import INSTALL_SUITE
 
 
 def suite_env(
@@ -48,6 +49,7 @@ def suite_env(
 
     Raises:
         ValueError: if there is no such task, the control step does not fit, or a number is not positive.
+        ImportError: if dm_control is not installed.
 
     Example:
         >>> suite_env("swimmer", "swimmer6", num_envs=2, timestep=0.02).reset()["observation"].shape
@@ -98,6 +100,8 @@ def _suite() -> tuple[Any, Any, Any]:
         from dm_control import suite
         from dm_control.rl import control
         from dm_control.suite import swimmer
+    except ImportError as error:
+        raise ImportError(f"Tasks of the suite need dm_control: {INSTALL_SUITE}.") from error
     finally:
         if before is None:
             del os.environ["MUJOCO_GL"]

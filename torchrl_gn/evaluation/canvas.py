@@ -15,9 +15,16 @@ if TYPE_CHECKING:
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """Empty figure of a size in inches."""
-    # Here, not at the top: training imports this package and need not load matplotlib.
-    from matplotlib.figure import Figure
+    """Empty figure of a size in inches.
+
+    Raises:
+        ImportError: if matplotlib is not installed.
+    """
+    # Here, not at the top: training imports this package and needs no matplotlib.
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ImportError('Figures need matplotlib: pip install "torchrl_gn[figures]".') from None
 
     return Figure(figsize=size, layout="constrained", facecolor="white")
 

@@ -63,7 +63,7 @@ def rollout_video(
     Raises:
         ValueError: if shapes do not fit the scene, the truth is not finite, or an option is unknown.
         RuntimeError: if ``engine="gl"`` cannot render here.
-        ImportError: if an ``.mp4`` is asked for and imageio-ffmpeg is not installed.
+        ImportError: if Pillow is not installed, or imageio-ffmpeg for an ``.mp4``.
     """
     path = Path(path)
     if path.suffix not in (".gif", ".mp4"):
@@ -116,6 +116,7 @@ def rollout_frames(
         raise ValueError("The true states contain values that are not finite.")
     if every < 1 or size < 32 or size % 2:
         raise ValueError(f"every must be at least 1 and size an even number from 32, got {every} and {size}.")
+    _require_pillow()
     sequences = [states[::every] for states in sequences]
     if engine == "drawn":
         panels = _drawn_panels(scene, sequences, size)
@@ -126,6 +127,13 @@ def rollout_frames(
     else:
         raise ValueError(f'engine must be "drawn" or "gl", got {engine!r}.')
     return (_compose(scene.name, step * every * scene.timestep, row, size, labels) for step, row in enumerate(panels))
+
+
+def _require_pillow() -> None:
+    try:
+        import PIL  # noqa: F401
+    except ImportError:
+        raise ImportError('Pictures and videos need Pillow: pip install "torchrl_gn[figures]".') from None
 
 
 def _drawn_panels(scene: Scene, sequences: list[np.ndarray], size: int) -> Iterator[list[Image.Image]]:

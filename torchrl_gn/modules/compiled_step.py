@@ -90,6 +90,18 @@ def _is_news(record: logging.LogRecord) -> bool:
     return "missing a c-shim implementation" not in record.getMessage()
 
 
+def check_isolation() -> None:
+    """Refuse to compile where one model could run what was compiled for another.
+
+    Only the inputs are guarded, so two models of equal shapes must not share compiled code.
+
+    Raises:
+        RuntimeError: if torch is too old to keep it apart.
+    """
+    if "isolate_recompiles" not in inspect.signature(torch.compile).parameters:
+        raise RuntimeError(f"compile=True needs torch 2.13 or newer, not {torch.__version__}: leave compile out.")
+
+
 def check_compiler() -> None:
     """Refuse to compile for a CPU without a C++ compiler, before anything is waited for.
 

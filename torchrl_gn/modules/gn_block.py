@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
-from torch_geometric.nn import MessagePassing
 from torchrl.modules import MLP
 
 from torchrl_gn.modules.graph import Graph, GraphSize
 from torchrl_gn.modules.linear import activation_class
+
+with warnings.catch_warnings():
+    # PyG scripts functions at import, which torch 2.15 warns of.
+    warnings.filterwarnings("ignore", "`torch.jit.script", FutureWarning)
+    from torch_geometric.nn import MessagePassing
 
 Pool = Literal["sum", "mean"]
 

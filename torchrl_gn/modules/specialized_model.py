@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.modules.ablated_core import AblatedCore
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded
-from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler
+from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler, check_isolation
 from torchrl_gn.modules.folded_core import FoldedCore, copy_into, snapshot
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.local_frame import Seen
@@ -82,6 +82,8 @@ class SpecializedForwardModel(BoundForwardModel):
                 static_features=bound.statics.brought,
             )
         self.strict = bound.strict
+        if compile:
+            check_isolation()
         if compile and bound.live.device.type == "cpu":
             check_compiler()
         self._dtype, self.compile_steps = dtype, compile
@@ -231,6 +233,7 @@ def specialize(
 
     Raises:
         FileNotFoundError: to compile for a CPU without a C++ compiler.
+        RuntimeError: to compile with a torch before 2.13.
         TypeError: for a recurrent core, or one of the ablation study.
     """
     if isinstance(bound.model.core, (AblatedCore, RecurrentCore)):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_gn.modules.float64_buffers import Float64Buffers
-from torchrl_gn.scenes.feature_set import FeatureSet
+from torchrl_gn.scenes.feature_set import FeatureSet, take_columns
 from torchrl_gn.scenes.scene_values import SceneValues
 
 if TYPE_CHECKING:
@@ -58,7 +59,8 @@ class StaticValues(Float64Buffers):
         # Where both have the same columns, nothing is gathered.
         self.columns = None if reads == self.brought else tuple(f"{part}_columns" for part in _PARTS)
         if self.columns is not None:
-            self.constants(dict(zip(self.columns, reads.columns_in(self.brought).values(), strict=True)))
+            columns = (torch.tensor(of_part, dtype=torch.long) for of_part in reads.columns_in(self.brought).values())
+            self.constants(dict(zip(self.columns, columns, strict=True)))
 
     @property
     def own(self) -> SceneValues:
@@ -120,7 +122,7 @@ class StaticValues(Float64Buffers):
                 )
             if self.columns is not None:
                 selected = static.copy() if selected is static else selected
-                selected.set(part, given[..., getattr(self, self.columns[index])])
+                selected.set(part, take_columns(given, getattr(self, self.columns[index])))
         return selected
 
     def find(self, tensordict: TensorDictBase) -> TensorDictBase | None:

@@ -97,7 +97,8 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     flags = mujoco.mjtDisableBit
     spec.option.disableflags |= int(flags.mjDSBL_WARMSTART)
     spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
-    spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)  # MuJoCo before 3.4 has none
+    spec.option.enableflags &= ~int(sleep)
     try:
         graph = topology(spec.compile())
         for body in spec.bodies:
@@ -125,7 +126,10 @@ def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
     named = _namer(model)
     transmission = mujoco.mjtTrn
     actuators = np.full(model.njnt, -1, dtype=np.int64)
-    for motor in range(model.nactuator):
+    # MuJoCo before 3.11 has one control an actuator, and before 3.5 no delays.
+    controls = getattr(model, "actuator_ctrlnum", np.ones(model.nu, dtype=int))
+    delays = getattr(model, "actuator_history", np.zeros((len(controls), 1), dtype=int))[:, 0]
+    for motor in range(len(controls)):
         label = f"Actuator {named(mujoco.mjtObj.mjOBJ_ACTUATOR, motor)!r}"
         kind = transmission(model.actuator_trntype[motor])
         if kind not in (transmission.mjTRN_JOINT, transmission.mjTRN_JOINTINPARENT):
@@ -135,9 +139,9 @@ def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
                 "edges. Give it a joint transmission or remove it."
             )
         joint = int(model.actuator_trnid[motor, 0])
-        if model.actuator_ctrlnum[motor] != 1:
-            raise UnsupportedSceneError(f"{label} has {model.actuator_ctrlnum[motor]} controls; an edge carries one.")
-        if model.actuator_dyntype[motor] != mujoco.mjtDyn.mjDYN_NONE or model.actuator_history[motor, 0] > 0:
+        if controls[motor] != 1:
+            raise UnsupportedSceneError(f"{label} has {controls[motor]} controls; an edge carries one.")
+        if model.actuator_dyntype[motor] != mujoco.mjtDyn.mjDYN_NONE or delays[motor] > 0:
             raise UnsupportedSceneError(
                 f"{label} has activation dynamics or a delay, a hidden state that body frames do "
                 "not show. Use an actuator without (dyntype none)."

@@ -6,7 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
 from torchrl_gn.scenes.scene_values import SceneValues
+from torchrl_gn.scenes.static_features import is_member
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
@@ -48,17 +53,24 @@ class FeatureSet:
         )
 
     def missing_in(self, other: FeatureSet) -> list[str]:
-        """Those that another set lacks."""
+        """Those that another set lacks, but for types and flags of another version of MuJoCo."""
         others = asdict(other)
-        return [name for part, names in asdict(self).items() for name in names if name not in others[part]]
+        return [
+            name
+            for part, names in asdict(self).items()
+            for name in names
+            if name not in others[part] and not is_member(name)
+        ]
 
     def columns_in(self, other: FeatureSet) -> dict[str, list[int]]:
-        """Column in another set, which has them all, of each of these, by part."""
-        others = asdict(other)
-        return {part: [others[part].index(name) for name in names] for part, names in asdict(self).items()}
+        """Column in another set of each of these, by part, for :func:`take_columns`; -1 where it is missing."""
+        places = {part: {name: place for place, name in enumerate(names)} for part, names in asdict(other).items()}
+        return {part: [places[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
 
     def select(self, scene: Scene) -> SceneValues:
         """The numbers of a scene, of its static features only these.
+
+        A type or flag that this version of MuJoCo does not know is 0: no scene has it here.
 
         Raises:
             ValueError: if the scene lacks one.
@@ -67,4 +79,9 @@ class FeatureSet:
         if missing := self.missing_in(there):
             raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")
         columns = self.columns_in(there)
-        return values._replace(**{part: getattr(values, part)[..., columns[part]] for part in columns})
+        return values._replace(**{part: take_columns(getattr(values, part), columns[part]) for part in columns})
+
+
+def take_columns(values: Tensor, columns: Sequence[int] | Tensor) -> Tensor:
+    """Columns of ``[..., F]``; zeros for column -1."""
+    return pad(values, (0, 1))[..., torch.as_tensor(columns, dtype=torch.long)]

@@ -102,5 +102,6 @@ def _alike(model: mujoco.MjModel, slides: list[int], rest: np.ndarray, across: l
     if np.isin(model.actuator_trnid[:, 0], slides).any():
         return False
     dofs = model.jnt_dofadr[slides]
-    table = [model.dof_damping, model.dof_dampingpoly, model.dof_armature, model.dof_frictionloss]
+    names = ("dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss")
+    table = [getattr(model, name) for name in names if hasattr(model, name)]  # MuJoCo before 3.7 has no polynomials
     return all(np.array_equal(values[dofs[0]], values[dofs[1]]) for values in table)

@@ -86,7 +86,8 @@ def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
 
 def feels_position(model: mujoco.MjModel, joint: int) -> bool:
     """Whether a limit, spring or actuator of a joint depends on the joint's position."""
-    if model.jnt_limited[joint] or model.jnt_stiffness[joint] or np.any(model.jnt_stiffnesspoly[joint]):
+    stiffness = [model.jnt_stiffness, getattr(model, "jnt_stiffnesspoly", None)]  # MuJoCo before 3.7 has no polynomials
+    if model.jnt_limited[joint] or any(np.any(table[joint]) for table in stiffness if table is not None):
         return True
     gains, biases = mujoco.mjtGain, mujoco.mjtBias
     for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):

@@ -20,6 +20,8 @@ Differences from the paper's list:
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import numpy as np
 
@@ -64,6 +66,11 @@ def _join(columns: Columns, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
 
 def _members(enum: type, prefix: str) -> list[tuple[str, int]]:
     return [(key.removeprefix(prefix), int(value)) for key, value in enum.__members__.items()]
+
+
+def is_member(name: str) -> bool:
+    """Whether a feature is one type of several or one flag, for example ``"actuator_biastype[SO3]"``."""
+    return re.fullmatch(r"(\w+type|enableflags|disableflags)\[[A-Z]\w*\]", name) is not None
 
 
 def _one_hot(name: str, values: np.ndarray, enum: type, prefix: str) -> Columns:

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
+
+# labmaze, which dm-control requires and nothing here uses, has no wheels for Python 3.13 and newer.
+INSTALL_SUITE = 'pip install "torchrl_gn[suite]"'
+if sys.version_info >= (3, 13):
+    INSTALL_SUITE += " && pip install --no-deps dm-control"
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,7 @@ def model_file(path: str) -> str:
     """
     package = importlib.util.find_spec("dm_control")
     if package is None or not package.submodule_search_locations:
-        raise ModuleNotFoundError("The paper's systems need the model files of dm_control: pip install dm-control.")
+        raise ModuleNotFoundError(f"The paper's systems need the model files of dm_control: {INSTALL_SUITE}.")
     return str(Path(package.submodule_search_locations[0], path))
 
 
