@@ -104,7 +104,7 @@ AT_2 = rf" has {NUMBER} at index \(2, "
 
 ENTRIES = [
     # Scenes
-    Entry("MJCF", lambda g, bad: load_scene(ARM.format(bad)), rf"dof_damping of joint .* is {NUMBER}"),
+    Entry("MJCF", lambda g, bad: load_scene(ARM.format(bad)), rf"dof_damping of joint .* is {NUMBER}|Nan, Inf"),
     Entry("timestep", lambda g, bad: load_scene("pendulum", timestep=bad), rf"timestep={NUMBER}"),
     # Data
     Entry(

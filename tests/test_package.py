@@ -76,7 +76,7 @@ def test_what_is_imported_is_declared():
                 continue
             known = needed | optional if name in later or file.name in WITH_PILLOW else needed
             # Python 3.10 does not find the packages that list no top level.
-            distributions = {found.replace("_", "-") for found in brought_by.get(package, [package])}
+            distributions = {found.replace("_", "-").lower() for found in brought_by.get(package, [package])}
             assert distributions & known, f"{file.name} imports {name}, which pyproject.toml does not name"
 
 

@@ -90,13 +90,14 @@ def _is_news(record: logging.LogRecord) -> bool:
     return "missing a c-shim implementation" not in record.getMessage()
 
 
-def check_isolation() -> None:
-    """Refuse to compile where one model could run what was compiled for another.
+def check_torch() -> None:
+    """Refuse to compile with a torch that is too old.
 
-    Only the inputs are guarded, so two models of equal shapes must not share compiled code.
+    Of a step only the inputs are guarded, so two models of equal shapes must not share compiled code, as they do
+    without ``isolate_recompiles``. Such a torch cannot compile TorchRL's losses either (tried with 2.7).
 
     Raises:
-        RuntimeError: if torch is too old to keep it apart.
+        RuntimeError: if it is too old.
     """
     if "isolate_recompiles" not in inspect.signature(torch.compile).parameters:
         raise RuntimeError(f"compile=True needs torch 2.13 or newer, not {torch.__version__}: leave compile out.")

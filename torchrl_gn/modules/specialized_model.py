@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.modules.ablated_core import AblatedCore
 from torchrl_gn.modules.bound_forward_model import BoundForwardModel, Folded
-from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler, check_isolation
+from torchrl_gn.modules.compiled_step import CompiledStep, check_compiler, check_torch
 from torchrl_gn.modules.folded_core import FoldedCore, copy_into, snapshot
 from torchrl_gn.modules.graph import Graph, graph_concat
 from torchrl_gn.modules.local_frame import Seen
@@ -83,7 +83,7 @@ class SpecializedForwardModel(BoundForwardModel):
             )
         self.strict = bound.strict
         if compile:
-            check_isolation()
+            check_torch()
         if compile and bound.live.device.type == "cpu":
             check_compiler()
         self._dtype, self.compile_steps = dtype, compile

@@ -101,7 +101,7 @@ class SVGLoss(DDPGLoss):
     def _share_statistics(self) -> None:
         """Let target networks read the statistics of what they are copies of: TorchRL's updaters copy weights only."""
         for name in ("actor_network", "value_network"):
-            target = cast(TensorDictBase | None, self._modules.get(f"target_{name}_params"))
+            target = cast("TensorDictBase | None", self._modules.get(f"target_{name}_params"))
             if target is not None:
                 own = cast(TensorDictBase, self._modules[f"{name}_params"])
                 for buffer, _ in getattr(self, name).named_buffers(remove_duplicate=False):
@@ -139,7 +139,7 @@ class SVGLoss(DDPGLoss):
         weights = self._maybe_get_priority_weight(tensordict)
         keys = [*self.actor_in_keys, *self.value_exclusive_keys]
         now = tensordict.select(*keys, *self._carried, strict=False).detach()
-        value, discount = cast(Tensor | float, 0.0), 1.0
+        value, discount = cast("Tensor | float", 0.0), 1.0
         gamma = cast(Tensor, self.value_estimator.gamma) if self.steps else 1.0
         with set_exploration_type(self.deterministic_sampling_mode):
             for _ in range(self.steps):

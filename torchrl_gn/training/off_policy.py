@@ -21,7 +21,7 @@ from torchrl.objectives import HardUpdate, LossModule
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.modules import Agent
-from torchrl_gn.modules.compiled_step import check_compiler
+from torchrl_gn.modules.compiled_step import check_compiler, check_torch
 
 _KEPT = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
@@ -86,6 +86,7 @@ class OffPolicyTrainer:
     Raises:
         ValueError: if a number of frames does not fit the environments, or a number is not positive.
         FileNotFoundError: with ``compile``, without a C++ compiler on a CPU.
+        RuntimeError: with ``compile``, if torch is too old.
     """
 
     def __init__(
@@ -141,6 +142,8 @@ class OffPolicyTrainer:
         self.curve = LearningCurve()
         self.seed = seed
         self._weights = [p for group in optimizer.param_groups for p in group["params"]]
+        if compile:
+            check_torch()
         if compile and self._weights[0].device.type == "cpu":
             check_compiler()
         self._loss = self._first_loss if compile else self._every_loss

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -100,7 +101,11 @@ class Workers:
         """The module with gradients averaged over all, its weights and statistics set to the first one's."""
         if self.size == 1:
             return module
-        return DistributedDataParallel(module, forward_sync_buffers=False)
+        if "forward_sync_buffers" in inspect.signature(DistributedDataParallel).parameters:
+            return DistributedDataParallel(module, forward_sync_buffers=False)
+        for buffer in module.buffers():  # an older torch has one option for the begin and every step
+            dist.broadcast(buffer, 0)
+        return DistributedDataParallel(module, broadcast_buffers=False)
 
 
 @contextmanager
