@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 
 import mujoco
 import pytest
@@ -11,8 +12,13 @@ import torch
 # Small tensors gain nothing from more threads, and threads on a busy machine wait for each other.
 torch.set_num_threads(int(os.environ.get("TORCHRL_GN_TEST_THREADS", "1")))
 
+# The compiler's cache does not tell one processor's code from another's: pretending to have another needs its own.
+if capability := os.environ.get("ATEN_CPU_CAPABILITY"):
+    cache = os.path.join(tempfile.gettempdir(), f"torchrl_gn_tests_{os.getuid()}_{capability}")
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", cache)
+
 
 def pytest_configure(config: pytest.Config) -> None:
-    # The shipped models were trained on what MuJoCo 3.17 makes of their scenes; others differ in flags, and say so.
+    # An older MuJoCo gives bodies of jaco other principal axes, in the fourth digit, and its trained model says so.
     if tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 14):
         config.addinivalue_line("filterwarnings", "ignore::torchrl_gn.scenes.SceneChangedWarning")
