@@ -10,7 +10,8 @@ import pytest
 import torch
 
 # Small tensors gain nothing from more threads, and threads on a busy machine wait for each other.
-torch.set_num_threads(int(os.environ.get("TORCHRL_GN_TEST_THREADS", "1")))
+THREADS = int(os.environ.get("TORCHRL_GN_TEST_THREADS", "1"))
+torch.set_num_threads(THREADS)
 
 # The compiler's cache does not tell one processor's code from another's: pretending to have another needs its own.
 if capability := os.environ.get("ATEN_CPU_CAPABILITY"):
@@ -22,3 +23,8 @@ def pytest_configure(config: pytest.Config) -> None:
     # An older MuJoCo gives bodies of jaco other principal axes, in the fourth digit, and its trained model says so.
     if tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 14):
         config.addinivalue_line("filterwarnings", "ignore::torchrl_gn.scenes.SceneChangedWarning")
+
+
+def pytest_runtest_setup() -> None:
+    """Recipes set the number of threads by their options, TorchRL's SerialEnv raises it when it is closed."""
+    torch.set_num_threads(THREADS)
