@@ -33,8 +33,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
+from torchrl_gn.dynamics import specialize
 from torchrl_gn.evaluation import plot_loglog, squared_errors
-from torchrl_gn.modules import fast_matmul, specialize
+from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import product_speeds
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.systems import find_system

@@ -24,9 +24,9 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.modules import FeatureSet, ForwardModel
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import ParameterNames, load_scene
 from torchrl_gn.training import (
     Budget,
     RunFolder,
@@ -48,7 +48,7 @@ def measure(cfg: DictConfig, batch: int, workers: Workers) -> dict[str, float]:
     torch.set_num_threads(cfg.threads)
     scene = load_scene(cfg.system)
     trajectories = collect_trajectories(scene, cfg.trajectories, seed=cfg.seed)
-    model = ForwardModel(FeatureSet.of(scene), activation="silu")
+    model = ForwardModel(ParameterNames.of(scene), activation="silu")
     loss = ForwardModelLoss(model.bind(scene))
     loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=2000, seed=cfg.seed).sample())
     buffer = trajectory_buffer(trajectories, batch_size=batch, seed=cfg.seed, shard=workers.shard)

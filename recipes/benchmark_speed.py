@@ -36,11 +36,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import plot_loglog
-from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, fast_matmul, specialize
+from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import product_speeds
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import ParameterNames, load_scene
 from torchrl_gn.training import RunFolder, Tracker, clean_exit, make_optimizer, with_help
 
 R = TypeVar("R")
@@ -50,7 +51,7 @@ R = TypeVar("R")
 class Way:
     """A way to evaluate the forward model."""
 
-    model: BoundForwardModel
+    model: Predictor
     fast: bool = False
 
 
@@ -100,7 +101,7 @@ def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[Forward
     torch.manual_seed(cfg.seed)
     edges = hidden if cfg.edge_hidden is None else list(cfg.edge_hidden)
     sizes = {"edge_hidden": edges, "node_hidden": hidden, "global_hidden": hidden, "latent": cfg.latent}
-    model = ForwardModel(FeatureSet.of(scene), activation=cfg.activation, **sizes)
+    model = ForwardModel(ParameterNames.of(scene), activation=cfg.activation, **sizes)
     ForwardModelLoss(model.bind(scene)).fit_normalizers(transitions)
     return model, transitions
 
@@ -129,12 +130,12 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
 
 
 @torch.no_grad()
-def step_once(model: BoundForwardModel, state: Tensor, action: Tensor) -> Tensor:
+def step_once(model: Predictor, state: Tensor, action: Tensor) -> Tensor:
     """Next state."""
     return model.step(state, action)
 
 
-def pull(model: BoundForwardModel, state: Tensor, actions: Tensor) -> Tensor:
+def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
     """Gradient of a rollout to its actions."""
     leaf = actions.clone().requires_grad_()
     model.rollout(state, leaf)[..., 7:].square().sum().backward()
@@ -182,7 +183,7 @@ def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
     ]
 
 
-def measure(works: list[Work], ways: dict[str, Way], reference: BoundForwardModel | None) -> dict[str, float]:
+def measure(works: list[Work], ways: dict[str, Way], reference: Predictor | None) -> dict[str, float]:
     """Time every work in every way, in turn; returns the seconds of first calls of compiled ways."""
     compile_seconds = {}
     bar = tqdm(total=sum(work.repeats + 1 for work in works) * len(ways), desc="measuring", leave=False)

@@ -25,8 +25,8 @@ from tqdm import tqdm
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.envs import observation_env
-from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
+from torchrl_gn.policies import Agent
 from torchrl_gn.rewards import TargetDistance
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training import OffPolicyTrainer, RunFolder, Tracker, clean_exit, make_agent_optimizer, with_help

@@ -23,9 +23,10 @@ from torch import nn
 from tqdm import trange
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.modules import FeatureSet, ForwardModel, fast_matmul
+from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import ParameterNames, load_scene
 from torchrl_gn.training import RunFolder, ScheduledOptimizer, Tracker, as_list, clean_exit, make_optimizer, with_help
 
 PARTS = ("sampling", "loss", "gradient", "optimiser")
@@ -45,7 +46,7 @@ def measure(cfg: DictConfig) -> dict[str, dict[str, float]]:
     """Median milliseconds of every part, by optimiser."""
     scene = load_scene(cfg.system)
     trajectories = collect_trajectories(scene, cfg.trajectories, 100, cfg.seed)
-    fresh = ForwardModel(FeatureSet.of(scene))
+    fresh = ForwardModel(ParameterNames.of(scene))
     ForwardModelLoss(fresh.bind(scene)).fit_normalizers(trajectory_buffer(trajectories, batch_size=5000).sample())
     models = {name: copy.deepcopy(fresh) for name in as_list(cfg.optimizers)}
     losses = {name: ForwardModelLoss(model.bind(scene)) for name, model in models.items()}

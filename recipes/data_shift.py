@@ -34,7 +34,7 @@ from tqdm import tqdm
 from torchrl_gn.data import Simulator, UnstableSimulationError, create_dataset, sample_start_states
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, rollout_video
-from torchrl_gn.modules import Agent, SwimmerObservation
+from torchrl_gn.policies import Agent, SwimmerObservation
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, load_checkpoint, with_help
 from torchrl_gn.training.run_folder import CONFIG_FILE

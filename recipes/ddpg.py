@@ -22,7 +22,7 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
 from torchrl_gn.envs import observation_env
-from torchrl_gn.modules import Agent
+from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training import (
     OffPolicyTrainer,

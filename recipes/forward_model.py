@@ -35,11 +35,11 @@ from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
 from tqdm import tqdm
 
 from torchrl_gn.data import TrajectoryDataset, collect_trajectories, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_training_curve, report, summary
-from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
 from torchrl_gn.pretrained import load_model
-from torchrl_gn.scenes import Scene, has_variants, load_scene
+from torchrl_gn.scenes import ParameterNames, Scene, has_variants, load_scene
 from torchrl_gn.training import (
     Budget,
     RunFolder,
@@ -89,13 +89,13 @@ class Task:
     @property
     def parametrized(self) -> bool:
         """Whether its sequences are of variants."""
-        return "static" in self.train.keys()
+        return "parameters" in self.train.keys()
 
-    def bind(self, model: ForwardModel) -> BoundForwardModel:
+    def bind(self, model: ForwardModel) -> Predictor:
         """Join the weights to the scene, or to its variants, whose numbers come with the samples."""
         if not self.parametrized:
             return model.bind(self.scene)
-        return model.bind(self.scene, static_key="static", static_features=self.dataset.features)
+        return model.bind(self.scene, parameters_key="parameters", static_features=self.dataset.features)
 
 
 def load_scenes(names: str | ListConfig, timestep: float | None) -> list[Scene]:
@@ -159,7 +159,7 @@ def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
     if cfg.model.core == "mlp" and len(scenes) > 1:
         raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
     items = (scenes[0].num_nodes, scenes[0].num_edges) if cfg.model.core == "mlp" else None
-    return ForwardModel(FeatureSet.of(scenes[0]), items=items, **plain_config(cfg.model))
+    return ForwardModel(ParameterNames.of(scenes[0]), items=items, **plain_config(cfg.model))
 
 
 def make_buffer(tasks: list[Task], batch_size: int, window: int, seed: int, workers: Workers) -> ReplayBuffer:

@@ -36,6 +36,7 @@ from torchrl_gn.data import (
     trajectory_buffer,
 )
 from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import (
     ErrorTable,
     evaluate_errors,
@@ -47,9 +48,9 @@ from torchrl_gn.evaluation import (
     plot_training_curve,
     summary,
 )
-from torchrl_gn.modules import FeatureSet, ForwardModel, IdentifyingModel
+from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.objectives import IdentificationLoss
-from torchrl_gn.scenes import Scene, load_scene, make_variants, parameter_ranges, sample_parameters
+from torchrl_gn.scenes import ParameterNames, Scene, load_scene, make_variants, parameter_ranges, sample_parameters
 from torchrl_gn.training import (
     Budget,
     RunFolder,
@@ -157,8 +158,8 @@ def probe(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestS
     _, inference = model.bind(scene)
     state, action = (cast(Tensor, systems.observed.get(key)) for key in ("state", "action"))
     with torch.no_grad():
-        static = inference.identify(state[:, : cfg.phase + 1], action[:, : cfg.phase])
-    features = torch.cat([cast(Tensor, value).flatten(1) for value in static.values()], dim=1)
+        parameters = inference.identify(state[:, : cfg.phase + 1], action[:, : cfg.phase])
+    features = torch.cat([cast(Tensor, value).flatten(1) for value in parameters.values()], dim=1)
     share = linear_probe(features, torch.from_numpy(systems.parameters), train=int(0.75 * len(features)))
     return dict(zip(systems.names, share.tolist(), strict=True))
 
@@ -180,8 +181,8 @@ def control_figure(cfg: DictConfig, model: IdentifyingModel, scene: Scene, path:
         states = cast(Tensor, simulator.rollout(start, actions, each).get("state"))
         actions = torch.from_numpy(actions)
         with torch.no_grad():
-            static = inference.identify(states[:, : cfg.phase + 1], actions[:, : cfg.phase])
-            predicted = bound.rollout(states[:, cfg.phase], actions[:, cfg.phase :], static)
+            parameters = inference.identify(states[:, : cfg.phase + 1], actions[:, : cfg.phase])
+            predicted = bound.rollout(states[:, cfg.phase], actions[:, cfg.phase :], parameters)
         panels[f"identified {title}"] = (states, predicted)
     return plot_motions(panels, scene, path, labels=("smallest", "middle", "largest"))
 
@@ -189,18 +190,20 @@ def control_figure(cfg: DictConfig, model: IdentifyingModel, scene: Scene, path:
 def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, scene: Scene) -> dict[str, ErrorTable]:
     """Errors of models without identification and with the true parameters, trained for the same time."""
     runs = {}
-    for name, static in (("no identification", "none"), ("true parameters", "scene")):
+    for name, parameters in (("no identification", "none"), ("true parameters", "scene")):
         sizes = {key: value for key, value in plain_config(cfg)["model"].items() if key != "inferred"}
         model = [f"model.{key}={value}".replace(" ", "") for key, value in sizes.items()]
         shared = [f"system={cfg.system}", "parametrized=true", f"data.folder={data}", f"seed={cfg.seed}"]
         budget = {key: "null" if cfg[key] is None else cfg[key] for key in ("minutes", "steps", "clock", "threads")}
         shared += [f"{key}={value}" for key, value in budget.items()]
         shared += [f"data.{key}={cfg.data[key]}" for key in ("train", "validation", "test", "length", "seed")]
-        shared += [f"noise={cfg.noise}", *model, f"model.static={static}"]
+        shared += [f"noise={cfg.noise}", *model, f"model.parameters={parameters}"]
         place = folder / name.replace(" ", "_")
         runs[name] = Run(RECIPE, place, tuple(shared), name, goes_on=("minutes", "steps", "clock"))  # as this one may
     refuse_failures(run_all(runs.values(), cfg.jobs, desc="training baselines"))
-    models = {name: load_checkpoint(run.folder).model.bind(scene, static_key="static") for name, run in runs.items()}
+    models = {
+        name: load_checkpoint(run.folder).model.bind(scene, parameters_key="parameters") for name, run in runs.items()
+    }
     return {name: evaluate_errors(bound, systems.predicted) for name, bound in models.items()}
 
 
@@ -219,7 +222,7 @@ def main(cfg: DictConfig) -> None:
         run.refuse_changes(begun.config, cfg, free=MAY_CHANGE)
         model = cast(IdentifyingModel, begun.trained)
     else:
-        forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", **plain_config(cfg.model))
+        forward_model = ForwardModel(ParameterNames.of(scene), parameters="inferred", **plain_config(cfg.model))
         model = IdentifyingModel(forward_model, **plain_config(cfg.inference))
     run.write_config(OmegaConf.to_yaml(cfg))
     tracker = Tracker(cfg.logger, run.path / "log", name=f"inference_model-{scene.name}", config=cfg)

@@ -41,9 +41,10 @@ from tqdm import tqdm
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states, spline_controls
+from torchrl_gn.dynamics import Predictor, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards, rollout_video
-from torchrl_gn.modules import BoundForwardModel, IdentifyingModel, specialize
+from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.pretrained import load_model, pretrained_names
@@ -181,11 +182,11 @@ def bind_model(cfg: DictConfig, scene: Scene):
         return made_quick(bound, cfg.compile), inference
     if cfg.variants and not checkpoint.config.get("parametrized"):
         raise ValueError("The model was trained on one system, not on variants: give checkpoint=PATH of one that was.")
-    bound = checkpoint.model.bind(scene, static_key="static" if cfg.variants else None)
+    bound = checkpoint.model.bind(scene, parameters_key="parameters" if cfg.variants else None)
     return made_quick(bound, cfg.compile), None
 
 
-def made_quick(bound: BoundForwardModel, compile: bool) -> BoundForwardModel:
+def made_quick(bound: Predictor, compile: bool) -> Predictor:
     """The model specialised, or as it is where it has a core that cannot be."""
     try:
         return specialize(bound, compile=compile)
@@ -249,9 +250,9 @@ def begin(cfg: DictConfig, env: SceneEnv, bound, inference) -> TensorDictBase:
             )
         now.update({key: simulated[key][:, -1] for key in ("state", "physics")})
         with torch.no_grad():
-            now["static"] = inference.identify(simulated["state"], controls)
-    elif bound is not None and bound.static_key is not None:
-        now["static"] = torch.stack([bound.static_of(scene) for scene in env.scenes])
+            now["parameters"] = inference.identify(simulated["state"], controls)
+    elif bound is not None and bound.parameters_key is not None:
+        now["parameters"] = torch.stack([bound.parameters_of(scene) for scene in env.scenes])
     return now
 
 

@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchrl_gn.evaluation import fresh_errors, summary
-from torchrl_gn.modules import Agent
+from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import as_list, clean_exit, load_checkpoint, save_checkpoint, with_help
 

@@ -1,4 +1,4 @@
-"""Train forward models on the logs of a robot's joints: with a memory, and without.
+"""Train forward models on the logs of a robot's joints: with a hidden state, and without.
 
     python recipes/real_robot.py [log=arm.npz] [timestep=0.01] ["names={angle: q, velocity: dq, command: u}"]
 
@@ -25,10 +25,11 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 
 from torchrl_gn.data import RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_joints, summary
-from torchrl_gn.modules import FeatureSet, ForwardModel, joint_layout
+from torchrl_gn.maths import joint_layout
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import JointChain, load_scene
+from torchrl_gn.scenes import KinematicTree, ParameterNames, load_scene
 from torchrl_gn.training import (
     Budget,
     Checkpoint,
@@ -49,18 +50,18 @@ MODELS = {"feed-forward": "gn", "recurrent": "recurrent"}
 MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")
 
 
-def read(cfg: DictConfig) -> tuple[RobotLog, JointChain]:
+def read(cfg: DictConfig) -> tuple[RobotLog, KinematicTree]:
     """The log, or a simulated one, and the robot as a graph."""
     commands = None if cfg.commands is None else [list(indices) for indices in cfg.commands]
     if cfg.log is not None:
         log = load_robot_log(cfg.log, timestep=cfg.timestep, names=plain_config(cfg)["names"])
-        name, carried_by = Path(cfg.log).stem, cfg.carried_by or ()
+        name, joint_parents = Path(cfg.log).stem, cfg.joint_parents or ()
     else:
         own = cfg.simulated
         scene = load_scene("jaco", timestep=own.timestep)
         log = simulate_log(scene, own.episodes, own.steps, cfg.seed, **plain_config(own.faults))
-        name, carried_by = "simulated jaco", [-1, 0, 1, 2, 3, 4, 5, 5, 5]
-    return log, log_chain(log, name, resample=cfg.resample, commands=commands, carried_by=carried_by)
+        name, joint_parents = "simulated jaco", [-1, 0, 1, 2, 3, 4, 5, 5, 5]
+    return log, log_chain(log, name, resample=cfg.resample, commands=commands, joint_parents=joint_parents)
 
 
 def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
@@ -86,9 +87,9 @@ def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
     return found
 
 
-def make_trainer(cfg: DictConfig, model: ForwardModel, chain: JointChain, data: dict[str, TensorDictBase]) -> Trainer:
+def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data: dict[str, TensorDictBase]) -> Trainer:
     """Wire data, loss and optimiser together."""
-    bound, recurrent = model.bind(cast(Any, chain)), model.options["core"] == "recurrent"
+    bound, recurrent = model.bind(cast(Any, tree)), model.options["core"] == "recurrent"
     loss = ForwardModelLoss(
         bound,
         noise=cfg.noise,
@@ -121,7 +122,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, chain: JointChain, data: 
 
 
 def train(
-    cfg: DictConfig, name: str, path: Path, begun: Checkpoint | None, chain: JointChain, data: dict, tracker: Tracker
+    cfg: DictConfig, name: str, path: Path, begun: Checkpoint | None, tree: KinematicTree, data: dict, tracker: Tracker
 ):
     """Train one of the models, or go on with it; the model and its trainer."""
     if begun:
@@ -129,18 +130,18 @@ def train(
     else:
         torch.manual_seed(cfg.seed)
         model = ForwardModel(
-            FeatureSet.of(cast(Any, chain)),
-            layout=joint_layout(chain.extras),
-            controls=chain.edge_action.shape[1],
+            ParameterNames.of(cast(Any, tree)),
+            layout=joint_layout(tree.extras),
+            controls=tree.edge_action.shape[1],
             joint_axes=False,
             contacts=False,
             core=cast(Any, MODELS[name]),
             **plain_config(cfg.model),
         )
-    trainer = make_trainer(cfg, model, chain, data)
+    trainer = make_trainer(cfg, model, tree, data)
     if not begun:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
-    train_with_progress(trainer, path, begun, tracker, scene=cast(Any, chain), config=plain_config(cfg), name=name)
+    train_with_progress(trainer, path, begun, tracker, scene=cast(Any, tree), config=plain_config(cfg), name=name)
     return model, trainer
 
 
@@ -156,8 +157,8 @@ def main(cfg: DictConfig) -> None:
             f"length={cfg.length} leaves {horizon} steps behind warm_up={cfg.warm_up}, too few for"
             f" validation_steps={cfg.validation_steps}."
         )
-    log, chain = read(cfg)
-    print(chain)
+    log, tree = read(cfg)
+    print(tree)
     data = split(cfg, log)
     run = RunFolder(cfg.run_dir, "real_robot")
     paths = {name: run.path / name / CHECKPOINT_FILE for name in MODELS}
@@ -165,13 +166,13 @@ def main(cfg: DictConfig) -> None:
     for checkpoint in begun.values():
         run.refuse_changes(checkpoint.config, cfg, free=MAY_CHANGE)
     run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"real_robot-{chain.name}", config=cfg)
+    tracker = Tracker(cfg.logger, run.path / "log", name=f"real_robot-{tree.name}", config=cfg)
     tables: dict[str, ErrorTable] = {}
     metrics: dict[str, float] = {}
     for name, path in paths.items():
-        model, trainer = train(cfg, name, path, begun.get(name), chain, data, tracker)
+        model, trainer = train(cfg, name, path, begun.get(name), tree, data, tracker)
         tables[name] = evaluate_errors(
-            model.bind(cast(Any, chain)),
+            model.bind(cast(Any, tree)),
             data["test"],
             horizons=(min(20, horizon), horizon),
             warm_up=cfg.warm_up,
@@ -181,7 +182,7 @@ def main(cfg: DictConfig) -> None:
         metrics |= {f"{name}/steps": trainer.step, f"{name}/training_seconds": trainer.seconds}
     predictions = {name: table.rollouts[0] for name, table in tables.items()}
     pictures = [
-        plot_joints(cast(Any, data["test"]["state"])[0], predictions, chain, run.path / "joints.png"),
+        plot_joints(cast(Any, data["test"]["state"])[0], predictions, tree, run.path / "joints.png"),
         plot_errors(tables, run.path / "errors.png"),
     ]
     tracker.finish(run.write_metrics(metrics, seed=cfg.seed), [*pictures, *paths.values()], trainer.step)

@@ -29,21 +29,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_gn.data import Simulator, collect_trajectories, sample_start_states, spline_controls, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor, UnseenFeatureWarning, specialize
 from torchrl_gn.evaluation import guarded_rollout, kinetic_energy
-from torchrl_gn.modules import (
-    BODY_STATE,
-    BoundForwardModel,
-    FeatureSet,
-    ForwardModel,
-    SpecializedForwardModel,
-    UnseenFeatureWarning,
-    quaternion,
-    specialize,
-)
+from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.processor import SlowDtypeWarning
-from torchrl_gn.scenes import Scene, has_variants, load_scene, make_variants, parameter_ranges
+from torchrl_gn.scenes import ParameterNames, Scene, has_variants, load_scene, make_variants, parameter_ranges
 from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.sweep import Run, refuse_failures, run_all
 
@@ -64,18 +56,18 @@ SMALL_SCENES = (
 class Setting:
     """What the checks of one dtype work on."""
 
-    model: BoundForwardModel
-    exact: BoundForwardModel
+    model: Predictor
+    exact: Predictor
     scene: Scene
     state: Tensor
     action: Tensor
     largest: Tensor
     cfg: DictConfig
 
-    def bind(self, weights: ForwardModel, scene: Scene, **options) -> BoundForwardModel:
+    def bind(self, weights: ForwardModel, scene: Scene, **options) -> Predictor:
         """Other weights or another scene, as this setting's model is."""
         bound = weights.bind(scene, **options)
-        return specialize(bound, dtype=self.model.dtype) if isinstance(self.model, SpecializedForwardModel) else bound
+        return specialize(bound, dtype=self.model.dtype) if isinstance(self.model, SpecializedPredictor) else bound
 
     def size(self, delta: Tensor) -> float:
         """Largest change, relative to the largest true one of its component; infinite if not finite."""
@@ -170,23 +162,26 @@ def saturated(factor: float) -> Callable[[Setting], float]:
 
 
 @cache
-def corners(exact: BoundForwardModel, count: int, seed: int) -> TensorDictBase:
-    """Static values of variants whose parameters are each at an end of the paper's random range."""
+def corners(exact: Predictor, count: int, seed: int) -> TensorDictBase:
+    """Physical parameters of variants whose parameters are each at an end of the paper's random range."""
     system = exact.scene.origin["system"]
     ends = np.array([(one.low, one.high) for one in parameter_ranges(system).values()])
     chosen = np.random.default_rng(seed).integers(2, size=(count, len(ends)))
     variants = make_variants(system, ends[np.arange(len(ends)), chosen], timestep=exact.scene.timestep)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnseenFeatureWarning)  # far outside of what was trained on, on purpose
-        return cast(TensorDictBase, torch.stack([exact.static_of(variant) for variant in variants]))
+        return cast(TensorDictBase, torch.stack([exact.parameters_of(variant) for variant in variants]))
 
 
 @cache
 def variants_at_corners(s: Setting) -> tuple[float, float]:
     """Largest change, and error against float64, of variants at the ends of the paper's random ranges."""
-    static = corners(s.exact, len(s.state), s.cfg.seed)
-    models = s.bind(s.model.model, s.scene, static_key="static"), s.exact.model.bind(s.scene, static_key="static")
-    delta, exact = (model.delta(s.state, s.action, model.fold(static)) for model in models)
+    parameters = corners(s.exact, len(s.state), s.cfg.seed)
+    models = (
+        s.bind(s.model.model, s.scene, parameters_key="parameters"),
+        s.exact.model.bind(s.scene, parameters_key="parameters"),
+    )
+    delta, exact = (model.delta(s.state, s.action, model.fold(parameters)) for model in models)
     return s.size(delta), s.error(delta, exact)
 
 
@@ -196,7 +191,7 @@ def small_scenes(s: Setting) -> float:
     for source in SMALL_SCENES:
         scene = load_scene(source, timestep=0.02)
         data = collect_trajectories(scene, 8, 20, s.cfg.seed)
-        for features in (FeatureSet.of(scene), FeatureSet()):  # with and without globals
+        for features in (ParameterNames.of(scene), ParameterNames()):  # with and without globals
             torch.manual_seed(s.cfg.seed)
             weights = ForwardModel(features, latent=32).to(s.model.network_dtype)
             plain = weights.bind(scene, plain=True)
@@ -217,15 +212,18 @@ def unstable_model(s: Setting) -> float:
         for parameter in weights.core.parameters():
             parameter *= 2
     model = s.bind(weights, s.scene)
-    rollout = model.rollout_and_memory
+    rollout = model.rollout_and_hidden_state
 
     def counted(
-        state: Tensor, actions: Tensor, static: TensorDictBase | None = None, memory: TensorDictBase | None = None
+        state: Tensor,
+        actions: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
     ) -> tuple[Tensor, TensorDictBase | None]:
         predicted.append(actions.shape[:-1].numel())
-        return rollout(state, actions, static, memory)
+        return rollout(state, actions, parameters, hidden_state)
 
-    model.rollout_and_memory = counted
+    model.rollout_and_hidden_state = counted
     guarded = guarded_rollout(model, s.state, s.action.unsqueeze(1).expand(-1, 1000, -1))
     return sum(predicted) / (1000 * len(s.state)) if bool(guarded.diverged.all()) else torch.inf
 
@@ -240,7 +238,7 @@ def long_gradient(s: Setting) -> float:
     repeats = -(-200 // len(s.action))
     actions = s.action.repeat(repeats, 1)[:200].unsqueeze(0).expand(4, -1, -1)
 
-    def gradient(model: BoundForwardModel) -> Tensor:
+    def gradient(model: Predictor) -> Tensor:
         leaf = actions.clone().requires_grad_()
         model.rollout(s.state[:4], leaf)[:, -1, 1:, :3].square().sum().backward()
         assert leaf.grad is not None
@@ -267,12 +265,12 @@ def orientation_loss(s: Setting) -> float:
     """Error of the loss of rotations that are off by 1e-6 rad."""
     loss = ForwardModelLoss(s.exact)
     turned = s.state.clone()
-    off = 1e-6 * torch.as_tensor(s.scene.live[:, 3:6], dtype=torch.float64)
+    off = 1e-6 * torch.as_tensor(s.scene.movable[:, 3:6], dtype=torch.float64)
     turned[..., 3:7] = quaternion.product(quaternion.exp(off.expand(len(turned), -1, -1)), turned[..., 3:7])
     target = BODY_STATE.delta(s.state, turned).to(s.model.network_dtype).double()
     where = BODY_STATE.delta_slices["orientation"]
     scale = s.exact.model.delta_normalizer.inverse_std[where]
-    weight = s.exact.live[:, where] * scale
+    weight = s.exact.movable[:, where] * scale
     expected = (off * weight).square().sum() / (weight > 0).sum()
     errors = loss._component_errors(torch.zeros_like(target), target)
     return s.error(errors[BODY_STATE.names.index("orientation")], expected)

@@ -23,8 +23,8 @@ from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
 
 from torchrl_gn.envs import observation_env
-from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
+from torchrl_gn.policies import Agent
 from torchrl_gn.rewards import TargetDistance
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training import (

@@ -4,10 +4,196 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Callable
 
 import mujoco
 import pytest
 import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.maths import quaternion
+from torchrl_gn.networks import Graph, GraphSize
+from torchrl_gn.policies import ObservationModel
+from torchrl_gn.scenes import ObservationGraph, ParameterNames, Scene, load_scene
+
+# Every joint type, two joints between the same two nodes, a tilted slider, a joint without motor.
+ZOO = """
+<mujoco model="zoo">
+  <option timestep="0.01"/>
+  <worldbody>
+    <body name="floater" pos="0 0 2">
+      <freejoint name="free"/>
+      <geom size=".2"/>
+      <body name="arm" pos=".3 0 0">
+        <joint name="ball" type="ball"/>
+        <geom size=".1"/>
+      </body>
+    </body>
+    <body name="cart" pos="1 0 1" euler="20 30 40">
+      <joint name="slide" type="slide" axis="1 0 0"/>
+      <geom size=".1"/>
+      <body name="wheel" pos="0 0 .3">
+        <joint name="lift" type="slide" axis="0 0 1"/>
+        <joint name="spin" axis="0 1 0"/>
+        <geom size=".1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push" joint="slide" ctrlrange="-1 1" ctrllimited="true"/>
+    <motor name="turn" joint="spin" ctrlrange="-1 1" ctrllimited="true"/>
+  </actuator>
+</mujoco>
+"""
+
+FALLING = """
+<mujoco model="falling">
+  <worldbody>
+    <body><freejoint/><geom size=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+_SOURCES = {"zoo": ZOO, "falling": FALLING}
+
+
+def _load(name: str) -> Scene:
+    return load_scene(_SOURCES.get(name, name))
+
+
+@pytest.fixture(scope="session")
+def scenes() -> dict[str, Scene]:
+    """Scenes by name; ``falling`` has no action."""
+    return {name: _load(name) for name in ("pendulum", "swimmer6", "cheetah", "zoo", "falling")}
+
+
+def _random_states(scene: Scene, *batch: int, seed: int = 0, scale: float = 1.0) -> Tensor:
+    """``[*batch, N, 13]`` float64 states that differ in movable components only."""
+    generator = torch.Generator().manual_seed(seed)
+    movable = torch.as_tensor(scene.movable, dtype=torch.float64)
+    shape = (*batch, scene.num_nodes, 12)
+    noise = scale * movable * torch.randn(shape, generator=generator, dtype=torch.float64)
+    offset = torch.zeros(scene.num_nodes, 3, dtype=torch.float64)
+    offset[1:, 2] = 0.5
+    return torch.cat((offset + noise[..., :3], quaternion.exp(noise[..., 3:6]), noise[..., 6:]), dim=-1)
+
+
+@pytest.fixture(scope="session")
+def random_states() -> Callable[..., Tensor]:
+    return _random_states
+
+
+@pytest.fixture(scope="session")
+def random_actions() -> Callable[..., Tensor]:
+    def draw(scene: Scene, *batch: int, seed: int = 0) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        low, high = (torch.as_tensor(bound) for bound in (scene.action_low, scene.action_high))
+        return low + (high - low) * torch.rand(*batch, scene.num_actions, generator=generator, dtype=torch.float64)
+
+    return draw
+
+
+@pytest.fixture(scope="session")
+def fit(random_states, random_actions) -> Callable[..., ForwardModel]:
+    """Take made-up transitions of a scene into a model's statistics."""
+
+    def fit(model: ForwardModel, scene: Scene) -> ForwardModel:
+        bound = model.bind(scene)
+        state = random_states(scene, 100)
+        bound.update_parameter_normalizers()
+        generator = torch.Generator().manual_seed(1)
+        change = 0.02 * torch.randn(100, scene.num_nodes, 12, generator=generator, dtype=torch.float64)
+        change = change * torch.as_tensor(scene.movable)
+        bound.update_dynamic_normalizers(state, random_actions(scene, 100), model.layout.apply(state, change))
+        return model
+
+    return fit
+
+
+@pytest.fixture
+def make_model(fit) -> Callable[..., ForwardModel]:
+    """A small model with random weights and statistics of made-up transitions of a scene."""
+
+    def make(scene: Scene, *, fitted: bool = True, seed: int = 0, **options) -> ForwardModel:
+        torch.manual_seed(seed)
+        small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+        model = ForwardModel(ParameterNames.of(scene), **(small | options))
+        return fit(model, scene) if fitted else model
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def random_graph() -> Callable[..., Graph]:
+    """Random features on a given topology, float64."""
+
+    def make(size: GraphSize, edge_index: Tensor, num_nodes: int, *batch: int, seed: int = 0) -> Graph:
+        generator = torch.Generator().manual_seed(seed)
+
+        def features(*shape: int) -> Tensor:
+            return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)
+
+        return Graph(
+            features(num_nodes, size.nodes),
+            features(edge_index.shape[1], size.edges),
+            features(size.globals_),
+            edge_index,
+        )
+
+    return make
+
+
+def _branching() -> ObservationGraph:
+    return ObservationGraph(
+        name="branching",
+        observation={"height": 1, "angles": 3, "velocities": 4, "goal": 2},
+        nodes={
+            "torso": ("height", "velocities[0:2]"),
+            "arm": ("velocities[2]",),
+            "leg": (),
+            "foot": ("velocities[3]",),
+        },
+        joints={("torso", "arm"): ("angles[0]",), ("torso", "leg"): ("angles[1:3]",), ("leg", "foot"): ()},
+        globals_=("goal",),
+        actions={("torso", "leg"): (2, 0), ("leg", "foot"): (1,)},
+        identity=True,
+    )
+
+
+@pytest.fixture(scope="session")
+def observation_graphs() -> dict[str, ObservationGraph]:
+    """A chain of equal links, and a tree whose nodes and joints have unlike numbers of features."""
+    return {"swimmer3": ObservationGraph.swimmer(3), "branching": _branching()}
+
+
+@pytest.fixture(scope="session")
+def transitions() -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+    """Made-up float64 observations, actions and next observations of a graph, every number on its own scale."""
+
+    def draw(graph: ObservationGraph, count: int = 50, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        size, actions = graph.num_observations, graph.num_actions
+        observation, change = torch.randn(2, count, size, generator=generator, dtype=torch.float64)
+        scale = torch.arange(1, size + 1, dtype=torch.float64)
+        action = 2 * torch.rand(count, actions, generator=generator, dtype=torch.float64) - 1
+        return scale * observation + 1, action, scale * (observation + 0.1 * change) + 1.5
+
+    return draw
+
+
+@pytest.fixture
+def make_observation_model(transitions) -> Callable[..., ObservationModel]:
+    """A small float64 model with random weights that has seen made-up transitions."""
+
+    def make(graph: ObservationGraph, *, seed: int = 0, **options) -> ObservationModel:
+        torch.manual_seed(seed)
+        model = ObservationModel(graph, **({"latent": 4, "hidden": (8,), "mlp_hidden": (8, 8)} | options)).double()
+        model.update_normalizers(*transitions(graph))
+        return model
+
+    return make
+
 
 # Small tensors gain nothing from more threads, and threads on a busy machine wait for each other.
 THREADS = int(os.environ.get("TORCHRL_GN_TEST_THREADS", "1"))

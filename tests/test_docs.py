@@ -48,7 +48,7 @@ def test_links_lead_somewhere(page):
         assert file.exists(), f"{name(page)} links to {link}"
         if anchor:
             headings = re.findall(r"^#+ (.+)$", FENCE.sub("", file.read_text()), re.MULTILINE)
-            anchors = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            anchors = [re.sub(r"[^\w\- ]", "", yaw_frame.lower()).replace(" ", "-") for yaw_frame in headings]
             assert anchor in anchors, f"{name(page)} links to {link}"
 
 

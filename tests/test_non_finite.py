@@ -21,12 +21,13 @@ from torchrl_gn.data import (
     spline_controls,
     trajectory_buffer,
 )
+from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, guarded_rollout, rollout, rollout_video
-from torchrl_gn.modules import FeatureSet, ForwardModel, Normalizer, specialize
+from torchrl_gn.maths import Normalizer
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.rewards.balance import Balance
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import ParameterNames, load_scene
 from torchrl_gn.training import Budget, Trainer, load_checkpoint, make_optimizer, save_checkpoint
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 
@@ -40,25 +41,25 @@ def scene():
 
 @pytest.fixture
 def given(scene, tmp_path, monkeypatch) -> SimpleNamespace:
-    """Good numbers to spoil one of: trajectories, a batch, physics states, static values, models."""
+    """Good numbers to spoil one of: trajectories, a batch, physics states, physical parameters, models."""
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
     small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    model = ForwardModel(FeatureSet.of(scene), **small)
+    model = ForwardModel(ParameterNames.of(scene), **small)
     trajectories = collect_trajectories(scene, 4, 6, seed=0)
     batch = trajectory_buffer(trajectories, batch_size=5, seed=0).sample().exclude("index")
     loss = ForwardModelLoss(model.bind(scene))
     loss.fit_normalizers(batch)
-    variants = model.bind(scene, static_key="static")
-    static = torch.stack([variants.static_of(scene)] * 5)
+    variants = model.bind(scene, parameters_key="parameters")
+    parameters = torch.stack([variants.parameters_of(scene)] * 5)
     physics = torch.as_tensor(sample_start_states(scene, 5, 0))
     return SimpleNamespace(
         scene=scene,
         trajectories=trajectories,
         batch=batch,
-        own=batch.clone().set("static", static),
-        own_trajectories=trajectories.clone().set("static", static[:4]),
-        static=static,
+        own=batch.clone().set("parameters", parameters),
+        own_trajectories=trajectories.clone().set("parameters", parameters[:4]),
+        parameters=parameters,
         physics=physics,
         start=TensorDict({"physics": physics, "action": torch.zeros(5, 1)}, [5]),
         model=model,
@@ -142,9 +143,9 @@ ENTRIES = [
     ),
     Entry("normaliser's floor", lambda g, bad: Normalizer(3, floor=bad), rf"floor={NUMBER}"),
     Entry(
-        "statistics of static values",
-        lambda g, bad: g.variants.update_static_normalizers(spoil(g.static, bad, "nodes")),
-        "static 'nodes'" + AT_2,
+        "statistics of physical parameters",
+        lambda g, bad: g.variants.update_parameter_normalizers(spoil(g.static, bad, "nodes")),
+        "parameters 'nodes'" + AT_2,
     ),
     Entry(
         "statistics of transitions",
@@ -169,13 +170,13 @@ ENTRIES = [
     ),
     Entry(
         "loss static",
-        lambda g, bad: ForwardModelLoss(g.variants)(spoil(g.own, bad, ("static", "edges"))),
-        "'static' of the batch 'edges'" + AT_2,
+        lambda g, bad: ForwardModelLoss(g.variants)(spoil(g.own, bad, ("parameters", "edges"))),
+        "'parameters' of the batch 'edges'" + AT_2,
     ),
     Entry(
         "fitted static",
-        lambda g, bad: ForwardModelLoss(g.variants).fit_normalizers(spoil(g.own, bad, ("static", "arm"))),
-        "'static' of the batch 'arm'" + AT_2,
+        lambda g, bad: ForwardModelLoss(g.variants).fit_normalizers(spoil(g.own, bad, ("parameters", "arm"))),
+        "'parameters' of the batch 'arm'" + AT_2,
     ),
     Entry("noise", lambda g, bad: ForwardModelLoss(g.bound, noise=bad), rf"noise={NUMBER}"),
     # Environments
@@ -195,8 +196,8 @@ ENTRIES = [
     ),
     Entry(
         "imagined reset static",
-        lambda g, bad: ModelEnv(g.variants).reset(spoil(g.own, bad, ("static", "nodes")), set_state=True),
-        r"ModelEnv\('pendulum'\): 'static' 'nodes'" + AT_2,
+        lambda g, bad: ModelEnv(g.variants).reset(spoil(g.own, bad, ("parameters", "nodes")), set_state=True),
+        r"ModelEnv\('pendulum'\): 'parameters' 'nodes'" + AT_2,
     ),
     Entry(
         "start states",
@@ -229,8 +230,8 @@ ENTRIES = [
     ),
     Entry(
         "errors static",
-        lambda g, bad: evaluate_errors(g.variants, spoil(g.own_trajectories, bad, ("static", "rest")), horizons=()),
-        "static of the trajectories 'rest'" + AT_2,
+        lambda g, bad: evaluate_errors(g.variants, spoil(g.own_trajectories, bad, ("parameters", "rest")), horizons=()),
+        "parameters of the trajectories 'rest'" + AT_2,
     ),
     *(
         Entry(
@@ -238,18 +239,18 @@ ENTRIES = [
             lambda g, bad, run=run, what=what: run(
                 g.variants,
                 **{
-                    name: spoil(value, bad, "pivot" if what == "static" else None) if name == what else value
+                    name: spoil(value, bad, "pivot" if what == "parameters" else None) if name == what else value
                     for name, value in (
                         ("state", g.batch["state"]),
                         ("actions", torch.zeros(5, 3, 1)),
-                        ("static", g.static),
+                        ("parameters", g.static),
                     )
                 },
             ),
             f"{what}.*{AT_2}",
         )
         for run in (rollout, guarded_rollout)
-        for what in ("state", "actions", "static")
+        for what in ("state", "actions", "parameters")
     ),
     Entry(
         "guard's limit",
@@ -299,7 +300,7 @@ def test_a_bad_number_is_named_where_it_comes_in(given, entry, bad):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("key", ["state", "action", ("static", "nodes")], ids=str)
+@pytest.mark.parametrize("key", ["state", "action", ("parameters", "nodes")], ids=str)
 @pytest.mark.parametrize("special", [False, True])
 def test_an_imagined_step_flags_it(given, key, bad, special):
     """A planner's search goes on with the other candidates."""

@@ -16,17 +16,17 @@ import torchrl_gn
 PACKAGE = Path(torchrl_gn.__file__).parent
 
 # A folder imports from itself and from those before it: the data flow is the reading order.
-ALLOWED = {
-    "scenes": set(),
-    "data": {"scenes"},
-    "modules": {"scenes"},
-    "rewards": {"scenes", "modules"},
-    "objectives": {"scenes", "data", "modules", "rewards"},
-    "envs": {"scenes", "data", "modules", "rewards"},
-    "planners": {"scenes", "data", "modules", "rewards", "objectives", "envs"},
-    "evaluation": {"scenes", "data", "modules", "rewards", "objectives", "envs", "planners"},
-    "training": {"scenes", "data", "modules", "rewards", "objectives", "envs", "planners", "evaluation"},
-}
+ORDER = (
+    "scenes", "data", "maths", "networks", "dynamics", "identification", "policies", "rewards",
+    "objectives", "envs", "planners", "evaluation", "training",
+)  # fmt: skip
+APART = {"data", "rewards"}  # nothing in the model's own folders imports these
+ALLOWED = {folder: set(ORDER[:index]) for index, folder in enumerate(ORDER)}
+for folder in ("maths", "networks", "dynamics", "identification", "policies"):
+    ALLOWED[folder] -= APART
+ALLOWED["data"] -= {"maths"}
+ALLOWED["rewards"] -= {"data", "networks", "dynamics", "identification", "policies"}
+ALLOWED["objectives"] -= {"data"}
 ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders
 LATER = (ast.FunctionDef, ast.AsyncFunctionDef)  # what is imported in there is not when the package is
 WITH_PILLOW = {"drawing.py", "gl_frames.py"}  # imported to draw a video, once Pillow was found
@@ -120,14 +120,15 @@ import FOLDERS
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.envs import suite_env
 from torchrl_gn.evaluation import evaluate_errors, plot_errors, rollout_frames
-from torchrl_gn.modules import FeatureSet, ForwardModel, specialize
+from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.scenes import ParameterNames
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, load_checkpoint, make_optimizer, save_checkpoint
 
 scene = load_scene(MJCF)
 trajectories = collect_trajectories(scene, 4, seed=0)
-bound = ForwardModel(FeatureSet.of(scene), node_hidden=(8,), edge_hidden=(8,), global_hidden=(8,)).bind(scene)
+bound = ForwardModel(ParameterNames.of(scene), node_hidden=(8,), edge_hidden=(8,), global_hidden=(8,)).bind(scene)
 loss = ForwardModelLoss(bound)
 buffer = trajectory_buffer(trajectories, batch_size=8, seed=0)
 loss.fit_normalizers(buffer.sample())

@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 from torchrl_gn.evaluation import fresh_errors
-from torchrl_gn.modules import Agent
+from torchrl_gn.policies import Agent
 from torchrl_gn.pretrained import WEIGHTS, load_model, load_pretrained, pretrained_names
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import CheckpointError, save_checkpoint

@@ -7,10 +7,10 @@ import json
 
 import pytest
 import torch
+from torchrl_gn.modules import precision, specialized_model
 
 from torchrl_gn import processor
-from torchrl_gn.modules import precision, specialized_model
-from torchrl_gn.modules.precision import fast_matmul
+from torchrl_gn.maths.precision import fast_matmul
 from torchrl_gn.processor import ProductSpeeds, SlowDtypeWarning, product_speeds
 
 SPEEDS = ProductSpeeds(float64=50.0, float32=100.0, onednn=160.0, bfloat16=300.0, float16=7.0, onednn_error=2e-7)

@@ -16,7 +16,8 @@ import torch
 from tqdm import tqdm
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.modules import fast_matmul, specialize
+from torchrl_gn.dynamics import specialize
+from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.pretrained import load_pretrained
 from torchrl_gn.processor import instruction_sets, processor_name, product_speeds, restrictions

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from torchrl_gn.data import DatasetError, collect, create_dataset, dataset, load_dataset, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import evaluate_errors
-from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, specialize
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.pretrained import load_pretrained
-from torchrl_gn.scenes import load_scene, sample_variants, static_features
+from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants, static_features
 
 SIZES = {"train": 10, "validation": 2, "test": 3, "steps": 6, "variants": 10}
 SMALL = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
@@ -37,11 +37,11 @@ def reorder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(static_features, "_node_columns", lambda *of: list(reversed(columns(*of))))
 
 
-def train_loss(bound: BoundForwardModel, data) -> torch.Tensor:
+def train_loss(bound: Predictor, data) -> torch.Tensor:
     return ForwardModelLoss(bound)(trajectory_buffer(data, batch_size=30, seed=0).sample())["loss_forward_model"]
 
 
-def fit(bound: BoundForwardModel, data) -> None:
+def fit(bound: Predictor, data) -> None:
     ForwardModelLoss(bound).fit_normalizers(trajectory_buffer(data, batch_size=50, seed=0).sample())
 
 
@@ -50,15 +50,15 @@ def model(tmp_path: Path) -> ForwardModel:
     """A model of pendulums, fitted to the data set in the folder."""
     torch.manual_seed(0)
     made = create_dataset(tmp_path / "d", load_scene("pendulum"), **SIZES)
-    assert made.features == FeatureSet.of(made.scene)
+    assert made.features == ParameterNames.of(made.scene)
     model = ForwardModel(made.features, **SMALL).double()
-    fit(model.bind(made.scene, static_key="static"), made.train)
+    fit(model.bind(made.scene, parameters_key="parameters"), made.train)
     return model
 
 
 def test_a_data_set_of_before_serves_a_model_of_before(tmp_path, model, monkeypatch):
     before = load_dataset(tmp_path / "d")
-    bound = model.bind(before.scene, static_key="static")
+    bound = model.bind(before.scene, parameters_key="parameters")
     expected, table = train_loss(bound, before.train), evaluate_errors(bound, before.test, horizons=(5,))
     gain(monkeypatch)
     for opened in (
@@ -66,56 +66,56 @@ def test_a_data_set_of_before_serves_a_model_of_before(tmp_path, model, monkeypa
         load_dataset(tmp_path / "d", load_scene("pendulum")),
         create_dataset(tmp_path / "d", load_scene("pendulum"), **SIZES),
     ):
-        assert opened.features == FeatureSet.of(opened.scene).common(model.features) != model.features
-        again = model.bind(opened.scene, static_key="static", static_features=opened.features)
+        assert opened.features == ParameterNames.of(opened.scene).common(model.features) != model.features
+        again = model.bind(opened.scene, parameters_key="parameters", static_features=opened.features)
         assert torch.equal(train_loss(again, opened.train), expected)
         assert evaluate_errors(again, opened.test, horizons=(5,)).to_metrics() == table.to_metrics()
 
 
 def test_data_collected_now_serve_a_model_of_before(tmp_path, model, monkeypatch):
     before = load_dataset(tmp_path / "d")
-    expected = train_loss(model.bind(before.scene, static_key="static"), before.train)
+    expected = train_loss(model.bind(before.scene, parameters_key="parameters"), before.train)
     variant = sample_variants("pendulum", 1, rng=1)[0]
     state, action = before.train["state"][:3, 0], before.train["action"][:3, 0]
     moved = model.bind(variant).step(state, action)
     gain(monkeypatch)
     made = create_dataset(tmp_path / "new", load_scene("pendulum"), **SIZES)
-    assert made.train["static", "nodes"][0, :, 0].tolist() == [1, 2]
-    bound = model.bind(made.scene, static_key="static")
+    assert made.train["parameters", "nodes"][0, :, 0].tolist() == [1, 2]
+    bound = model.bind(made.scene, parameters_key="parameters")
     assert torch.equal(train_loss(bound, made.train), expected)
     # By hand, and in a snapshot.
     variant = sample_variants("pendulum", 1, rng=1)[0]
-    static = torch.stack([bound.static_of(variant)] * 3)
-    assert static["nodes"].shape[-1] == len(made.features.nodes)
-    torch.testing.assert_close(bound.step(state, action, static), moved, rtol=0, atol=1e-12)
+    parameters = torch.stack([bound.parameters_of(variant)] * 3)
+    assert parameters["nodes"].shape[-1] == len(made.features.nodes)
+    torch.testing.assert_close(bound.step(state, action, parameters), moved, rtol=0, atol=1e-12)
     model.requires_grad_(False)
     quick = specialize(bound)
-    torch.testing.assert_close(quick.step(state, action, static), moved, rtol=0, atol=1e-12)
-    assert quick.own_static()["nodes"].shape[-1] == len(made.features.nodes)
+    torch.testing.assert_close(quick.step(state, action, parameters), moved, rtol=0, atol=1e-12)
+    assert quick.own_parameters()["nodes"].shape[-1] == len(made.features.nodes)
 
 
 def test_columns_in_another_order_are_put_right_when_a_data_set_is_opened(tmp_path, model, monkeypatch):
     before = load_dataset(tmp_path / "d")
-    expected = train_loss(model.bind(before.scene, static_key="static"), before.train)
+    expected = train_loss(model.bind(before.scene, parameters_key="parameters"), before.train)
     reorder(monkeypatch)
     opened = load_dataset(tmp_path / "d")
-    assert opened.features == FeatureSet.of(opened.scene) != before.features
+    assert opened.features == ParameterNames.of(opened.scene) != before.features
     made = create_dataset(tmp_path / "new", load_scene("pendulum"), **SIZES)
-    assert torch.equal(opened.train["static", "nodes"], made.train["static", "nodes"])
-    assert torch.equal(train_loss(model.bind(opened.scene, static_key="static"), opened.train), expected)
+    assert torch.equal(opened.train["parameters", "nodes"], made.train["parameters", "nodes"])
+    assert torch.equal(train_loss(model.bind(opened.scene, parameters_key="parameters"), opened.train), expected)
 
 
 def test_what_is_missing_is_named(tmp_path, model, monkeypatch):
     gain(monkeypatch)
     opened = load_dataset(tmp_path / "d")
-    fresh = ForwardModel(FeatureSet.of(opened.scene), **SMALL).double()
+    fresh = ForwardModel(ParameterNames.of(opened.scene), **SMALL).double()
     with pytest.raises(ValueError, match=r"reads the static features \['charm'\], which samples of 'pendulum' do not"):
-        fresh.bind(opened.scene, static_key="static", static_features=opened.features)
+        fresh.bind(opened.scene, parameters_key="parameters", static_features=opened.features)
     # The data set's names were not given.
     for each in (fresh, model):
         count = len(opened.features.nodes)
         with pytest.raises(ValueError, match=rf"have {count} static features in 'nodes', not the {count + 1} of scene"):
-            fit(each.bind(opened.scene, static_key="static"), opened.train)
+            fit(each.bind(opened.scene, parameters_key="parameters"), opened.train)
     monkeypatch.undo()
     with pytest.raises(ValueError, match=r"Scene 'pendulum' lacks the static features \['charm'\]"):
         fresh.bind(load_scene("pendulum"))

@@ -168,5 +168,5 @@ def test_a_command_that_never_varies_is_named():
     log.command[:, 1] = 3.0
     report = log_trajectories(log, 10)[1]
     assert report.constant == (1,) and "commands that never vary: 1;" in str(report)
-    chain = log_chain(log, "arm")
-    assert chain.action_low[1] == chain.action_high[1] == 3 and chain.action_low[0] < chain.action_high[0]
+    tree = log_chain(log, "arm")
+    assert tree.action_low[1] == tree.action_high[1] == 3 and tree.action_low[0] < tree.action_high[0]

@@ -78,11 +78,11 @@ def test_draws_repeat_and_resume() -> None:
 def test_statics_are_gathered_by_trajectory() -> None:
     data = _counting(5, 7)
     mass = torch.arange(5.0)[:, None]
-    data["static"] = TensorDict({"nodes": mass[..., None].expand(5, 2, 1)}, batch_size=[5])
+    data["parameters"] = TensorDict({"nodes": mass[..., None].expand(5, 2, 1)}, batch_size=[5])
     for window in (1, 3):
         batch = trajectory_buffer(data, batch_size=20, window=window, seed=0).sample()
-        assert batch["static"].batch_size == batch.batch_size
-        assert torch.equal(batch["static", "nodes"][..., 0, 0], batch["index"][..., 0].float())
+        assert batch["parameters"].batch_size == batch.batch_size
+        assert torch.equal(batch["parameters", "nodes"][..., 0, 0], batch["index"][..., 0].float())
 
 
 def test_extending_gives_way_to_the_newest() -> None:

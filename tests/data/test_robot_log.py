@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from torchrl_gn.data import DatasetError, RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log
-from torchrl_gn.scenes import JointChain, load_scene, scene_from_description
+from torchrl_gn.scenes import KinematicTree, load_scene, scene_from_description
 
 PAM = Path(__file__).parents[3] / "shared" / "data" / "pam_arm" / "pam_arm_clean_f32.npz"
 NAMES = {"angle": "q", "velocity": "dq", "command": "action"}
@@ -240,28 +240,28 @@ def test_other_bad_input_is_named(tmp_path):
 
 
 def test_a_chain_is_a_graph_that_comes_back_from_its_description():
-    chain = log_chain(smooth_log(joints=3), "arm", carried_by=[-1, 0, 0])
-    assert isinstance(chain, JointChain)
-    assert chain.senders.tolist() == [0, 1, 1, 2, 1, 3] and chain.receivers.tolist() == [1, 0, 2, 1, 3, 1]
-    assert chain.edge_action[:, 0].tolist() == [0, 0, 1, 1, 2, 2]
-    again = scene_from_description(chain.description())
-    assert again.fingerprint() == chain.fingerprint() and again.senders.tolist() == chain.senders.tolist()
-    assert "joint2, carried by joint0" in str(chain)
-    with pytest.raises(ValueError, match="carried_by="):
-        log_chain(smooth_log(), "arm", carried_by=[0, 1])
+    tree = log_chain(smooth_log(joints=3), "arm", joint_parents=[-1, 0, 0])
+    assert isinstance(tree, KinematicTree)
+    assert tree.senders.tolist() == [0, 1, 1, 2, 1, 3] and tree.receivers.tolist() == [1, 0, 2, 1, 3, 1]
+    assert tree.edge_action[:, 0].tolist() == [0, 0, 1, 1, 2, 2]
+    again = scene_from_description(tree.description())
+    assert again.fingerprint() == tree.fingerprint() and again.senders.tolist() == tree.senders.tolist()
+    assert "joint2, carried by joint0" in str(tree)
+    with pytest.raises(ValueError, match="joint_parents="):
+        log_chain(smooth_log(), "arm", joint_parents=[0, 1])
 
 
 def test_a_chain_of_numpy_numbers_can_be_saved():
-    plain = log_chain(smooth_log(joints=3), "arm", commands=[[2], [0], [1]], carried_by=[-1, 0, 0])
-    own = {"commands": np.array([[2], [0], [1]]), "carried_by": np.array([-1, 0, 0])}
-    chain = log_chain(dataclasses.replace(smooth_log(joints=3), timestep=np.float32(0.01)), "arm", **own)
-    assert json.loads(json.dumps(chain.description())) == chain.description()
-    assert chain.fingerprint() == plain.fingerprint()
+    plain = log_chain(smooth_log(joints=3), "arm", commands=[[2], [0], [1]], joint_parents=[-1, 0, 0])
+    own = {"commands": np.array([[2], [0], [1]]), "joint_parents": np.array([-1, 0, 0])}
+    tree = log_chain(dataclasses.replace(smooth_log(joints=3), timestep=np.float32(0.01)), "arm", **own)
+    assert json.loads(json.dumps(tree.description())) == tree.description()
+    assert tree.fingerprint() == plain.fingerprint()
 
 
 def test_bounds_are_of_every_command():
     with pytest.raises(ValueError, match="action_low of 'arm' must be of its 2 commands, got 1 numbers"):
-        JointChain("arm", ("a", "b"), 0.01, ((0,), (1,)), action_low=np.zeros(1))
+        KinematicTree("arm", ("a", "b"), 0.01, ((0,), (1,)), action_low=np.zeros(1))
     with pytest.raises(ValueError, match="action_low of 'arm' must be of its 1 commands, got 2 numbers"):
         log_chain(smooth_log(), "arm", commands=[[0], [0]])
 

@@ -20,7 +20,7 @@ from torchrl_gn.data import (
     spline_controls,
     trajectory_buffer,
 )
-from torchrl_gn.scenes import Scene, SceneValues, load_scene, make_variants, parameter_ranges, sample_variants
+from torchrl_gn.scenes import PhysicalParameters, Scene, load_scene, make_variants, parameter_ranges, sample_variants
 
 SYSTEMS = ["pendulum", "cartpole", "swimmer3", "swimmer6", "cheetah", "jaco"]
 SIZES = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
@@ -48,8 +48,8 @@ def test_together_as_each_alone(system: str) -> None:
         alone = Simulator(scene, 1).rollout(data["physics"][i, 0], data["action"][i])
         assert alone["stable"] and torch.equal(alone["state"], data["state"][i])
         assert torch.equal(alone["physics"], data["physics"][i])
-        for name, value in SceneValues.of(scene)._asdict().items():
-            assert torch.equal(data["static", name][i], value)
+        for name, value in PhysicalParameters.of(scene)._asdict().items():
+            assert torch.equal(data["parameters", name][i], value)
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -58,13 +58,13 @@ def test_pinned_bodies_stay_pinned(system: str) -> None:
     state = collect_trajectories(scenes, 5, 20)["state"]
     for scene, states in zip(scenes, state.numpy(), strict=True):
         pins = []
-        for node, arms in (
-            (scene.linkage.parent, scene.linkage.parent_arm),
-            (np.arange(scene.num_nodes), scene.linkage.arm),
+        for node, anchors in (
+            (scene.joint_anchors.parent, scene.joint_anchors.parent_anchor),
+            (np.arange(scene.num_nodes), scene.joint_anchors.child_anchor),
         ):
             w, v = states[:, node, 3:4], states[:, node, 4:7]
-            turned = np.cross(v, np.cross(v, arms) + w * arms)
-            pins.append(states[:, node, :3] + arms + 2 * turned)
+            turned = np.cross(v, np.cross(v, anchors) + w * anchors)
+            pins.append(states[:, node, :3] + anchors + 2 * turned)
         assert np.abs(pins[1] - pins[0]).max() < 1e-12
         assert np.ptp(states[:, 1:, :7], axis=0).max() > 1e-3  # and something moves
 
@@ -104,13 +104,13 @@ def test_on_disk_as_in_memory(tmp_path: Path, count: int) -> None:
         data = getattr(loaded, split)
         assert _equal(getattr(made, split), data)
         own = min(count, SIZES[split])
-        parameters = data["parameters"].numpy()
+        parameters = data["variant_parameters"].numpy()
         assert len(np.unique(parameters, axis=0)) == own
         assert np.array_equal(parameters, parameters[np.arange(len(data)) % own])
         seen.append(parameters[:own])
         scenes = make_variants("cartpole", parameters[:own], timestep=0.02)
         expected = collect_trajectories(scenes, SIZES[split], 6, seed=3, split=number)
-        assert _equal(data.exclude("parameters"), expected)
+        assert _equal(data.exclude("variant_parameters"), expected)
         last = loaded.scene_of(split, len(data) - 1)
         assert last.fingerprint() == scenes[(len(data) - 1) % own].fingerprint()
     everything = np.concatenate(seen)
@@ -147,7 +147,7 @@ def test_damaged_and_other_data_are_refused(tmp_path: Path) -> None:
     for other in (None, 7):
         with pytest.raises(DatasetError, match=f"variants is 6, not {other}"):
             create_dataset(tmp_path / "d", scene, **SIZES, variants=other)
-    file = tmp_path / "d" / "validation" / "static" / "nodes.bin"
+    file = tmp_path / "d" / "validation" / "parameters" / "nodes.bin"
     content = bytearray(file.read_bytes())
     content[50] ^= 1
     file.write_bytes(content)
@@ -174,5 +174,5 @@ def test_samples_bring_their_trajectorys_values(tmp_path: Path) -> None:
     for window in (1, 3):
         batch = trajectory_buffer(data, batch_size=40, window=window, seed=0).sample()
         trajectory = batch["index"][..., 0]
-        for name in SceneValues._fields:
-            assert torch.equal(batch["static", name], data["static", name][trajectory])
+        for name in PhysicalParameters._fields:
+            assert torch.equal(batch["parameters", name], data["parameters", name][trajectory])

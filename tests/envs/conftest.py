@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torchrl_gn.envs import ModelEnv, SceneEnv
-from torchrl_gn.modules import quaternion
+from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import Scene, load_scene
 

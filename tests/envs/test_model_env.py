@@ -13,12 +13,12 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
+from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.dynamics.model import ParameterNames
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.envs.specs import reward_of
-from torchrl_gn.modules import ForwardModel
-from torchrl_gn.modules.forward_model import FeatureSet
 from torchrl_gn.rewards import make_reward
-from torchrl_gn.scenes import SceneValues, load_scene
+from torchrl_gn.scenes import PhysicalParameters, load_scene
 
 
 def rollout(env: ModelEnv, start: TensorDict, actions: torch.Tensor) -> TensorDict:
@@ -139,11 +139,11 @@ def test_steps_a_true_environments_tensordict(scene_env, model_env):
 def test_runs_a_bound_forward_model(swimmer):
     torch.manual_seed(0)
     small = {"latent": 8, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    model = ForwardModel(FeatureSet.of(swimmer), **small)
+    model = ForwardModel(ParameterNames.of(swimmer), **small)
     env = ModelEnv(model.bind(swimmer), seed=0)
     check_env_specs(env)
     true = SceneEnv(swimmer, seed=0).rollout(4, tensordict=TensorDict(batch_size=[3]))
-    env.world_model.update_static_normalizers()
+    env.world_model.update_parameter_normalizers()
     env.world_model.update_dynamic_normalizers(true["state"], true["action"], true["next", "state"])
     actions = true["action"].clone().requires_grad_()
     played = rollout(env, true[:, 0].select("state"), actions)
@@ -154,31 +154,31 @@ def test_runs_a_bound_forward_model(swimmer):
 
 def test_samples_of_another_scene_are_refused(pendulum):
     small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    env = ModelEnv(ForwardModel(FeatureSet.of(pendulum), **small).bind(pendulum), seed=0)
+    env = ModelEnv(ForwardModel(ParameterNames.of(pendulum), **small).bind(pendulum), seed=0)
     start = env.rand_action(env.reset(TensorDict(batch_size=[2])))
     own, heavy = (
-        SceneValues.of(scene).tensordict().expand(2)
+        PhysicalParameters.of(scene).tensordict().expand(2)
         for scene in (pendulum, load_scene("pendulum", parameters={"mass": 2.0}))
     )
     expected = env.step(start.clone())["next", "state"]
-    assert torch.equal(env.step(start.clone().set("static", own))["next", "state"], expected)
+    assert torch.equal(env.step(start.clone().set("parameters", own))["next", "state"], expected)
     with pytest.raises(ValueError, match="other static 'nodes' than scene 'pendulum'"):
-        env.step(start.clone().set("static", heavy))
+        env.step(start.clone().set("parameters", heavy))
 
 
-@pytest.mark.parametrize("kind", ["static", "inferred", "recurrent"])
+@pytest.mark.parametrize("kind", ["parameters", "inferred", "recurrent"])
 def test_specs_name_what_else_a_model_reads(swimmer, kind):
     small = {"latent": 8, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
     options = {
-        "static": {},
-        "inferred": {"static": "inferred", "inferred": (4, 4, 4)},
-        "recurrent": {"core": "recurrent", "memory": [4, 4, 4]},
+        "parameters": {},
+        "inferred": {"parameters": "inferred", "inferred": (4, 4, 4)},
+        "recurrent": {"core": "recurrent", "hidden_state": [4, 4, 4]},
     }
-    model = ForwardModel(FeatureSet.of(swimmer), **options[kind], **small)
-    env = ModelEnv(model.bind(swimmer, static_key=None if kind == "recurrent" else "static"), seed=0)
+    model = ForwardModel(ParameterNames.of(swimmer), **options[kind], **small)
+    env = ModelEnv(model.bind(swimmer, parameters_key=None if kind == "recurrent" else "parameters"), seed=0)
     check_env_specs(env)
-    assert ("memory" in env.observation_spec.keys()) == (kind == "recurrent")
-    assert ("static" in env.state_spec.keys()) == (kind != "recurrent")
+    assert ("hidden_state" in env.observation_spec.keys()) == (kind == "recurrent")
+    assert ("parameters" in env.state_spec.keys()) == (kind != "recurrent")
 
 
 def test_a_given_start_must_be_given(scene_env, model_env):

@@ -8,8 +8,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, quaternion
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.dynamics import ForwardModel, Predictor
+from torchrl_gn.maths import quaternion
+from torchrl_gn.scenes import ParameterNames, load_scene
 
 SYSTEMS = ("pendulum", "swimmer6", "cheetah")
 
@@ -20,10 +21,10 @@ def scenes():
 
 
 def random_states(scene, *shape: int, seed: int = 0) -> torch.Tensor:
-    """``[*shape, N, 13]`` states that differ in live components only; fixed nodes stay at the origin."""
+    """``[*shape, N, 13]`` states that differ in movable components only; fixed nodes stay at the origin."""
     generator = torch.Generator().manual_seed(seed)
-    live = torch.as_tensor(scene.live, dtype=torch.float64)
-    noise = torch.randn(*shape, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * live
+    movable = torch.as_tensor(scene.movable, dtype=torch.float64)
+    noise = torch.randn(*shape, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * movable
     turn = quaternion.exp(noise[..., 3:6])
     return torch.cat((noise[..., :3], turn, noise[..., 6:]), dim=-1)
 
@@ -44,11 +45,11 @@ def as_model(function, scene) -> TensorDictModule:
 def moving_states(scene, steps: int) -> torch.Tensor:
     """``[steps + 1, N, 13]`` a smooth made-up motion."""
     time = torch.linspace(0, 1, steps + 1, dtype=torch.float64)[:, None, None]
-    live = torch.as_tensor(scene.live, dtype=torch.float64)
-    position = live[:, :3] * torch.cat((time, 0.1 * time, 0.5 + 0 * time), dim=-1)
-    position = position + live[:, :3] * 0.2 * torch.arange(scene.num_nodes, dtype=torch.float64)[:, None]
-    turn = quaternion.exp(live[:, 3:6] * torch.sin(2 * math.pi * time))
-    return torch.cat((position, turn, live[:, 6:] * time), dim=-1)
+    movable = torch.as_tensor(scene.movable, dtype=torch.float64)
+    position = movable[:, :3] * torch.cat((time, 0.1 * time, 0.5 + 0 * time), dim=-1)
+    position = position + movable[:, :3] * 0.2 * torch.arange(scene.num_nodes, dtype=torch.float64)[:, None]
+    turn = quaternion.exp(movable[:, 3:6] * torch.sin(2 * math.pi * time))
+    return torch.cat((position, turn, movable[:, 6:] * time), dim=-1)
 
 
 @pytest.fixture(scope="session")
@@ -58,12 +59,12 @@ def simulated(scenes) -> TensorDict:
 
 
 @pytest.fixture
-def swimmer(scenes, simulated) -> BoundForwardModel:
+def swimmer(scenes, simulated) -> Predictor:
     """A small untrained model of the swimmer that knows how its states vary."""
     torch.manual_seed(0)
     small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    bound = ForwardModel(FeatureSet.of(scenes["swimmer6"]), **small).double().bind(scenes["swimmer6"])
-    bound.update_static_normalizers()
+    bound = ForwardModel(ParameterNames.of(scenes["swimmer6"]), **small).double().bind(scenes["swimmer6"])
+    bound.update_parameter_normalizers()
     state = simulated["state"]
     bound.update_dynamic_normalizers(state[:, :-1], simulated["action"], state[:, 1:])
     return bound

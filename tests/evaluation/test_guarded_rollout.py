@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
+from torchrl_gn.dynamics import specialize
 from torchrl_gn.evaluation import evaluate_errors, guarded_rollout, rollout
-from torchrl_gn.modules import specialize
 
 from .conftest import as_model, random_states
 
@@ -27,11 +27,11 @@ def no_limits(swimmer, monkeypatch) -> None:
 @pytest.fixture
 def sizes(swimmer, monkeypatch) -> list[int]:
     """Batch sizes and lengths of the rollouts that the model is asked for."""
-    asked, plain = [], swimmer.rollout_and_memory
+    asked, plain = [], swimmer.rollout_and_hidden_state
 
-    def counted(state, actions, static=None, memory=None):
+    def counted(state, actions, parameters=None, hidden_state=None):
         asked.append((len(state), actions.shape[-2]))
-        return plain(state, actions, static, memory)
+        return plain(state, actions, parameters, hidden_state)
 
     monkeypatch.setattr(swimmer, "rollout_and_memory", counted)
     return asked
@@ -120,18 +120,18 @@ def test_before_training_only_finite_numbers_are_asked_for(swimmer, simulated):
 
 def test_rollouts_with_static_values_of_their_own(swimmer, simulated, sizes):
     state, actions = simulated["state"][:, 0].clone(), simulated["action"].clone()
-    static = torch.stack([swimmer.static_of(swimmer.scene)] * 6)
+    parameters = torch.stack([swimmer.parameters_of(swimmer.scene)] * 6)
     factors = torch.linspace(0.5, 1.5, 6, dtype=torch.float64)[:, None, None]
-    static = static.set("nodes", factors * static["nodes"]).set("arm", factors * static["arm"])
-    expected = swimmer.rollout(state, actions, static).detach()
+    parameters = parameters.set("nodes", factors * parameters["nodes"]).set("arm", factors * parameters["arm"])
+    expected = swimmer.rollout(state, actions, parameters).detach()
     assert (expected - swimmer.rollout(state, actions)).abs().max() > 1e-3
     actions[1, 30] = 1e308
-    guarded = guarded_rollout(swimmer, state, actions, static)
+    guarded = guarded_rollout(swimmer, state, actions, parameters)
     assert guarded.good_steps.tolist() == [STEPS, 30, *[STEPS] * 4]
     rest = torch.arange(6) != 1
     torch.testing.assert_close(guarded.states[rest], expected[rest])
-    torch.testing.assert_close(guarded_rollout(swimmer, state, actions, static[0]).states[0], expected[0])
-    grouped = guarded_rollout(swimmer, state.view(2, 3, 7, 13), actions.view(2, 3, STEPS, 5), static.view(2, 3))
+    torch.testing.assert_close(guarded_rollout(swimmer, state, actions, parameters[0]).states[0], expected[0])
+    grouped = guarded_rollout(swimmer, state.view(2, 3, 7, 13), actions.view(2, 3, STEPS, 5), parameters.view(2, 3))
     torch.testing.assert_close(grouped.states.flatten(0, 1), guarded.states, rtol=0, atol=1e-12)
     assert grouped.good_steps.tolist() == [[STEPS, 30, STEPS], [STEPS] * 3]
 
@@ -182,17 +182,17 @@ def test_errors_count_what_diverged(swimmer, simulated):
 
 
 def test_errors_of_samples_with_static_values_of_their_own(swimmer, simulated):
-    bound = swimmer.model.bind(swimmer.scene, static_key="static")
-    static = torch.stack([bound.static_of(swimmer.scene)] * 6)
-    static["arm"][3:] *= 1.5
-    own = simulated.clone().set("static", static)
+    bound = swimmer.model.bind(swimmer.scene, parameters_key="parameters")
+    parameters = torch.stack([bound.parameters_of(swimmer.scene)] * 6)
+    parameters["arm"][3:] *= 1.5
+    own = simulated.clone().set("parameters", parameters)
     table = evaluate_errors(bound, own, horizons=(5,), batch_size=4)
     halves = [evaluate_errors(bound, half, horizons=(5,)) for half in (own[:3], own[3:])]
     for name in table.errors:
         squared = [sum(half[name].squared.values()) for half in halves]
         assert sum(table[name].squared.values()) == pytest.approx(sum(squared) / 2, rel=1e-9)
         assert squared[0] != pytest.approx(squared[1], rel=1e-3)
-    with pytest.raises(KeyError, match="static values at 'static'"):
+    with pytest.raises(KeyError, match="physical parameters at 'parameters'"):
         evaluate_errors(bound, simulated, horizons=())
     with pytest.raises(ValueError, match="other static 'arm' than scene 'swimmer6'"):
         evaluate_errors(swimmer, own, horizons=())

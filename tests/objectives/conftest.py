@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.modules import FeatureSet, ForwardModel
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.scenes import ParameterNames, Scene, load_scene
 
 FALLING = """
 <mujoco model="falling">
@@ -50,7 +50,7 @@ def windows(scenes) -> dict[str, TensorDict]:
     generator = torch.Generator().manual_seed(0)
     change = 0.1 * torch.randn(40, 6, 2, 12, generator=generator, dtype=torch.float64)
     change[..., 0, :] = 0
-    from torchrl_gn.modules import BODY_STATE
+    from torchrl_gn.maths import BODY_STATE
 
     start = torch.zeros(40, 2, 13, dtype=torch.float64)
     start[..., 3] = 1
@@ -68,7 +68,7 @@ def make_loss(scenes, windows) -> Callable[..., ForwardModelLoss]:
     def make(name: str = "swimmer6", *, fitted: bool = True, model: dict | None = None, **options) -> ForwardModelLoss:
         torch.manual_seed(0)
         small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-        network = ForwardModel(FeatureSet.of(scenes[name]), **(small | (model or {}))).double()
+        network = ForwardModel(ParameterNames.of(scenes[name]), **(small | (model or {}))).double()
         loss = ForwardModelLoss(network.bind(scenes[name]), **options)
         if fitted:
             loss.fit_normalizers(windows[name].reshape(-1))

@@ -12,7 +12,9 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.modules import Agent, FeatureSet, ForwardModel, IdentifyingModel, Normalizer
+from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.identification import IdentifyingModel
+from torchrl_gn.maths import Normalizer
 from torchrl_gn.objectives import (
     ForwardModelLoss,
     IdentificationLoss,
@@ -20,7 +22,8 @@ from torchrl_gn.objectives import (
     SeveralScenesLoss,
     SVGLoss,
 )
-from torchrl_gn.scenes import ObservationGraph, load_scene
+from torchrl_gn.policies import Agent
+from torchrl_gn.scenes import ObservationGraph, ParameterNames, load_scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
 
@@ -39,7 +42,7 @@ class Case(NamedTuple):
 
 def forward_model(**options) -> Case:
     scene = load_scene("pendulum")
-    loss = ForwardModelLoss(ForwardModel(FeatureSet.of(scene), **SMALL, **options).bind(scene))
+    loss = ForwardModelLoss(ForwardModel(ParameterNames.of(scene), **SMALL, **options).bind(scene))
     batch = transitions("pendulum")
     return Case(
         loss,
@@ -51,7 +54,7 @@ def forward_model(**options) -> Case:
 
 
 def several_scenes() -> Case:
-    model = ForwardModel(FeatureSet.of(load_scene("pendulum")), **SMALL)
+    model = ForwardModel(ParameterNames.of(load_scene("pendulum")), **SMALL)
     names = ("pendulum", "cartpole")
     loss = SeveralScenesLoss([ForwardModelLoss(model.bind(load_scene(name))) for name in names])
     batch = [transitions(name) for name in names]
@@ -60,7 +63,7 @@ def several_scenes() -> Case:
 
 def identification() -> Case:
     scene = load_scene("pendulum")
-    forward = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=(3, 3, 3), **SMALL)
+    forward = ForwardModel(ParameterNames.of(scene), parameters="inferred", inferred=(3, 3, 3), **SMALL)
     loss = IdentificationLoss(IdentifyingModel(forward), scene, phase=3)
     batch = transitions("pendulum", window=4)
     flat = transitions("pendulum")
@@ -97,7 +100,7 @@ def agent_case(kind: str) -> Case:
 CASES = {
     "forward model": forward_model,
     "recurrent": lambda: forward_model(core="recurrent", memory=(3, 3, 3)),
-    "true parameters hidden": lambda: forward_model(static="none"),
+    "true parameters hidden": lambda: forward_model(parameters="none"),
     "several scenes": several_scenes,
     "identification": identification,
     "observations": lambda: agent_case("observations"),

@@ -8,10 +8,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_gn.data import create_dataset, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import evaluate_errors
-from torchrl_gn.modules import BODY_STATE, FeatureSet, ForwardModel, quaternion
+from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import ParameterNames, load_scene
 
 COMPONENTS = BODY_STATE.names
 
@@ -22,7 +23,7 @@ def predict(loss: ForwardModelLoss, delta) -> list[Tensor]:
 
     def stub(state: Tensor, action: Tensor, _) -> Tensor:
         fed.append(state)
-        return delta(state, action) * loss.model.live
+        return delta(state, action) * loss.model.movable
 
     loss.model.delta = stub
     return fed
@@ -37,8 +38,8 @@ def unit_scale(loss: ForwardModelLoss) -> None:
 
 
 def by_hand(loss: ForwardModelLoss, delta: Tensor, target: Tensor) -> dict[str, Tensor]:
-    """Mean squared error of each component, in units of its change's spread, over live channels."""
-    normalizer, live = loss.model.model.delta_normalizer, loss.model.live
+    """Mean squared error of each component, in units of its change's spread, over movable channels."""
+    normalizer, movable = loss.model.model.delta_normalizer, loss.model.movable
     errors = {}
     for name in COMPONENTS:
         where = BODY_STATE.delta_slices[name]
@@ -46,7 +47,7 @@ def by_hand(loss: ForwardModelLoss, delta: Tensor, target: Tensor) -> dict[str, 
         if name == "orientation":
             expected, predicted = quaternion.exp(target[..., where]), quaternion.exp(delta[..., where])
             difference = 2 * quaternion.product(quaternion.conjugate(expected), predicted)[..., 1:]
-        counts = (live & ~normalizer.constant)[:, where]
+        counts = (movable & ~normalizer.constant)[:, where]
         scaled = (difference * normalizer.inverse_std[where])[..., counts]
         errors[name] = scaled.square().mean() if counts.any() else torch.zeros((), dtype=torch.float64)
     return errors
@@ -84,9 +85,9 @@ def test_the_value_is_the_mean_over_components_of_scaled_errors(make_loss, windo
     expected = by_hand(loss, delta, BODY_STATE.delta(batch["state"], batch["next", "state"]))
     for component, error in expected.items():
         torch.testing.assert_close(out[f"error_{component}"], error.detach(), rtol=1e-12, atol=0)
-    live = [error for error in expected.values() if error > 0]
-    assert len(live) == (2 if name == "pendulum" else 4)  # the pendulum's body frame never moves
-    torch.testing.assert_close(out["loss_forward_model"], sum(live) / len(live), rtol=1e-12, atol=0)
+    movable = [error for error in expected.values() if error > 0]
+    assert len(movable) == (2 if name == "pendulum" else 4)  # the pendulum's body frame never moves
+    torch.testing.assert_close(out["loss_forward_model"], sum(movable) / len(movable), rtol=1e-12, atol=0)
 
 
 def test_predicting_the_mean_change_costs_one(make_loss, windows):
@@ -215,14 +216,14 @@ def test_noise_has_the_size_of_each_channels_spread(make_loss, windows):
     fed = predict(loss, lambda state, action: state.new_zeros(*state.shape[:-1], 12))
     loss(batch)
     noise = BODY_STATE.delta(batch["state"], fed[0])
-    live = loss.model.live
+    movable = loss.model.movable
     assert torch.equal(fed[0][:, 0], batch["state"][:, 0])  # the world
-    assert (noise[:, ~live][..., :].abs() < 1e-15).all()
-    expected = (0.1 * loss.noise_scale).expand_as(live)
+    assert (noise[:, ~movable][..., :].abs() < 1e-15).all()
+    expected = (0.1 * loss.noise_scale).expand_as(movable)
     spread, mean = noise.std(0), noise.mean(0)
-    assert (expected[live] > 0).all()
-    torch.testing.assert_close(spread[live], expected[live], rtol=0.03, atol=0)
-    assert (mean[live].abs() < 5 * expected[live] / 20000**0.5).all()
+    assert (expected[movable] > 0).all()
+    torch.testing.assert_close(spread[movable], expected[movable], rtol=0.03, atol=0)
+    assert (mean[movable].abs() < 5 * expected[movable] / 20000**0.5).all()
     # Radians for orientations; each state channel's own spread for the rest.
     assert torch.equal(loss.noise_scale[3:6], torch.ones(3).double())
     moving = loss.model.frame.recentered(windows["swimmer6"]["state"])[..., loss.model.incidence.predicted, :]
@@ -265,12 +266,12 @@ def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, no
     if model.integrate:
         target = BODY_STATE.residual(state, target, loss.model.timestep)
     if model.align:
-        turn = loss.model.frame.heading_turn(state, loss.model.values).rotation
-        target = BODY_STATE.turn_delta(target, quaternion.conjugate(turn))
-    live = loss.model.live
+        turn = loss.model.frame.yaw_rotation(state, loss.model.values).rotation
+        target = BODY_STATE.rotate_delta(target, quaternion.conjugate(turn))
+    movable = loss.model.movable
     targets = model.residual_normalizer(target)
-    for channel in live.any(0).nonzero().flatten().tolist():
-        seen = targets[..., channel][:, live[:, channel]]
+    for channel in movable.any(0).nonzero().flatten().tolist():
+        seen = targets[..., channel][:, movable[:, channel]]
         assert seen.mean().item() == pytest.approx(0, abs=1e-9)
         assert seen.var(correction=0).item() == pytest.approx(1, rel=1e-9)
     dynamic = loss.model.dynamic_graph(state, batch["action"])
@@ -347,19 +348,19 @@ def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
     torch.manual_seed(0)
     scene, small = load_scene(name), {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
     data = create_dataset(tmp_path, scene, train=6, validation=1, test=1, steps=4, variants=6)
-    model = ForwardModel(FeatureSet.of(scene), **small).double()
-    loss = ForwardModelLoss(model.bind(scene, static_key="static"))
+    model = ForwardModel(ParameterNames.of(scene), **small).double()
+    loss = ForwardModelLoss(model.bind(scene, parameters_key="parameters"))
     loss.fit_normalizers(trajectory_buffer(data.train, batch_size=200, seed=0).sample())
     for window in (1, 3):
         batch = trajectory_buffer(data.train, batch_size=8, window=window, seed=1).sample()
         alone = []
         for sample in batch:
             own = data.scene_of("train", int(sample["index"].flatten()[0]))
-            one = ForwardModelLoss(model.bind(own, strict=True))(sample.exclude("static").unsqueeze(0))
+            one = ForwardModelLoss(model.bind(own, strict=True))(sample.exclude("parameters").unsqueeze(0))
             alone.append(one["loss_forward_model"])
         torch.testing.assert_close(loss(batch)["loss_forward_model"], torch.stack(alone).mean(), rtol=1e-9, atol=0)
     model.requires_grad_(False)
-    table = evaluate_errors(model.bind(scene, static_key="static"), data.train[:1], horizons=(4,))
-    own = evaluate_errors(model.bind(data.scene_of("train", 0)), data.train[:1].exclude("static"), horizons=(4,))
+    table = evaluate_errors(model.bind(scene, parameters_key="parameters"), data.train[:1], horizons=(4,))
+    own = evaluate_errors(model.bind(data.scene_of("train", 0)), data.train[:1].exclude("parameters"), horizons=(4,))
     for error in ("one_step_error", "rollout_error_4"):
         assert table[error].total == pytest.approx(own[error].total, rel=1e-9)

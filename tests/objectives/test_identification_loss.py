@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import identification_errors, linear_probe
-from torchrl_gn.modules import FeatureSet, ForwardModel, IdentifyingModel
+from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss
-from torchrl_gn.scenes import load_scene, sample_variants
+from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants
 
 SMALL = {"edge_hidden": (16,), "node_hidden": (16,), "global_hidden": (16,)}
 
@@ -25,7 +26,7 @@ def make_loss(trajectories):
     def make(**options) -> IdentificationLoss:
         torch.manual_seed(0)
         scene = load_scene("pendulum")
-        forward_model = ForwardModel(FeatureSet.of(scene), static="inferred", latent=16, **SMALL)
+        forward_model = ForwardModel(ParameterNames.of(scene), parameters="inferred", latent=16, **SMALL)
         loss = IdentificationLoss(IdentifyingModel(forward_model, **SMALL), scene, **options)
         loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=500, seed=0).sample())
         return loss
@@ -40,12 +41,14 @@ def test_it_is_the_forward_models_loss_with_the_inferred_graph(make_loss, trajec
     assert batch.shape == (5, 6 + 2 * length)
     time, trajectory = batch["index"][..., 1], batch["index"][..., 0]
     assert (trajectory == trajectory[:, :1]).all() and (time[:, :6].diff(dim=1) == 1).all()
-    static = loss.inference.infer(batch["state"][:, :6], batch["action"][:, :6], batch["next", "state"][:, :6]).static
+    parameters = loss.inference.infer(
+        batch["state"][:, :6], batch["action"][:, :6], batch["next", "state"][:, :6]
+    ).parameters
     alone = []
-    for sample, own in zip(batch, static, strict=True):
+    for sample, own in zip(batch, parameters, strict=True):
         for part in range(2):
             steps = sample[6 + part * length : 6 + (part + 1) * length].select("state", "action", "next")
-            steps = steps.set("static", own.expand(length)).unsqueeze(0)
+            steps = steps.set("parameters", own.expand(length)).unsqueeze(0)
             alone.append(loss.prediction(steps)["loss_forward_model"])
     torch.testing.assert_close(loss(batch)["loss_forward_model"], torch.stack(alone).mean())
 
@@ -89,9 +92,9 @@ def test_one_loss_trains_both_models_and_identification_pays(make_loss, trajecto
 def test_true_parameters_in_the_samples_are_not_read(make_loss, trajectories):
     loss = make_loss(phase=6)
     batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(1, 1), seed=0).sample()
-    mixed = batch.clone().set("static", batch["static"].apply(lambda value: value.flip(0)))
+    mixed = batch.clone().set("parameters", batch["parameters"].apply(lambda value: value.flip(0)))
     assert torch.equal(loss(batch)["loss_forward_model"], loss(mixed)["loss_forward_model"])
-    assert "static" not in loss.in_keys
+    assert "parameters" not in loss.in_keys
 
 
 def test_what_does_not_fit_is_named(make_loss, trajectories):
@@ -125,7 +128,7 @@ def test_of_a_model_that_diverged_the_loss_is_nan(make_loss, trajectories):
 
 def test_a_model_that_reads_true_parameters_is_no_part_of_it():
     scene = load_scene("pendulum")
-    model = ForwardModel(FeatureSet.of(scene), latent=16, **SMALL)
+    model = ForwardModel(ParameterNames.of(scene), latent=16, **SMALL)
     loss = ForwardModelLoss(model.bind(scene))
     assert not isinstance(loss.trained, IdentifyingModel)
 

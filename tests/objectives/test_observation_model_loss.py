@@ -8,8 +8,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.modules import LearnedReward, ObservationModel
 from torchrl_gn.objectives import ObservationModelLoss
+from torchrl_gn.policies import LearnedReward, ObservationModel
 from torchrl_gn.scenes import ObservationGraph
 
 GRAPH = ObservationGraph.swimmer(3)

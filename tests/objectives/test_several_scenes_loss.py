@@ -7,9 +7,9 @@ import torch
 from torchrl.data import ReplayBufferEnsemble
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.modules import FeatureSet, ForwardModel
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import ParameterNames, load_scene
 
 NAMES = ("pendulum", "cartpole")  # both turn about one axis, at different speeds
 
@@ -19,7 +19,7 @@ def losses() -> list[ForwardModelLoss]:
     """Losses of two scenes that share a model."""
     torch.manual_seed(0)
     small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    model = ForwardModel(FeatureSet.of(load_scene("pendulum")), **small).double()
+    model = ForwardModel(ParameterNames.of(load_scene("pendulum")), **small).double()
     return [ForwardModelLoss(model.bind(load_scene(name))) for name in NAMES]
 
 
@@ -55,8 +55,8 @@ def test_every_scene_counts_by_its_own_scale(losses, buffer):
         alone = ForwardModelLoss(model.bind(loss.model.scene))
         alone.fit_normalizers(part)
         assert torch.equal(loss.error_weight, model.delta_normalizer.inverse_std)
-        live = loss.model.live.any(0)
-        assert (loss.error_weight[live] != shared.inverse_std[live]).any()
+        movable = loss.model.movable.any(0)
+        assert (loss.error_weight[movable] != shared.inverse_std[movable]).any()
 
 
 def test_a_training_goes_on_with_the_scales_it_had(losses, buffer):

@@ -11,10 +11,11 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import DDPGLoss, HardUpdate, ValueEstimators
 
-from torchrl_gn.modules import Agent, FeatureSet, ForwardModel, specialize
+from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.objectives import SVGLoss
+from torchrl_gn.policies import Agent
 from torchrl_gn.rewards import make_reward
-from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.scenes import ObservationGraph, ParameterNames
 
 # x' = a x + b u for -(q x^2 + rho u^2), with u = k x; exact in float32 is gamma.
 A, B, Q, RHO, K, GAMMA = 0.9, 0.4, 1.3, 0.2, -0.7, 0.875
@@ -349,8 +350,8 @@ def test_it_plans_with_the_model_of_a_scene(scenes, windows, special):
     torch.manual_seed(0)
     scene, data = scenes["pendulum"], windows["pendulum"].reshape(-1)[:30]
     sizes = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    model = ForwardModel(FeatureSet.of(scene), **sizes).double().bind(scene)
-    model.update_static_normalizers()
+    model = ForwardModel(ParameterNames.of(scene), **sizes).double().bind(scene)
+    model.update_parameter_normalizers()
     model.update_dynamic_normalizers(data["state"], data["action"], data["next", "state"])
     balance = make_reward("balance", scene)
     policy = TensorDictModule(Concatenated(26), ["state"], ["action"])

@@ -11,8 +11,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ValueOperator
 from torchrl.objectives import DDPGLoss, HardUpdate, ValueEstimators
 
-from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import SVGLoss
+from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")

@@ -15,11 +15,11 @@ from torchrl.collectors import Collector
 from torchrl.envs import StepCounter
 
 from torchrl_gn.data import collect_trajectories
+from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
-from torchrl_gn.modules import FeatureSet, ForwardModel, specialize
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import FixTask, make_reward
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import ParameterNames, load_scene
 
 STEP, SPEED_WEIGHT, CONTROL_COST, HORIZON = 0.1, 0.1, 0.02, 12
 SMALL = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
@@ -107,9 +107,9 @@ def check_that_it_imagines_what_stepping_gives(env: ModelEnv, start: TensorDict,
 def trained(scene, **options):
     """A forward model that has seen data, and no more."""
     torch.manual_seed(0)
-    bound = ForwardModel(FeatureSet.of(scene), **options).double().bind(scene)
+    bound = ForwardModel(ParameterNames.of(scene), **options).double().bind(scene)
     seen = collect_trajectories(scene, 5, 20, seed=0)
-    bound.update_static_normalizers()
+    bound.update_parameter_normalizers()
     bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
     return bound
 
@@ -146,7 +146,7 @@ def test_it_imagines_what_stepping_gives():
 @pytest.mark.parametrize("kind", ["bound", "specialized", "recurrent"])
 def test_a_trained_kind_of_model_imagines_what_stepping_gives_and_differentiates_it(kind):
     scene = load_scene("cartpole")
-    core = {"core": "recurrent", "memory": [4, 4, 4]} if kind == "recurrent" else {}
+    core = {"core": "recurrent", "hidden_state": [4, 4, 4]} if kind == "recurrent" else {}
     bound = trained(scene, **SMALL, **core)
     env = ModelEnv(specialize(bound) if kind == "specialized" else bound, make_reward("balance", scene), seed=0)
     start, actions = env.reset(TensorDict(batch_size=[2])), torch.rand(2, 4, 1, dtype=torch.float64) - 0.5

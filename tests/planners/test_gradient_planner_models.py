@@ -7,22 +7,22 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data import collect_trajectories
+from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
-from torchrl_gn.modules import BoundForwardModel, FeatureSet, ForwardModel, specialize
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import make_reward
-from torchrl_gn.scenes import Scene, load_scene
-from torchrl_gn.scenes.scene_values import SceneValues
+from torchrl_gn.scenes import ParameterNames, Scene, load_scene
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 SMALL = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
 
 
-def trained(scene: Scene, **options) -> BoundForwardModel:
+def trained(scene: Scene, **options) -> Predictor:
     """A small model with random weights and true statistics."""
     torch.manual_seed(0)
-    bound = ForwardModel(FeatureSet.of(scene), **SMALL, **options).bind(scene)
+    bound = ForwardModel(ParameterNames.of(scene), **SMALL, **options).bind(scene)
     seen = collect_trajectories(scene, 5, 20, seed=0)
-    bound.update_static_normalizers()
+    bound.update_parameter_normalizers()
     bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
     return bound
 
@@ -48,15 +48,15 @@ def test_samples_of_other_variants_are_refused():
     scene, other = bound.scene, load_scene("pendulum", timestep=0.04)
     planner = GradientPlanner(ModelEnv(bound, make_reward("balance", scene)), 3, 1, warm_up=1, samples=2, seed=0)
     start = planner.imagined.reset(TensorDict(batch_size=[2]))
-    planner(start.clone().set("static", bound.own_static().expand(2)))
-    static = SceneValues.of(other).tensordict().expand(2)
+    planner(start.clone().set("parameters", bound.own_parameters().expand(2)))
+    parameters = PhysicalParameters.of(other).tensordict().expand(2)
     with pytest.raises(ValueError, match="other static 'globals_' than scene 'pendulum'"):
-        planner(start.set("static", static))
+        planner(start.set("parameters", parameters))
 
 
 def test_a_recurrent_model_remembers_what_was_played():
     scene = load_scene("pendulum")
-    bound = trained(scene, core="recurrent", memory=[4, 4, 4])
+    bound = trained(scene, core="recurrent", hidden_state=[4, 4, 4])
     reward = make_reward("balance", scene)
     planner = GradientPlanner(ModelEnv(bound, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
     acted = SceneEnv(scene, reward, seed=0)
@@ -65,31 +65,33 @@ def test_a_recurrent_model_remembers_what_was_played():
         acted.rollout(2, planner, tensordict=start.clone(), auto_reset=False)
     primed = batched(acted, 2).append_transform(planner.make_tensordict_primer())
     played = primed.rollout(4, planner)
-    _, memory = bound.observe(played["state"], played["action"])
-    for key, value in memory.items():
-        torch.testing.assert_close(played["next", "memory", key][:, -1], value)
-        assert (played["memory", key][:, 0] == 0).all()
+    _, hidden_state = bound.observe(played["state"], played["action"])
+    for key, value in hidden_state.items():
+        torch.testing.assert_close(played["next", "hidden_state", key][:, -1], value)
+        assert (played["hidden_state", key][:, 0] == 0).all()
 
 
 def test_what_an_inference_model_wrote_is_planned_with():
     scene = load_scene("pendulum")
     torch.manual_seed(0)
-    model = ForwardModel(FeatureSet.of(scene), static="inferred", inferred=[3, 3, 3], link=False, **SMALL).double()
-    bound = model.bind(scene, static_key="static")
+    model = ForwardModel(
+        ParameterNames.of(scene), parameters="inferred", inferred=[3, 3, 3], project=False, **SMALL
+    ).double()
+    bound = model.bind(scene, parameters_key="parameters")
     seen = collect_trajectories(scene, 5, 20, seed=0)
     bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
     reward = make_reward("balance", scene)
     special = specialize(bound)
     planner = GradientPlanner(ModelEnv(special, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)
     start = SceneEnv(scene, reward, seed=0).reset(TensorDict(batch_size=[2]))
-    static = bound.own_static().expand(2).apply(torch.randn_like)
-    start["static"] = static
+    parameters = bound.own_parameters().expand(2).apply(torch.randn_like)
+    start["parameters"] = parameters
     planner(start)
-    total = planner._imagine(start.select("state", "static"), torch.zeros(2, 1, 3, 1))
+    total = planner._imagine(start.select("state", "parameters"), torch.zeros(2, 1, 3, 1))
     for row in range(2):
-        other = static.clone()
+        other = parameters.clone()
         other["nodes"][1 - row] += 1
-        changed = planner._imagine(start.select("state").set("static", other), torch.zeros(2, 1, 3, 1))
+        changed = planner._imagine(start.select("state").set("parameters", other), torch.zeros(2, 1, 3, 1))
         assert changed[row] == pytest.approx(total[row].item(), rel=1e-6)
         assert changed[1 - row] != pytest.approx(total[1 - row].item(), rel=1e-6)
     folds = special._folds

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from torchrl_gn.data import UnstableSimulationError
 from torchrl_gn.envs import SceneEnv
-from torchrl_gn.modules import Agent
+from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import RunFolder
 

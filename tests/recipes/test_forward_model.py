@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.modules import UnseenFeatureWarning
+from torchrl_gn.dynamics import UnseenFeatureWarning
 from torchrl_gn.pretrained import load_pretrained
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_checkpoint

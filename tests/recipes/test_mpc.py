@@ -12,10 +12,10 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from torchrl_gn.data import Simulator, collect_trajectories, spline_controls
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.envs import SceneEnv
-from torchrl_gn.modules import FeatureSet, ForwardModel
 from torchrl_gn.rewards import make_reward
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import ParameterNames, load_scene
 from torchrl_gn.training import save_checkpoint
 
 SMALL = ("episodes=2", "horizon=4", "gn.warm_up=2", "gn.samples=3", "gn.iterations=1", "ilqg.iterations=1")
@@ -119,9 +119,9 @@ def test_a_recurrent_model_plans_too_and_videos_show_plans(tmp_path, call):
     torch.manual_seed(0)
     scene = load_scene("pendulum")
     sizes = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8], "memory": [4, 4, 4]}
-    model = ForwardModel(FeatureSet.of(scene), core="recurrent", **sizes)
+    model = ForwardModel(ParameterNames.of(scene), core="recurrent", **sizes)
     bound, seen = model.bind(scene), collect_trajectories(scene, 5, 20, seed=0)
-    bound.update_static_normalizers()
+    bound.update_parameter_normalizers()
     bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
     save_checkpoint(tmp_path / "model.safetensors", model, scene=scene)
     options = (

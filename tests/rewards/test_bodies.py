@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrl_gn.rewards import Bodies, find_body, make_reward
-from torchrl_gn.scenes import JointChain, load_scene
+from torchrl_gn.scenes import KinematicTree, load_scene
 
 # A tip welded askew to the second link of an arm that turns about three axes, on a cart.
 ARM = """
@@ -103,8 +103,8 @@ def test_refuses_what_it_cannot_read(arm, steps):
         Bodies(arm.scene, ["tip", "tip"])
     with pytest.raises(ValueError, match=r"states of scene 'arm' must be \[\*B, 4, 13\], got \[4, 10, 13\]"):
         Bodies(arm.scene, ["tip"]).position(steps("jaco").state)
-    chain = JointChain("robot", ("a",), 0.1, ((0,),))
-    with pytest.raises(TypeError, match="JointChain"):
+    chain = KinematicTree("robot", ("a",), 0.1, ((0,),))
+    with pytest.raises(TypeError, match="KinematicTree"):
         Bodies(chain, ["a"])
-    with pytest.raises(TypeError, match="JointChain"):
+    with pytest.raises(TypeError, match="KinematicTree"):
         make_reward("reach", chain)

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data import Simulator, sample_start_states
-from torchrl_gn.modules import quaternion
+from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards import FixTask, ImitatePose, arm_reach, make_reward
 from torchrl_gn.scenes import load_scene
 

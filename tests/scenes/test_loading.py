@@ -100,7 +100,7 @@ def test_humanoid_has_one_edge_type_for_its_free_joint():
     free = scene.static.edges[:, scene.static.edge_names.index("jnt_type[FREE]")]
     np.testing.assert_array_equal(np.flatnonzero(free), [0, 1])
     np.testing.assert_array_equal(scene.translation_invariant, [True, True, False])
-    assert scene.live[1:].all()
+    assert scene.movable[1:].all()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Live channels and translation invariance against simulation."""
+"""Movable components and translation invariance against simulation."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ def test_live_channels_are_what_moves(name):
             mujoco.mju_quat2Vel(rotation[step, node], delta, 1.0)
     change = np.concatenate([np.diff(states[..., :3], axis=0), rotation, np.diff(states[..., 7:], axis=0)], -1)
     largest = np.abs(change).max(axis=0)
-    assert largest[~scene.live].max(initial=0.0) < 1e-9
-    assert largest[scene.live].min() > 1e-7
-    assert scene.live.shape == (scene.num_nodes, 12)
+    assert largest[~scene.movable].max(initial=0.0) < 1e-9
+    assert largest[scene.movable].min() > 1e-7
+    assert scene.movable.shape == (scene.num_nodes, 12)
     assert not scene.predicted[0] and scene.predicted[1:].all()
 
 
 def test_live_channels_of_planar_systems():
-    swimmer, cheetah, pendulum = (load_scene(name).live[1] for name in ("swimmer6", "cheetah", "pendulum"))
+    swimmer, cheetah, pendulum = (load_scene(name).movable[1] for name in ("swimmer6", "cheetah", "pendulum"))
     xy_plane, xz_plane, turn_y = [1, 1, 0, 0, 0, 1], [1, 0, 1, 0, 1, 0], [0, 0, 0, 0, 1, 0]
-    for live, expected in ((swimmer, xy_plane), (cheetah, xz_plane), (pendulum, turn_y)):
-        np.testing.assert_array_equal(live, expected * 2)
+    for movable, expected in ((swimmer, xy_plane), (cheetah, xz_plane), (pendulum, turn_y)):
+        np.testing.assert_array_equal(movable, expected * 2)
 
 
 def _body(joints: str, geom: str = "", rest: str = "") -> str:

@@ -12,8 +12,8 @@ from scipy import stats
 
 from torchrl_gn.scenes import (
     SYSTEMS,
+    PhysicalParameters,
     SceneError,
-    SceneValues,
     load_scene,
     make_variants,
     parameter_ranges,
@@ -21,7 +21,7 @@ from torchrl_gn.scenes import (
     sample_variants,
     scene_from_description,
 )
-from torchrl_gn.scenes.scene_values import topology
+from torchrl_gn.scenes.physical_parameters import topology
 
 LIMBS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 LINKS = ("head", *(f"segment_{i}" for i in range(5)))
@@ -48,12 +48,12 @@ INERTIA = {f"inertia[{i}]" for i in range(3)}
 VARYING = {
     "pendulum": ({"mass", *INERTIA, "ipos[2]"}, {"actuator_acc0"}, set()),
     "cartpole": ({"mass", *INERTIA, "ipos[2]"}, {"actuator_acc0"}, set()),
-    "swimmer6": ({"mass", *INERTIA, "pos[1]"}, {"jnt_pos[1]", "actuator_acc0"}, {"parent_arm", "arm"}),
+    "swimmer6": ({"mass", *INERTIA, "pos[1]"}, {"jnt_pos[1]", "actuator_acc0"}, {"parent_anchor", "arm"}),
     "cheetah": (
         {"mass", *INERTIA, "pos[0]", "pos[2]", "quat[0]", "quat[2]", "ipos[0]", "ipos[2]"}
         | {f"iquat[{i}]" for i in range(4)},
         {"actuator_acc0"},
-        {"parent_arm", "contact_offset", "contact_radius"},
+        {"parent_anchor", "contact_offset", "contact_radius"},
     ),
     "jaco": ({"mass", *INERTIA}, {"actuator_gear[0]", "actuator_acc0"}, set()),
 }
@@ -130,9 +130,10 @@ def test_variants_are_one_graph_and_all_differ(variants, system):
 @pytest.mark.parametrize("system", TABLE)
 def test_static_features_differ_where_they_should_and_only_there(variants, system):
     static = load_scene(system).static
-    values = [SceneValues.of(scene) for scene in variants[system]]
+    values = [PhysicalParameters.of(scene) for scene in variants[system]]
     differs = {
-        name: np.ptp(np.stack([getattr(one, name) for one in values]), axis=0) > 1e-12 for name in SceneValues._fields
+        name: np.ptp(np.stack([getattr(one, name) for one in values]), axis=0) > 1e-12
+        for name in PhysicalParameters._fields
     }
     columns = {
         part: {
@@ -186,8 +187,8 @@ def test_swimmer(variants):
         extent = np.stack([box[:, 1] ** 2 + box[:, 2] ** 2, box[:, 0] ** 2 + box[:, 2] ** 2, (box[:, :2] ** 2).sum(1)])
         np.testing.assert_allclose(model.body_inertia[1:], (model.body_mass[1:] * extent / 3).T, rtol=1e-9)
         # Joints sit at the ends of both links.
-        np.testing.assert_allclose(scene.linkage.parent_arm[2:], np.eye(3)[[1]] * half[:-1, None], atol=1e-15)
-        np.testing.assert_allclose(scene.linkage.arm[2:], np.eye(3)[[1]] * -half[1:, None], atol=1e-15)
+        np.testing.assert_allclose(scene.joint_anchors.parent_anchor[2:], np.eye(3)[[1]] * half[:-1, None], atol=1e-15)
+        np.testing.assert_allclose(scene.joint_anchors.arm[2:], np.eye(3)[[1]] * -half[1:, None], atol=1e-15)
 
 
 def test_cheetah(variants):
@@ -204,11 +205,11 @@ def test_cheetah(variants):
         size[:, 1] *= lengths[model.geom_bodyid[moving] - 1]
         np.testing.assert_allclose(model.geom_size[moving], size, rtol=1e-12)
         # The points that can touch the ground keep their order.
-        offset, expected = (SceneValues.of(one).contact_offset[1:].numpy() for one in (scene, standard))
+        offset, expected = (PhysicalParameters.of(one).contact_offset[1:].numpy() for one in (scene, standard))
         np.testing.assert_allclose(offset, expected * lengths[:, None, None], atol=1e-12)
         for node in range(2, scene.num_nodes):
-            expected = standard.linkage.parent_arm[node] * lengths[scene.parent[node] - 1]
-            np.testing.assert_allclose(scene.linkage.parent_arm[node], expected, atol=1e-12)
+            expected = standard.joint_anchors.parent_anchor[node] * lengths[scene.parent[node] - 1]
+            np.testing.assert_allclose(scene.joint_anchors.parent_anchor[node], expected, atol=1e-12)
             half = 0.5 * parameters[f"angle_{scene.node_names[node]}"]
             np.testing.assert_allclose(model.body_quat[node], [np.cos(half), 0, np.sin(half), 0], atol=1e-15)
         assert lowest(model) == pytest.approx(clearance, abs=1e-9)
@@ -236,8 +237,8 @@ def test_a_variant_is_rebuilt_bit_for_bit_from_its_description(variants, system)
     assert again.origin == scene.origin and again.name == system
     ours, theirs = arrays(scene.model), arrays(again.model)
     assert all(np.array_equal(ours[name], theirs[name], equal_nan=True) for name in ours)
-    for name, value in SceneValues.of(scene)._asdict().items():
-        assert np.array_equal(value, getattr(SceneValues.of(again), name))
+    for name, value in PhysicalParameters.of(scene)._asdict().items():
+        assert np.array_equal(value, getattr(PhysicalParameters.of(again), name))
 
 
 def test_any_number_of_links_and_values_beyond_the_ranges():

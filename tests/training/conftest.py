@@ -12,9 +12,10 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import ValueEstimators
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.modules import Agent, FeatureSet, ForwardModel
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, ObservationModelLoss, SVGLoss
-from torchrl_gn.scenes import ObservationGraph, Scene, load_scene
+from torchrl_gn.policies import Agent
+from torchrl_gn.scenes import ObservationGraph, ParameterNames, Scene, load_scene
 from torchrl_gn.training import Budget, OffPolicyTrainer, mean_return
 from torchrl_gn.training.optimizers import make_optimizer
 from torchrl_gn.training.trainer import Trainer
@@ -35,7 +36,7 @@ def make_model(scene) -> Callable[..., ForwardModel]:
     def make(seed: int = 0, **options) -> ForwardModel:
         torch.manual_seed(seed)
         small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-        return ForwardModel(FeatureSet.of(scene), **(small | options))
+        return ForwardModel(ParameterNames.of(scene), **(small | options))
 
     return make
 

@@ -12,7 +12,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
 
-from torchrl_gn.modules import Agent
+from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import Budget
 from torchrl_gn.training import checkpoint as module

@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_gn.modules import Agent
+from torchrl_gn.policies import Agent
 from torchrl_gn.training import load_checkpoint, mean_return, save_checkpoint
 
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
+from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training.muon import Muon
 from torchrl_gn.training.optimizers import ScheduledOptimizer, make_agent_optimizer, make_optimizer

@@ -10,8 +10,8 @@ from torchrl.objectives import ValueEstimators
 
 from torchrl_gn.data import create_dataset
 from torchrl_gn.envs import observation_env
-from torchrl_gn.modules import Agent
 from torchrl_gn.objectives import SVGLoss
+from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import OffPolicyTrainer, RayCluster
 

@@ -51,10 +51,12 @@ def test_a_file_is_no_run_folder(tmp_path):
 
 def test_a_run_goes_on_with_its_own_options_only(tmp_path):
     run = RunFolder(tmp_path, "recipe")
-    before = {"system": "pendulum", "minutes": 1, "model": {"latent": 128, "static": "scene"}}
+    before = {"system": "pendulum", "minutes": 1, "model": {"latent": 128, "parameters": "scene"}}
     run.refuse_changes(before, {**before, "minutes": 5}, free=["minutes"])
     with pytest.raises(ValueError, match=r"model\.latent=64 \(was 128\), system=jaco \(was pendulum\)"):
-        run.refuse_changes(before, {**before, "system": "jaco", "model": {"latent": 64, "static": "scene"}}, free=[])
+        run.refuse_changes(
+            before, {**before, "system": "jaco", "model": {"latent": 64, "parameters": "scene"}}, free=[]
+        )
     with pytest.raises(ValueError, match=r"model\.skip=True \(was None\)"):
         run.refuse_changes(before, {**before, "model": {**before["model"], "skip": True}}, free=[])
 

@@ -9,7 +9,7 @@ import time
 import pytest
 import torch
 
-from torchrl_gn.modules import fast_matmul
+from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import onednn_precision
 from torchrl_gn.training import Budget, Trainer, Workers
 from torchrl_gn.training.checkpoint import load_checkpoint, save_checkpoint

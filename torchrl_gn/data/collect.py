@@ -13,8 +13,8 @@ from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.errors import UnstableSimulationError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Scene
-from torchrl_gn.scenes.scene_values import SceneValues
 
 CHUNK = 250
 """Sequences that share one derived seed; part of what makes data repeat, so it never changes."""
@@ -54,8 +54,8 @@ def collect_trajectories(
 
     Returns:
         TensorDict ``[num]``, float64: ``state`` ``[num, T+1, N, 13]``, ``action`` ``[num, T, A]``,
-        ``physics`` ``[num, T+1, S]``; of variants also ``static``, a TensorDict ``[num]`` of the entries of
-        :class:`~torchrl_gn.scenes.SceneValues` that a model bound with ``static_key="static"`` reads.
+        ``physics`` ``[num, T+1, S]``; of variants also ``parameters``, a TensorDict ``[num]`` of the entries of
+        :class:`~torchrl_gn.scenes.PhysicalParameters` that a model bound with ``parameters_key="parameters"`` reads.
 
     Raises:
         ValueError: ``num`` or ``steps`` is below one, or ``simulator`` is of another scene.
@@ -74,17 +74,17 @@ def collect_trajectories(
         variant = np.arange(first, first + count) % scenes
         chunk, _ = collect_chunk(simulator, variant, steps, seed, (split, first // CHUNK), knot_interval=knot_interval)
         if not isinstance(scene, Scene):
-            chunk["static"] = static_values(simulator.scenes, variant)
+            chunk["parameters"] = variant_parameters(simulator.scenes, variant)
         chunks.append(chunk)
         if progress is not None:
             progress(first + count, num)
     return cast(TensorDict, torch.cat(chunks)) if len(chunks) > 1 else chunks[0]
 
 
-def static_values(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDict:
+def variant_parameters(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDict:
     """Numbers of each sequence's scene, a TensorDict ``[n]`` for ``[n]`` indices of scenes."""
     which, row = np.unique(variant, return_inverse=True)
-    values = torch.stack([SceneValues.of(scenes[index]).tensordict() for index in which])
+    values = torch.stack([PhysicalParameters.of(scenes[index]).tensordict() for index in which])
     return cast(TensorDict, values[torch.from_numpy(row)])
 
 

@@ -13,16 +13,16 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.data.collect import CHUNK, collect_chunk, collect_trajectories, static_values
+from torchrl_gn.data.collect import CHUNK, collect_chunk, collect_trajectories, variant_parameters
 from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, simulation_versions
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.errors import SceneError
-from torchrl_gn.scenes.feature_set import FeatureSet, take_columns
 from torchrl_gn.scenes.load import scene_from_description
+from torchrl_gn.scenes.parameter_names import ParameterNames, take_columns
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Scene
-from torchrl_gn.scenes.scene_values import SceneValues
 from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters
 
 __all__ = ["TrajectoryDataset", "collect_trajectories", "create_dataset", "load_dataset"]
@@ -33,8 +33,8 @@ class TrajectoryDataset:
     """Trajectories of a scene under random control, in three splits.
 
     Each split is a TensorDict ``[M]``, float64: ``state`` ``[M, T+1, N, 13]``, ``action`` ``[M, T, A]`` and
-    ``physics`` ``[M, T+1, S]``; of variants also ``static``, a TensorDict ``[M]`` of the entries of
-    :class:`~torchrl_gn.scenes.SceneValues`, and ``parameters`` ``[M, P]``, in the order of
+    ``physics`` ``[M, T+1, S]``; of variants also ``parameters``, a TensorDict ``[M]`` of the entries of
+    :class:`~torchrl_gn.scenes.PhysicalParameters`, and ``parameters`` ``[M, P]``, in the order of
     :func:`~torchrl_gn.scenes.parameter_ranges`. They are mapped from disk, read when needed; writing to them
     changes memory only, never the files.
 
@@ -45,8 +45,8 @@ class TrajectoryDataset:
         test: sequences to report errors on.
         rejected: for each split, how many simulations were unstable and drawn again.
         manifest: the data set's manifest: seed, steps, package versions, checksums.
-        features: names of the static features in ``static``, for :meth:`ForwardModel.bind
-            <torchrl_gn.modules.ForwardModel.bind>`: those of this version of the library, in its order, that the data
+        features: names of the static features in ``parameters``, for :meth:`ForwardModel.bind
+            <torchrl_gn.dynamics.ForwardModel.bind>`: those of this version of the library, in its order, that the data
             set was made with; None if it is not of variants.
     """
 
@@ -56,7 +56,7 @@ class TrajectoryDataset:
     test: TensorDict
     rejected: dict[str, int]
     manifest: dict = field(repr=False)
-    features: FeatureSet | None = field(default=None, repr=False)
+    features: ParameterNames | None = field(default=None, repr=False)
 
     def scene_of(self, split: str, index: int) -> Scene:
         """The scene of one sequence, built again if it is a variant.
@@ -67,7 +67,7 @@ class TrajectoryDataset:
         """
         if split not in SPLITS:
             raise ValueError(f"split={split!r} is not known; use one of {list(SPLITS)}.")
-        parameters = getattr(self, split).get("parameters", None)
+        parameters = getattr(self, split).get("variant_parameters", None)
         return self.scene if parameters is None else _variants(self.scene, parameters[index, None].numpy())[0]
 
 
@@ -157,7 +157,7 @@ def create_dataset(
                     "physics": [steps + 1, scene.physics_size],
                     **({} if ranges is None else _variant_entries(scene, len(ranges))),
                 },
-                "features": None if ranges is None else asdict(FeatureSet.of(scene)),
+                "features": None if ranges is None else asdict(ParameterNames.of(scene)),
                 "versions": simulation_versions(),
                 "chunks": {split: [] for split in SPLITS},
             }
@@ -222,7 +222,7 @@ def _collect_missing(
     done = sum(min(len(manifest["chunks"][split]) * CHUNK, size) for split, size in request["sizes"].items())
     chunks = list(_missing_chunks(manifest, scene))
     collector = _ChunkCollector(scene, request["steps"], request["seed"], request["knot_interval"], num_threads)
-    stored, here = _stored_features(manifest), FeatureSet.of(scene)
+    stored, here = _stored_features(manifest), ParameterNames.of(scene)
     if stored and (missing := stored.missing_in(here)):
         raise DatasetError(
             f"{files.manifest_path}: the data set was begun with static features {missing}, which this version of"
@@ -282,8 +282,8 @@ class _ChunkCollector:
             simulator, variant, self.steps, self.seed, chunk.key, knot_interval=self.knot_interval
         )
         if chunk.parameters is not None:
-            data["static"] = static_values(simulator.scenes, variant)
-            data["parameters"] = torch.from_numpy(chunk.parameters)
+            data["parameters"] = variant_parameters(simulator.scenes, variant)
+            data["variant_parameters"] = torch.from_numpy(chunk.parameters)
         return data, rejected
 
     @functools.cached_property
@@ -317,8 +317,8 @@ def _variants(scene: Scene, parameters: np.ndarray) -> list[Scene]:
 
 def _variant_entries(scene: Scene, parameters: int) -> dict[str, list[int]]:
     """Shapes of what sequences of variants have besides their states."""
-    static = {f"static/{name}": list(value.shape) for name, value in SceneValues.of(scene)._asdict().items()}
-    return {**static, "parameters": [parameters]}
+    parameters = {f"static/{name}": list(value.shape) for name, value in PhysicalParameters.of(scene)._asdict().items()}
+    return {**parameters, "variant_parameters": [parameters]}
 
 
 def _open(files: DatasetFiles, manifest: dict, scene: Scene) -> TrajectoryDataset:
@@ -327,22 +327,22 @@ def _open(files: DatasetFiles, manifest: dict, scene: Scene) -> TrajectoryDatase
     features = _stored_features(manifest)
     if features:
         # In the order in which samples that are collected now have them.
-        stored, features = features, FeatureSet.of(scene).common(features)
+        stored, features = features, ParameterNames.of(scene).common(features)
         for data in splits.values():
             _take_columns(data, features.columns_in(stored))
     return TrajectoryDataset(scene=scene, rejected=rejected, manifest=manifest, features=features, **splits)
 
 
-def _stored_features(manifest: dict) -> FeatureSet | None:
-    return None if manifest["features"] is None else FeatureSet.from_names(manifest["features"])
+def _stored_features(manifest: dict) -> ParameterNames | None:
+    return None if manifest["features"] is None else ParameterNames.from_names(manifest["features"])
 
 
 def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
     """Keep some columns of the static features, in another order; what is right already stays mapped from disk."""
     for part, wanted in columns.items():
-        values = data["static", part]
+        values = data["parameters", part]
         if wanted != list(range(values.shape[-1])):
-            data["static", part] = take_columns(values, wanted)
+            data["parameters", part] = take_columns(values, wanted)
 
 
 def _check_same(files: DatasetFiles, manifest: dict, request: dict) -> None:

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data.robot_log import RobotLog, short_way
-from torchrl_gn.scenes.joint_chain import chain_states
+from torchrl_gn.scenes.kinematic_tree import tree_states
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def log_trajectories(
             continue
         here, grid = at[rows] - at[start + lag], pace * np.arange(count + 1)
         (angle, velocity, *extras), needed = _interpolated(here, channels[rows], grid)
-        state, command = chain_states(angle, velocity, extras), _held(here, log.command[start : stop - lag], grid)
+        state, command = tree_states(angle, velocity, extras), _held(here, log.command[start : stop - lag], grid)
         begin = np.arange(0, count - steps + 1, 1 if overlap else steps)
         window = begin[:, None] + np.arange(steps + 1)
         states.append(state[window])

@@ -12,7 +12,7 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictRoundRobinWriter
 
-_KEYS = ("state", "action", "static")
+_KEYS = ("state", "action", "parameters")
 
 
 def trajectory_buffer(
@@ -33,7 +33,7 @@ def trajectory_buffer(
 
     ``sample()`` gives a TensorDict ``[batch_size]``, or ``[batch_size, window]`` for windows longer
     than one, with ``state`` ``[..., N, 13]``, ``action`` ``[..., A]``, ``("next", "state")`` ``[..., N, 13]``
-    and ``index`` ``[..., 2]``, trajectory and time. Entries of ``static``, stored once per trajectory, are
+    and ``index`` ``[..., 2]``, trajectory and time. Entries of ``parameters``, stored once per trajectory, are
     gathered with them (windows see views). ``buffer[i]`` gives whole trajectories.
 
     To resume a run save ``buffer.state_dict()``: it holds the state of the random draws, and the
@@ -41,7 +41,7 @@ def trajectory_buffer(
 
     Args:
         trajectories: ``[M]`` with ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and possibly
-            ``static`` (a tensor ``[M, ...]`` or a TensorDict ``[M]``); other entries are left out.
+            ``parameters`` (a tensor ``[M, ...]`` or a TensorDict ``[M]``); other entries are left out.
         batch_size: how many transitions or windows a sample has.
         window: consecutive transitions in one draw.
         seed: seed of the draws. Default: drawn from torch's global generator.
@@ -94,7 +94,7 @@ class TrajectoryStorage(TensorStorage):
     """TorchRL storage of whole trajectories that is read by (trajectory, time).
 
     Args:
-        trajectories: ``[M]`` with ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]``, possibly ``static``.
+        trajectories: ``[M]`` with ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]``, possibly ``parameters``.
         writable: whether trajectories can be added; the storage then starts empty.
     """
 
@@ -132,9 +132,9 @@ class TrajectoryStorage(TensorStorage):
             "action": _rows(stored.get("action"), trajectory * self.steps + time),
             "next": TensorDict({"state": _rows(stored.get("state"), here + 1)}, batch_size=here.shape),
         }
-        static = stored.get("static", None)
-        if static is not None:
-            entries["static"] = _of_trajectory(static, trajectory)
+        parameters = stored.get("parameters", None)
+        if parameters is not None:
+            entries["parameters"] = _of_trajectory(parameters, trajectory)
         return TensorDict(entries, batch_size=here.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
@@ -237,10 +237,10 @@ def _rows(values: Tensor, row: Tensor) -> Tensor:
     return picked.view(*row_shape, *values.shape[2:])
 
 
-def _of_trajectory(static: Tensor | TensorDictBase, trajectory: Tensor) -> Tensor | TensorDictBase:
+def _of_trajectory(parameters: Tensor | TensorDictBase, trajectory: Tensor) -> Tensor | TensorDictBase:
     if trajectory.ndim == 1:
-        return static[trajectory]
-    return static[trajectory[:, 0]].unsqueeze(1).expand(*trajectory.shape, *static.shape[1:])
+        return parameters[trajectory]
+    return parameters[trajectory[:, 0]].unsqueeze(1).expand(*trajectory.shape, *parameters.shape[1:])
 
 
 def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchrl_gn.scenes.joint_chain import JointChain
+from torchrl_gn.scenes.kinematic_tree import KinematicTree
 
 _GAP = 1.5  # times the usual step: with one row missing it is 2
 _EVEN = 0.01  # of a step, by which time stamps may be rounded
@@ -121,8 +121,8 @@ def log_chain(
     *,
     resample: float | None = None,
     commands: Sequence[Sequence[int]] | None = None,
-    carried_by: Sequence[int] = (),
-) -> JointChain:
+    joint_parents: Sequence[int] = (),
+) -> KinematicTree:
     """The robot of a log as a graph.
 
     Args:
@@ -131,7 +131,7 @@ def log_chain(
         resample: as of :func:`log_trajectories`.
         commands: for each joint the commands that act on it, none of a joint without motor; by default they are dealt
             out in order, as many to each.
-        carried_by: for each joint the one before it, -1 for the base; by default each is carried by the last: an arm.
+        joint_parents: for each joint the one before it, -1 for the base; by default each is carried by the last: an arm.
 
     Raises:
         ValueError: if commands cannot be dealt out evenly, are none of the log's, or are finite in no row.
@@ -146,7 +146,7 @@ def log_chain(
         each = count // joints
         commands = [range(joint * each, (joint + 1) * each) for joint in range(joints)]
     low, high = log.command_bounds()
-    return JointChain(
+    return KinematicTree(
         name,
         tuple(f"joint{joint}" for joint in range(joints)),
         log.timestep if resample is None else resample,
@@ -154,5 +154,5 @@ def log_chain(
         extras=tuple(log.extra),
         action_low=low,
         action_high=high,
-        carried_by=tuple(carried_by),
+        joint_parents=tuple(joint_parents),
     )

@@ -14,10 +14,10 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, reward_of, set_specs, step_reward
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules.bound_forward_model import BoundForwardModel
 from torchrl_gn.scenes.scene import Scene
 
 
@@ -41,20 +41,20 @@ class ModelEnv(ModelBasedEnvBase):
     out of its submodules.
 
     ``reset()`` draws true start states and observes them; ``reset(tensordict,
-    set_state=True)`` starts from the TensorDict's ``state``. A model that reads static values of
-    every sample (``static_key``) gets those of the TensorDict, or else its scene's (of an inferred
+    set_state=True)`` starts from the TensorDict's ``state``. A model that reads physical parameters of
+    every sample (``parameters_key``) gets those of the TensorDict, or else its scene's (of an inferred
     graph zeros: nothing is known); where an episode ends and another begins within a rollout, TorchRL hands none on. A
-    recurrent model's ``memory`` is carried along, from the
+    recurrent model's ``hidden_state`` is carried along, from the
     TensorDict's or from nothing.
 
     Args:
         model: module with ``in_keys`` holding ``"state"`` and ``"action"``, ``out_keys`` holding
             ``("next", "state")`` and an attribute ``scene``, as
-            :class:`~torchrl_gn.modules.BoundForwardModel`.
+            :class:`~torchrl_gn.dynamics.Predictor`.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
         start_states: ``[M, S]`` full MuJoCo states to start from, or a function
             ``(n, generator) -> [n, S]``. Default: the system's reset distribution. Of a robot that is known by its
-            joints alone (:class:`~torchrl_gn.scenes.JointChain`): its states ``[M, N, C]``, those of a log, say.
+            joints alone (:class:`~torchrl_gn.scenes.KinematicTree`): its states ``[M, N, C]``, those of a log, say.
         unstable_reward: reward of a step whose prediction is not finite.
         seed: seed of the start states. Default: drawn from torch's global generator.
         device: where everything lives. Default: the model's device.
@@ -63,7 +63,7 @@ class ModelEnv(ModelBasedEnvBase):
         TypeError: the model lacks these keys or the scene.
         ValueError: start states, or when stepping ``state`` or ``action``, of a wrong shape; no start states of a
             robot without a model; a reward of another scene; an ``unstable_reward``, or when resetting a ``state`` or
-            static values, that are not finite.
+            physical parameters, that are not finite.
         KeyError: when stepping, no ``state`` or ``action``.
     """
 
@@ -99,10 +99,10 @@ class ModelEnv(ModelBasedEnvBase):
         self._simulator: Simulator | None = None
         set_specs(self, self.scene, physics=False)
         if self._static_key is not None:
-            self.state_spec[self._static_key] = self._spec_of(cast(Any, model).own_static())
-        if "memory" in inputs:
+            self.state_spec[self._static_key] = self._spec_of(cast(Any, model).own_parameters())
+        if "hidden_state" in inputs:
             for spec in (self.observation_spec, self.state_spec):
-                spec["memory"] = self._spec_of(cast(Any, model).own_memory())
+                spec["hidden_state"] = self._spec_of(cast(Any, model).initial_hidden_state())
 
     def _spec_of(self, entries: TensorDictBase) -> Composite:
         specs = {
@@ -113,7 +113,7 @@ class ModelEnv(ModelBasedEnvBase):
 
     @property
     def _static_key(self) -> NestedKey | None:
-        return getattr(self.world_model, "static_key", None)
+        return getattr(self.world_model, "parameters_key", None)
 
     @property
     def _state_shape(self) -> tuple[int, int]:
@@ -135,17 +135,17 @@ class ModelEnv(ModelBasedEnvBase):
         reset = TensorDict({"state": state}, batch_size=shape)
         key = self._static_key
         if key is not None:
-            static = tensordict.get(key, None)
-            if static is None:
-                static = cast(TensorDictBase, self.world_model.own_static()).expand(shape)
+            parameters = tensordict.get(key, None)
+            if parameters is None:
+                parameters = cast(TensorDictBase, self.world_model.own_parameters()).expand(shape)
             else:
-                require_finite(static, f"{self}: {key!r}")
-            reset.set(key, static)
-        if "memory" in self.world_model.in_keys:
-            memory = tensordict.get("memory", None)
-            if memory is None:
-                memory = cast(TensorDictBase, self.world_model.own_memory()).expand(shape).clone()
-            reset.set("memory", memory)
+                require_finite(parameters, f"{self}: {key!r}")
+            reset.set(key, parameters)
+        if "hidden_state" in self.world_model.in_keys:
+            hidden_state = tensordict.get("hidden_state", None)
+            if hidden_state is None:
+                hidden_state = cast(TensorDictBase, self.world_model.initial_hidden_state()).expand(shape).clone()
+            reset.set("hidden_state", hidden_state)
         return reset.to(self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -163,8 +163,8 @@ class ModelEnv(ModelBasedEnvBase):
             "done": ~stable,
             "terminated": ~stable,
         }
-        if "memory" in predicted.keys():
-            entries["memory"] = predicted["memory"]
+        if "hidden_state" in predicted.keys():
+            entries["hidden_state"] = predicted["hidden_state"]
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def imagine(self, tensordict: TensorDictBase, actions: Tensor) -> tuple[Tensor, Tensor]:
@@ -192,9 +192,9 @@ class ModelEnv(ModelBasedEnvBase):
             )
         state = read(tensordict, "state", self._state_shape, self)
         model = cast(object, self.world_model)
-        if isinstance(model, BoundForwardModel):
-            memory = cast("TensorDictBase | None", tensordict.get("memory", None))
-            states, _ = model.rollout_and_memory(state, actions, model.static_in(tensordict), memory)
+        if isinstance(model, Predictor):
+            hidden_state = cast("TensorDictBase | None", tensordict.get("hidden_state", None))
+            states, _ = model.rollout_and_hidden_state(state, actions, model.parameters_in(tensordict), hidden_state)
         else:
             entries, each = tensordict.select(*self.world_model.in_keys, strict=False), [state]
             for action in actions.unbind(-2):

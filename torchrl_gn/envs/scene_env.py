@@ -59,7 +59,7 @@ class SceneEnv(EnvBase):
         num_threads: threads of the simulation. Default: all cores.
         unstable_reward: reward of a step whose simulation became unstable.
         seed: seed of the start states. Default: drawn from torch's global generator.
-        device: where TensorDicts live; the simulation runs on the CPU.
+        device: where TensorDicts movable; the simulation runs on the CPU.
 
     Raises:
         ValueError: start states of a wrong shape, a reward of another scene, or an ``unstable_reward`` that is not

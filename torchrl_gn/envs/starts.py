@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_gn.data.generator import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
-from torchrl_gn.scenes.joint_chain import JointChain
+from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.scene import Scene
 
 StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndarray]
@@ -34,10 +34,10 @@ class StartSampler:
     """
 
     def __init__(
-        self, scene: Scene | JointChain, start_states: StartStates | None = None, seed: int | None = None
+        self, scene: Scene | KinematicTree, start_states: StartStates | None = None, seed: int | None = None
     ) -> None:
         self.scene = scene
-        joints = isinstance(scene, JointChain)
+        joints = isinstance(scene, KinematicTree)
         self.shape = (scene.num_nodes, scene.state_size) if joints else (scene.physics_size,)
         if joints and start_states is None:
             raise ValueError(

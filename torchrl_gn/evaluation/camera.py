@@ -39,12 +39,12 @@ def choose_view(scene: Scene) -> View:
 
     A scene is planar if no node moves along an axis or turns about the other two.
     """
-    live = np.asarray(scene.live.any(axis=0))
+    movable = np.asarray(scene.movable.any(axis=0))
     x, y, z = np.eye(3)
     # Looking from above for z; from the front, with z up, for the others.
     for normal, (right, up) in ((1, (x, z)), (2, (x, y)), (0, (y, z))):
         others = [axis for axis in range(3) if axis != normal]
-        if not live[normal] and not live[[3 + axis for axis in others]].any():
+        if not movable[normal] and not movable[[3 + axis for axis in others]].any():
             return View(right, up, np.cross(right, up), True)
     flat = np.array([np.cos(_AZIMUTH), np.sin(_AZIMUTH), 0.0])
     toward = np.cos(_ELEVATION) * flat + np.sin(_ELEVATION) * z

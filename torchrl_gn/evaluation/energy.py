@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchrl_gn.modules import quaternion
+from torchrl_gn.maths import quaternion
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene

@@ -19,11 +19,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_gn.dynamics import Predictor, RecurrentPredictor
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
 from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout, predict
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import BoundForwardModel, BoundRecurrentModel, quaternion
-from torchrl_gn.modules.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
@@ -92,21 +93,21 @@ def evaluate_errors(
     Args:
         model: bound forward model (``in_keys`` state and action, ``out_keys`` next state).
         trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]``, ``"action"`` ``[M, T, A]`` and, if
-            the model reads them, static values ``[M]`` at its ``static_key``; may lie on disk (memory-mapped).
+            the model reads them, physical parameters ``[M]`` at its ``parameters_key``; may lie on disk (memory-mapped).
         horizons: lengths of the rollouts to measure, at most ``T``.
         one_step: whether to measure the one-step error, which takes a prediction of every step.
         warm_up: steps at the begin of every trajectory that are not predicted, but given to a recurrent model to
             remember; all else starts behind them, for any model.
         batch_size: number of states that the model gets in one call.
         keep: number of predicted rollouts to return in the table.
-        scene: which nodes count and which components are live; default ``model.scene``.
+        scene: which nodes count and which components are movable; default ``model.scene``.
         device: where to run; default where the model is.
 
     Returns:
         Table with ``"one_step_error"``, if asked for, and one ``"rollout_error_<H>"`` for each horizon.
 
     Raises:
-        KeyError: if the model reads static values that the trajectories lack.
+        KeyError: if the model reads physical parameters that the trajectories lack.
         ValueError: if shapes do not fit, trajectories are too short, empty, of another scene than the model's or
             contain values that are not finite, or nothing moves in them.
     """
@@ -126,24 +127,24 @@ def evaluate_errors(
     predicted = torch.as_tensor(scene.predicted, device=device)
     single = _Sums(1, layout, predicted)
     rollouts = _Sums(horizon, layout, predicted)
-    static = model.static_in(trajectories) if isinstance(model, BoundForwardModel) else None
-    if static is not None:
-        require_finite(static, "static of the trajectories")
+    parameters = model.parameters_in(trajectories) if isinstance(model, Predictor) else None
+    if parameters is not None:
+        require_finite(parameters, "parameters of the trajectories")
     kept: list[Tensor] = []
 
     with torch.no_grad(), _evaluation_mode(model):
         size = max(1, batch_size // steps)
-        for state, action, own in _batches(states, actions, static, size, device, layout) if one_step else ():
+        for state, action, own in _batches(states, actions, parameters, size, device, layout) if one_step else ():
             prediction = _single_steps(model, state[:, :-1], action, own)[:, warm_up:].flatten(0, 1)
             flat, truth = state[:, warm_up:-1].flatten(0, 1), state[:, warm_up + 1 :].flatten(0, 1)
             valid = single.add(0, prediction, truth, flat)
             single.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
-        for state, action, own in _batches(states, actions, static, batch_size, device, layout) if horizons else ():
-            wanted, memory = max(0, min(keep - sum(map(len, kept)), len(state))), None
-            if warm_up and isinstance(model, BoundRecurrentModel):
-                _, memory = model.observe(state[:, :warm_up], action[:, :warm_up], own)
+        for state, action, own in _batches(states, actions, parameters, batch_size, device, layout) if horizons else ():
+            wanted, hidden_state = max(0, min(keep - sum(map(len, kept)), len(state))), None
+            if warm_up and isinstance(model, RecurrentPredictor):
+                _, hidden_state = model.observe(state[:, :warm_up], action[:, :warm_up], own)
             state, action = state[:, warm_up:], action[:, warm_up:]
-            guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own, memory=memory)
+            guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own, hidden_state=hidden_state)
             kept.append(_add_rollouts(guarded, state, rollouts, wanted))
 
     dead = _dead_components(scene, layout)
@@ -157,13 +158,13 @@ def evaluate_errors(
 
 
 def _single_steps(
-    model: TensorDictModuleBase, states: Tensor, actions: Tensor, static: TensorDictBase | None
+    model: TensorDictModuleBase, states: Tensor, actions: Tensor, parameters: TensorDictBase | None
 ) -> Tensor:
     """Prediction from each of the states ``[B, T, N, 13]``; a recurrent model remembers those before it."""
-    if isinstance(model, BoundRecurrentModel):
-        return model.observe(states, actions, static)[0]
+    if isinstance(model, RecurrentPredictor):
+        return model.observe(states, actions, parameters)[0]
     batch = actions.shape[:2]
-    each = None if static is None else static.unsqueeze(1).expand(batch).reshape(-1)
+    each = None if parameters is None else parameters.unsqueeze(1).expand(batch).reshape(-1)
     return predict(model, states.flatten(0, 1), actions.flatten(0, 1), each).unflatten(0, batch)
 
 
@@ -224,7 +225,7 @@ def _add_rollouts(guarded: GuardedRollout, truth: Tensor, sums: _Sums, keep: int
 def _batches(
     states: Tensor,
     actions: Tensor,
-    static: TensorDictBase | None,
+    parameters: TensorDictBase | None,
     size: int,
     device: torch.device | str,
     layout: StateLayout,
@@ -233,7 +234,7 @@ def _batches(
         rows = slice(start, start + size)
         state = torch.as_tensor(states[rows]).to(device)
         action = torch.as_tensor(actions[rows]).to(state.device)
-        own = None if static is None else static[rows].to(state.device)
+        own = None if parameters is None else parameters[rows].to(state.device)
         checks = {
             "states that are not finite": state.isfinite(),
             "states with a zero quaternion": ~_without_angle(state, layout),
@@ -253,8 +254,8 @@ def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:
 
 
 def _dead_components(scene: Scene, layout: StateLayout) -> set[str]:
-    live = scene.live[scene.predicted]
-    return {name for name, where in layout.delta_slices.items() if not live[:, where].any()}
+    movable = scene.movable[scene.predicted]
+    return {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
 
 
 def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Scene, layout: StateLayout) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_gn.data import collect_trajectories
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.evaluation.identification import identification_errors
-from torchrl_gn.modules import ForwardModel, IdentifyingModel
+from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.scenes import Scene, sample_variants
 
 

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_gn.modules import quaternion
-from torchrl_gn.modules.state_layout import BODY_STATE
+from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.state_layout import BODY_STATE
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
@@ -115,7 +115,7 @@ def node_frames(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_visible(model: mujoco.MjModel, geom: int) -> bool:
-    # MuJoCo's viewers show groups 0 to 2; collision shapes and the like live in higher ones.
+    # MuJoCo's viewers show groups 0 to 2; collision shapes and the like movable in higher ones.
     material = model.geom_matid[geom]
     alpha = model.geom_rgba[geom][3] if material < 0 else model.mat_rgba[material][3]
     return model.geom_group[geom] <= 2 and alpha > 0 and model.geom_rgba[geom][3] > 0

@@ -9,16 +9,17 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
-from torchrl_gn.modules import BoundForwardModel, BoundInferenceModel
+from torchrl_gn.identification import BoundInferenceModel
 
 _PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # on squared weights, as shares of the number of samples
 
 
 @torch.no_grad()
 def identification_errors(
-    model: BoundForwardModel,
+    model: Predictor,
     inference: BoundInferenceModel,
     observed: TensorDictBase,
     trajectories: TensorDictBase,
@@ -51,11 +52,11 @@ def identification_errors(
     action = cast(Tensor, observed.get("action"))[:, :steps]
     state = cast(Tensor, observed.get("state"))[:, : action.shape[1] + 1]
     device = next(inference.parameters()).device
-    static = inference.identify(state.to(device), action.to(device))
+    parameters = inference.identify(state.to(device), action.to(device))
     if wrong:
-        static = static.apply(lambda value: value.roll(1, 0))
+        parameters = parameters.apply(lambda value: value.roll(1, 0))
     entries = {key: trajectories.get(key) for key in ("state", "action")}
-    test = TensorDict({**entries, "static": static}, batch_size=[len(static)])
+    test = TensorDict({**entries, "parameters": parameters}, batch_size=[len(parameters)])
     return evaluate_errors(model, test, horizons=horizons, one_step=one_step)
 
 

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from torchrl_gn.evaluation import palette
 from torchrl_gn.evaluation.canvas import clean, new_figure, save
-from torchrl_gn.modules import quaternion
-from torchrl_gn.modules.state_layout import BODY_STATE
+from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.state_layout import BODY_STATE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from torchrl_gn.scenes import JointChain, Scene
+    from torchrl_gn.scenes import KinematicTree, Scene
 
 _PANELS = (
     ("position", "position [m]", "xyz"),
@@ -147,7 +147,7 @@ def _turned(orientation: Tensor, start: Tensor, axis: int) -> np.ndarray:
 def plot_joints(
     truth: Tensor,
     predictions: Mapping[str, Tensor],
-    scene: JointChain,
+    scene: KinematicTree,
     path: str | os.PathLike,
     *,
     joints: Sequence[int] | None = None,

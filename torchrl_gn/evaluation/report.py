@@ -7,17 +7,17 @@ from pathlib import Path
 
 from tensordict import TensorDictBase
 
+from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.evaluation.figures import plot_errors
 from torchrl_gn.evaluation.motion_figures import plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
-from torchrl_gn.modules import BoundForwardModel
 from torchrl_gn.scenes import Scene
 
 
 def report(
-    model: BoundForwardModel,
+    model: Predictor,
     trajectories: TensorDictBase,
     folder: str | os.PathLike,
     *,
@@ -29,7 +29,7 @@ def report(
     Args:
         model: the model, bound to the scene of the trajectories.
         trajectories: ``[M]`` test trajectories, ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``, and
-            static values at the model's ``static_key`` if it has one.
+            physical parameters at the model's ``parameters_key`` if it has one.
         folder: where the files go.
         horizons: steps of the rollout errors.
         scene: scene of the first trajectory, which is drawn, if that is a variant of the model's.

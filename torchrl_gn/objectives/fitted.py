@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from torch import nn
 
-from torchrl_gn.modules import ForwardModel, ObservationModel, ObservationNetwork
+from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.policies import ObservationModel, ObservationNetwork
 
 
 def require_fitted(loss: nn.Module, *networks: nn.Module, remedy: str) -> None:

@@ -12,14 +12,9 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import (
-    BoundForwardModel,
-    ForwardModel,
-    Normalizer,
-    SpecializedForwardModel,
-    quaternion,
-)
+from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.objectives.fitted import require_fitted
 
 FIT_NORMALIZERS = (
@@ -37,10 +32,10 @@ class ForwardModelLoss(LossModule):
     fed its own predictions and each step's target is the change from what it was
     fed to the true next state; gradients flow through the whole window. The first ``forced`` steps are fed
     the true states instead ("teacher forcing"; paper, SM "Recurrent one-step predictions": all of them), which pays
-    for a recurrent model, whose memory is carried through the window.
+    for a recurrent model, whose hidden state is carried through the window.
 
     Each component's error is divided by the variance of its change in this scene and averaged over
-    live channels, nodes and samples; the loss is the mean of the components.
+    movable channels, nodes and samples; the loss is the mean of the components.
 
     Orientation: the paper prints :math:`1 - \cos^2(q_e \cdot q_p)`, which is not zero for
     equal rotations; with :math:`\cos = q_e \cdot q_p` it is :math:`1 - (q_e \cdot q_p)^2`,
@@ -53,13 +48,13 @@ class ForwardModelLoss(LossModule):
     Args:
         model: forward model bound to the scene of the samples.
         noise: standard deviation of the input noise, in units of each state channel's own
-            standard deviation (radians for orientations). None on dead channels.
+            standard deviation (radians for orientations). None on fixed components.
         generator: source of the noise; the global one if None (a run then cannot resume bit for bit).
         forced: steps of a window, at its begin, that are fed the true state, with noise.
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` steps in a row,
     ``action`` ``[B, (H,) A]``, ``("next", "state")`` like ``state``; with a model that reads them the
-    static values ``[B, (H)]`` of every sample, the same for a whole window.
+    physical parameters ``[B, (H)]`` of every sample, the same for a whole window.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
 
@@ -84,13 +79,13 @@ class ForwardModelLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
 
-    model: BoundForwardModel
+    model: Predictor
     noise_scale: Tensor
     error_weight: Tensor
 
     def __init__(
         self,
-        model: BoundForwardModel,
+        model: Predictor,
         *,
         noise: float = 0.0,
         generator: torch.Generator | None = None,
@@ -99,7 +94,7 @@ class ForwardModelLoss(LossModule):
         super().__init__()
         if not 0 <= noise < math.inf:
             raise ValueError(f"noise={noise} must not be negative, NaN or infinite.")
-        if isinstance(model, SpecializedForwardModel):
+        if isinstance(model, SpecializedPredictor):
             raise TypeError("A specialised model passes no gradient to the weights; train the bound model.")
         self.model = model
         self.noise = noise
@@ -107,7 +102,7 @@ class ForwardModelLoss(LossModule):
         if forced < 1:
             raise ValueError(f"forced={forced} must be at least 1: the first state is always a true one.")
         self.forced = forced
-        scale = torch.zeros(model.layout.delta_size, dtype=torch.float64, device=model.live.device)
+        scale = torch.zeros(model.layout.delta_size, dtype=torch.float64, device=model.movable.device)
         self.register_buffer("noise_scale", scale)
         self.register_buffer("error_weight", scale - 1)  # negative: not fitted (of None load_state_dict knows nothing)
 
@@ -122,8 +117,8 @@ class ForwardModelLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys that the loss reads."""
-        state, action, static = self.tensor_keys.state, self.tensor_keys.action, self.model.static_key
-        return [state, action, unravel_key(("next", state)), *([] if static is None else [static])]
+        state, action, parameters = self.tensor_keys.state, self.tensor_keys.action, self.model.parameters_key
+        return [state, action, unravel_key(("next", state)), *([] if parameters is None else [parameters])]
 
     @property
     def out_keys(self) -> list[str]:
@@ -139,10 +134,10 @@ class ForwardModelLoss(LossModule):
         """
         model = self.model
         state, action, next_state = self._read(tensordict)
-        static = self._read_static(tensordict) if model.model.static == "scene" else None
+        parameters = self._read_parameters(tensordict) if model.model.parameter_source == "scene" else None
         noisy = self._fit_scales(state, next_state)
-        model.update_static_normalizers(static)
-        model.update_dynamic_normalizers(noisy, action, next_state, static)
+        model.update_parameter_normalizers(parameters)
+        model.update_dynamic_normalizers(noisy, action, next_state, parameters)
 
     @torch.no_grad()
     def fit_scales(self, tensordict: TensorDictBase) -> None:
@@ -167,7 +162,7 @@ class ForwardModelLoss(LossModule):
         noisy = self._perturb(state)
         # The model's statistics are of all scenes that share it, and would make light of errors in slow ones.
         change = Normalizer(layout.delta_size, floor=1e-9)
-        change.update(layout.delta(noisy, next_state).cpu(), model.live.cpu())
+        change.update(layout.delta(noisy, next_state).cpu(), model.movable.cpu())
         self.error_weight.copy_(change.inverse_std)
         return noisy
 
@@ -197,22 +192,22 @@ class ForwardModelLoss(LossModule):
         state, action, next_state = self._read(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
-        static = self._read_static(tensordict, windows=state.ndim == 4)
+        parameters = self._read_parameters(tensordict, windows=state.ndim == 4)
         if state.ndim == 3:
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
         layout, steps = self.model.layout, state.shape[1]
-        current, memory = self._perturb(state[:, 0]), None
-        errors, folded = state.new_zeros(len(layout.components)), self.model.fold(static)
+        current, hidden_state = self._perturb(state[:, 0]), None
+        errors, folded = state.new_zeros(len(layout.components)), self.model.fold(parameters)
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
-            delta, memory = self.model.delta_and_memory(current, action[:, step], folded, memory)
+            delta, hidden_state = self.model.delta_and_hidden_state(current, action[:, step], folded, hidden_state)
             errors = errors + self._component_errors(delta, target)
             if step + 1 < steps:
                 forced = step + 1 < self.forced
                 current = self._perturb(state[:, step + 1]) if forced else layout.apply(current, delta)
         errors = errors / steps
-        live = self._live_components()
-        loss = errors.sum() / live.sum().clamp(min=1)
+        movable = self._movable_components()
+        loss = errors.sum() / movable.sum().clamp(min=1)
         out: dict[str, Tensor] = {
             f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)
         }
@@ -243,14 +238,14 @@ class ForwardModelLoss(LossModule):
             )
         return state, action, next_state
 
-    def _read_static(self, tensordict: TensorDictBase, *, windows: bool = False) -> TensorDictBase | None:
-        static = self.model.static_in(tensordict)
-        if static is not None:
-            static = static[:, 0] if windows else static
+    def _read_parameters(self, tensordict: TensorDictBase, *, windows: bool = False) -> TensorDictBase | None:
+        parameters = self.model.parameters_in(tensordict)
+        if parameters is not None:
+            parameters = parameters[:, 0] if windows else parameters
         # Inferred ones come from a network that is trained too: if it diverges, the loss says so.
-        if static is not None and self.trained.static != "inferred":
-            require_finite(static, f"{self.model.static_key!r} of the batch")
-        return static
+        if parameters is not None and self.trained.parameter_source != "inferred":
+            require_finite(parameters, f"{self.model.parameters_key!r} of the batch")
+        return parameters
 
     def _perturb(self, state: Tensor) -> Tensor:
         if self.noise == 0:
@@ -259,15 +254,15 @@ class ForwardModelLoss(LossModule):
         # A generator draws on its own device only, so that a seed gives the same noise on any.
         device = state.device if self.generator is None else self.generator.device
         noise = torch.randn(shape, generator=self.generator, dtype=state.dtype, device=device).to(state.device)
-        scale = (self.noise * self.noise_scale).to(state.dtype) * self.model.live
+        scale = (self.noise * self.noise_scale).to(state.dtype) * self.model.movable
         return self.model.layout.apply(state, noise * scale)
 
     def _scale(self, like: Tensor) -> Tensor:
-        """``[N, 12]`` weights: one over the spread of each live channel, 0 for dead ones."""
+        """``[N, 12]`` weights: one over the spread of each movable channel, 0 for dead ones."""
         weight = torch.where(self.error_weight < 0, self.trained.delta_normalizer.inverse_std, self.error_weight)
-        return (weight * self.model.live).to(like.dtype)
+        return (weight * self.model.movable).to(like.dtype)
 
-    def _live_components(self) -> Tensor:
+    def _movable_components(self) -> Tensor:
         layout = self.model.layout
         scale = self._scale(self.noise_scale)
         return torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])

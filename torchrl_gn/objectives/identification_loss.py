@@ -8,8 +8,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_gn.dynamics import Predictor
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import BoundForwardModel, BoundInferenceModel, IdentifyingModel
+from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.objectives.fitted import require_fitted
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 from torchrl_gn.scenes import Scene
@@ -35,7 +36,7 @@ class IdentificationLoss(LossModule):
 
     Input: ``state``, ``action`` and ``("next", "state")`` ``[B, phase + parts * H, ...]`` as
     ``trajectory_buffer(..., window=phase, elsewhere=(parts, H))`` draws them; over ``H`` steps the model is fed its own
-    predictions. Static values of the samples are not read.
+    predictions. Physical parameters of the samples are not read.
 
     Output: as :class:`ForwardModelLoss`.
     """
@@ -75,7 +76,7 @@ class IdentificationLoss(LossModule):
         return self.identifying
 
     @property
-    def bound(self) -> BoundForwardModel:
+    def bound(self) -> Predictor:
         """The forward model, which reads what the inference model writes."""
         return self.prediction.model
 
@@ -117,16 +118,18 @@ class IdentificationLoss(LossModule):
             )
         state, action, next_state = (self._entry(tensordict, key) for key in self.in_keys)
         seen = slice(self._skipped(), self.phase)
-        static = self.inference.infer(state[:, seen], action[:, seen], next_state[:, seen]).static
+        parameters = self.inference.infer(state[:, seen], action[:, seen], next_state[:, seen]).parameters
         # Every part that is predicted is a sample of its own, [B * parts, H, ...].
         state, action, next_state = (
             entry[:, self.phase :].unflatten(1, (self.parts, window)).flatten(0, 1)
             for entry in (state, action, next_state)
         )
         steps = len(state), window
-        static = static.apply(lambda value: value.repeat_interleave(self.parts, 0), batch_size=steps[:1])
-        static = static.apply(lambda value: value.unsqueeze(1).expand(*steps, *value.shape[1:]), batch_size=steps)
-        entries = {"state": state, "action": action, "next": {"state": next_state}, "static": static}
+        parameters = parameters.apply(lambda value: value.repeat_interleave(self.parts, 0), batch_size=steps[:1])
+        parameters = parameters.apply(
+            lambda value: value.unsqueeze(1).expand(*steps, *value.shape[1:]), batch_size=steps
+        )
+        entries = {"state": state, "action": action, "next": {"state": next_state}, "parameters": parameters}
         return self.prediction(TensorDict(entries, batch_size=steps))
 
     def _skipped(self) -> int:

@@ -11,8 +11,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives import LossModule
 
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import LearnedReward, ObservationModel
 from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.policies import LearnedReward, ObservationModel
 
 UPDATE_NORMALIZERS = (
     "Call update_normalizers(observation, action, next_observation) of the Agent, or of the model, with collected"

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from torchrl_gn.modules import ForwardModel
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives.fitted import require_fitted
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss
 
-from torchrl_gn.modules.weights import frozen, with_weights
+from torchrl_gn.networks.frozen_weights import frozen, with_weights
 from torchrl_gn.objectives.fitted import require_fitted
 from torchrl_gn.objectives.observation_model_loss import UPDATE_NORMALIZERS
 
@@ -47,7 +47,7 @@ class SVGLoss(DDPGLoss):
         actor_network: policy, for example a ``ProbabilisticActor``; one that does not sample is DDPG's.
         value_network: writes ``state_action_value``.
         model: TensorDict module from observation and action to ``("next", observation)``, for example an
-            :class:`~torchrl_gn.modules.ObservationModel`. Not read with ``steps=0``. What policy and value read besides
+            :class:`~torchrl_gn.policies.ObservationModel`. Not read with ``steps=0``. What policy and value read besides
             (a goal) stays as it is.
         reward: reward of an imagined step, known or learned.
         steps: ``N``, steps through the model.

@@ -16,9 +16,9 @@ from torchrl.envs import TensorDictPrimer
 
 from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.generator import numpy_generator
+from torchrl_gn.dynamics import Predictor
 from torchrl_gn.envs.model_env import ModelEnv
-from torchrl_gn.modules import BoundForwardModel
-from torchrl_gn.modules.weights import frozen
+from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.plan import (
     KEY,
     RecedingHorizonPlanner,
@@ -140,11 +140,13 @@ class GradientPlanner(RecedingHorizonPlanner):
 
         Of a recurrent model it also carries what that remembers.
         """
-        memory = cast(TensorDictBase, self.imagined.world_model.own_memory()) if self._remembers else None
-        return plan_primer(self.plan_shape, torch.float32, self.imagined.device, memory, step_size=(1,))
+        hidden_state = (
+            cast(TensorDictBase, self.imagined.world_model.initial_hidden_state()) if self._remembers else None
+        )
+        return plan_primer(self.plan_shape, torch.float32, self.imagined.device, hidden_state, step_size=(1,))
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
-        """The action to take now, ``[*B, A]``, where the states are; what is left of the plan; and memory."""
+        """The action to take now, ``[*B, A]``, where the states are; what is left of the plan; and hidden state."""
         if torch.is_inference_mode_enabled():
             raise RuntimeError(
                 "GradientPlanner needs gradients, which torch.inference_mode() rules out; use torch.no_grad() there."
@@ -155,9 +157,9 @@ class GradientPlanner(RecedingHorizonPlanner):
         states_at = cast(Tensor, tensordict.get("state", plan)).device
         plan, planned = self._scaled(plan.to(device)), planned.flatten().to(device)
         entries = self._entries(flat)
-        if self._remembers and "memory" not in entries.keys() and bool(planned.any()):
+        if self._remembers and "hidden_state" not in entries.keys() and bool(planned.any()):
             raise KeyError(
-                "The model remembers past states, and the environment drops its entry 'memory' between steps: append"
+                "The model remembers past states, and the environment drops its entry 'hidden_state' between steps: append"
                 " the planner's make_tensordict_primer() to the environment that is acted in."
             )
         best, size = plan.clone(), self._step_size(flat).to(device)
@@ -180,7 +182,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         )
         beside: dict[NestedKey, TensorDictBase] = {KEY: left}
         if self._remembers:
-            beside["next", "memory"] = self._remember(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
+            beside["next", "hidden_state"] = self._remember(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
         return actions[:, 0, 0].reshape(*batch, -1).to(states_at), beside
 
     def _step_size(self, flat: TensorDictBase) -> Tensor:
@@ -200,19 +202,19 @@ class GradientPlanner(RecedingHorizonPlanner):
 
     @property
     def _remembers(self) -> bool:
-        return "memory" in self.imagined.world_model.in_keys
+        return "hidden_state" in self.imagined.world_model.in_keys
 
     @torch.no_grad()
     def _remember(self, entries: TensorDictBase, action: Tensor) -> TensorDictBase:
         """What the model remembers once it has seen this state and action."""
         action = self.env.action_spec.project(action)
-        return self.imagined.world_model(entries.copy().set("action", action))["next", "memory"]
+        return self.imagined.world_model(entries.copy().set("action", action))["next", "hidden_state"]
 
     def _entries(self, flat: TensorDictBase) -> TensorDictBase:
         """What imagining reads, detached."""
         model = cast(object, self.imagined.world_model)
-        if isinstance(model, BoundForwardModel):
-            model.static_in(flat)  # refuses other variants, of which the entries below tell nothing any more
+        if isinstance(model, Predictor):
+            model.parameters_in(flat)  # refuses other variants, of which the entries below tell nothing any more
         keys = [key for key in (*self.imagined.world_model.in_keys, "task") if key != "action"]
         read = flat.select(*keys, strict=False).detach()
         # Of what was made in inference mode, which autograd refuses, copies.

@@ -13,7 +13,7 @@ from torchrl_gn.data.simulate import Simulator
 class Tangent:
     """Small changes of a MuJoCo state: ``X = 2 nv + na`` numbers, of positions, velocities and activations.
 
-    Where positions hold quaternions, changes live in their tangent space (``mj_integratePos``).
+    Where positions hold quaternions, changes movable in their tangent space (``mj_integratePos``).
 
     Args:
         model: MuJoCo model of the states.

@@ -140,7 +140,7 @@ def plan_primer(
     shape: tuple[int, ...],
     dtype: torch.dtype,
     device: torch.device | None,
-    memory: TensorDictBase | None = None,
+    hidden_state: TensorDictBase | None = None,
     **more: tuple[int, ...],
 ) -> TensorDictPrimer:
     """Transform that clears the plan when an episode begins; append it to the environment that is acted in.
@@ -149,14 +149,17 @@ def plan_primer(
         shape: of a sample's sequences, ``(..., H, A)``.
         dtype: of the actions.
         device: of the environment.
-        memory: what a recurrent model remembers of nothing, zeros, to clear too.
+        hidden_state: what a recurrent model remembers of nothing, zeros, to clear too.
         **more: shapes of a sample's other entries of the plan.
     """
     entries = {key: Unbounded(shape=torch.Size(of), dtype=dtype, device=device) for key, of in more.items()}
     entries["actions"] = Unbounded(shape=torch.Size(shape), dtype=dtype, device=device)
     entries["planned"] = Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=device)
     specs = {KEY: Composite(entries)}
-    if memory is not None:
-        of = {str(key): Unbounded(shape=value.shape, dtype=value.dtype, device=device) for key, value in memory.items()}
-        specs["memory"] = Composite(of)
+    if hidden_state is not None:
+        of = {
+            str(key): Unbounded(shape=value.shape, dtype=value.dtype, device=device)
+            for key, value in hidden_state.items()
+        }
+        specs["hidden_state"] = Composite(of)
     return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)

@@ -28,11 +28,11 @@ def arm_reach(scene: Scene, body: str) -> tuple[np.ndarray, float]:
     Raises:
         ValueError: the scene has no such body.
     """
-    found, linkage = find_body(scene, body), scene.linkage
+    found, joint_anchors = find_body(scene, body), scene.joint_anchors
     node, point, length = found.node, found.pos, 0.0
-    if linkage.root[node] != 0:
+    if joint_anchors.root[node] != 0:
         return np.zeros(3), math.inf
     while node:
-        length += float(np.linalg.norm(point - linkage.arm[node]))
-        node, point = int(linkage.parent[node]), linkage.parent_arm[node]
+        length += float(np.linalg.norm(point - joint_anchors.child_anchor[node]))
+        node, point = int(joint_anchors.parent[node]), joint_anchors.parent_anchor[node]
     return point, length

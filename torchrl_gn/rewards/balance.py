@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.modules import quaternion
+from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.rewards.reward import Reward
 from torchrl_gn.scenes.scene import Scene

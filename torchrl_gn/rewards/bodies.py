@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.modules import BODY_STATE, quaternion
-from torchrl_gn.modules.float64_buffers import Float64Buffers
+from torchrl_gn.maths import BODY_STATE, quaternion
+from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.scenes.scene import Attachment, Scene
 
 _POSITION, _ORIENTATION = BODY_STATE.slices["position"], BODY_STATE.slices["orientation"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_gn.modules import quaternion
+from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards.arm_reach import arm_reach
 from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.rewards.reward import Reward

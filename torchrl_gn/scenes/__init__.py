@@ -8,29 +8,29 @@ Example:
 """
 
 from torchrl_gn.scenes.errors import SceneChangedWarning, SceneError, UnsupportedSceneError
-from torchrl_gn.scenes.feature_set import FeatureSet
-from torchrl_gn.scenes.joint_chain import JointChain, chain_states
+from torchrl_gn.scenes.kinematic_tree import KinematicTree, tree_states
 from torchrl_gn.scenes.load import load_scene, scene_from_description
 from torchrl_gn.scenes.observation_graph import ObservationGraph
+from torchrl_gn.scenes.parameter_names import ParameterNames
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
-from torchrl_gn.scenes.scene_values import SceneValues
 from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange
 from torchrl_gn.scenes.variants import has_variants, make_variants, parameter_ranges, sample_parameters, sample_variants
 
 __all__ = [
     "SYSTEMS",
     "Attachment",
-    "FeatureSet",
-    "JointChain",
+    "ParameterNames",
+    "KinematicTree",
     "ObservationGraph",
     "ParameterRange",
     "Scene",
     "SceneChangedWarning",
     "SceneError",
-    "SceneValues",
+    "PhysicalParameters",
     "StaticGraph",
     "UnsupportedSceneError",
-    "chain_states",
+    "tree_states",
     "has_variants",
     "load_scene",
     "make_variants",

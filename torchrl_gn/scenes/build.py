@@ -7,13 +7,13 @@ import numpy as np
 
 from torchrl_gn.scenes.contact_points import find_contact_points
 from torchrl_gn.scenes.errors import SceneError, UnsupportedSceneError
-from torchrl_gn.scenes.heading import find_heading
 from torchrl_gn.scenes.invariance import translation_invariant
-from torchrl_gn.scenes.linkage import find_linkage
-from torchrl_gn.scenes.mobility import live_channels
+from torchrl_gn.scenes.joint_anchors import find_joint_anchors
+from torchrl_gn.scenes.movable import movable_components
 from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import Topology, offset, topology
+from torchrl_gn.scenes.yaw_frame import find_yaw_frame
 
 _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the state
     mujoco.mjtSensor.mjSENS_FRAMEPOS,
@@ -62,7 +62,7 @@ def build_scene(
     static = static_graph(model, graph, actuator_of_joint, substeps * model.opt.timestep)
     _refuse_non_finite(static, name, node_names, joint_names)
     data = mujoco.MjData(model)
-    live = live_channels(model, data, graph.body)
+    movable = movable_components(model, data, graph.body)
     mujoco.mj_resetData(model, data)
     mujoco.mj_kinematics(model, data)
     invariant = translation_invariant(model, data, graph)
@@ -78,10 +78,10 @@ def build_scene(
         receivers=graph.receivers,
         edge_action=np.repeat(actuator_of_joint, 2),
         static=static,
-        live=live,
+        movable=movable,
         translation_invariant=invariant,
-        linkage=find_linkage(model, data, graph),
-        heading=find_heading(model, data, graph, live, invariant),
+        joint_anchors=find_joint_anchors(model, data, graph),
+        yaw_frame=find_yaw_frame(model, data, graph, movable, invariant),
         contact_points=find_contact_points(model, data, graph),
         action_low=model.actuator_ctrlrange[:, 0].copy(),
         action_high=model.actuator_ctrlrange[:, 1].copy(),

@@ -13,7 +13,7 @@ import mujoco
 
 from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.errors import SceneChangedWarning
-from torchrl_gn.scenes.joint_chain import JointChain
+from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.mjcf_source import is_mjcf_text, read_mjcf, rebuild_mjcf
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
@@ -85,7 +85,7 @@ def scene_from_description(description: dict) -> Scene:
     """
     if "joint_chain" in description:
         # It has all of a scene that models and errors read.
-        return cast(Scene, JointChain.from_description(description))
+        return cast(Scene, KinematicTree.from_description(description))
     system = find_system(description["system"]) if "system" in description else None
     if system is None and "system" in description:
         raise ValueError(_unknown(description["system"]))

@@ -11,8 +11,8 @@ import numpy as np
 from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.errors import SceneError
 from torchrl_gn.scenes.fingerprint import fingerprint
-from torchrl_gn.scenes.heading import Heading
-from torchrl_gn.scenes.linkage import Linkage
+from torchrl_gn.scenes.joint_anchors import JointAnchors
+from torchrl_gn.scenes.yaw_frame import YawFrame
 
 
 @dataclass(frozen=True)
@@ -73,12 +73,12 @@ class Scene:
         receivers: ``[E]`` receiving node of each edge.
         edge_action: ``[E]`` index of the action applied at the edge's joint, -1 without motor.
         static: the static graph, float64.
-        live: ``[N, 12]`` bool, which components of the state change (position 3, rotation
+        movable: ``[N, 12]`` bool, which components of the state change (position 3, rotation
             3, linear velocity 3, angular velocity 3; world frame) can ever differ from zero.
         translation_invariant: ``[3]`` bool, world axes along which the dynamics do not
             depend on where the scene is.
-        linkage: where joints pin the nodes together.
-        heading: how the whole scene is turned, if the dynamics do not depend on it.
+        joint_anchors: where joints joint anchor the nodes together.
+        yaw_frame: how the whole scene is turned, if the dynamics do not depend on it.
         contact_points: where bodies can touch a plane that is fixed in the world.
         action_low: ``[A]`` lower bounds of the controls.
         action_high: ``[A]`` upper bounds of the controls.
@@ -99,10 +99,10 @@ class Scene:
     receivers: np.ndarray
     edge_action: np.ndarray
     static: StaticGraph
-    live: np.ndarray
+    movable: np.ndarray
     translation_invariant: np.ndarray
-    heading: Heading | None
-    linkage: Linkage
+    yaw_frame: YawFrame | None
+    joint_anchors: JointAnchors
     contact_points: ContactPoints | None
     action_low: np.ndarray
     action_high: np.ndarray
@@ -152,8 +152,8 @@ class Scene:
 
     @property
     def predicted(self) -> np.ndarray:
-        """``[N]`` bool, nodes with at least one live component; the others never move."""
-        return np.any(self.live, axis=1)
+        """``[N]`` bool, nodes with at least one movable component; the others never move."""
+        return np.any(self.movable, axis=1)
 
     def description(self) -> dict:
         """Plain, JSON-able values from which :func:`scene_from_description` builds the scene again.
@@ -180,15 +180,15 @@ class Scene:
     def fingerprint(self) -> str:
         """Hash of names, control step, bounds and physical parameters (six digits): equal physics, equal hash.
 
-        Static features have no part in it; :class:`~torchrl_gn.scenes.FeatureSet` has their names.
+        Static features have no part in it; :class:`~torchrl_gn.scenes.ParameterNames` has their names.
         """
         return fingerprint(self)
 
     def __str__(self) -> str:
         """Readable summary: time steps, nodes, joints, motors, what moves, where it is invariant."""
         axes = "".join(axis for axis, free in zip("xyz", self.translation_invariant, strict=True) if free)
-        turns = "no axis" if self.heading is None else "xyz"[self.heading.axis]
-        turns += " but for contacts with the world" * (self.heading is not None and not self.heading.exact)
+        turns = "no axis" if self.yaw_frame is None else "xyz"[self.yaw_frame.axis]
+        turns += " but for contacts with the world" * (self.yaw_frame is not None and not self.yaw_frame.exact)
         step, physics_step = 1e3 * self.timestep, 1e3 * self.model.opt.timestep
         counts = ((self.num_nodes, "node"), (self.num_edges, "edge"), (self.num_actions, "action"))
         lines = [
@@ -198,12 +198,12 @@ class Scene:
             f"  translation-invariant along {axes or 'no axis'}, rotation-invariant about {turns}",
         ]
         mass = dict(zip(self.static.node_names, self.static.nodes.T, strict=True))["mass"]
-        rows = [("node", "parent", "mass [kg]", "live position", "live rotation", "welded bodies")]
+        rows = [("node", "parent", "mass [kg]", "movable position", "movable rotation", "welded bodies")]
         for node, name in enumerate(self.node_names):
             parent = self.node_names[self.parent[node]] if node else "-"
             welded = [body for body, attachment in self.attachments.items() if attachment.node == node]
-            live = [_axes(self.live[node, :3]), _axes(self.live[node, 3:6])]
-            rows.append((name, parent, f"{mass[node]:.4g}", live[0], live[1], ", ".join(welded) or "-"))
+            movable = [_axes(self.movable[node, :3]), _axes(self.movable[node, 3:6])]
+            rows.append((name, parent, f"{mass[node]:.4g}", movable[0], movable[1], ", ".join(welded) or "-"))
         lines += _table(rows)
         rows = [("joint", "type", "between", "action", "bounds")]
         for joint, name in enumerate(self.joint_names):
@@ -217,7 +217,7 @@ class Scene:
 
 
 def _axes(flags: np.ndarray) -> str:
-    return "".join(axis for axis, live in zip("xyz", flags, strict=True) if live) or "-"
+    return "".join(axis for axis, movable in zip("xyz", flags, strict=True) if movable) or "-"
 
 
 def _table(rows: list[tuple[str, ...]]) -> list[str]:

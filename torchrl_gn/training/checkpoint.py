@@ -18,7 +18,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.modules import Agent, ForwardModel, IdentifyingModel
+from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.identification import IdentifyingModel
+from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import Scene, scene_from_description
 
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"

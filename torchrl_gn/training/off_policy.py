@@ -19,9 +19,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import HardUpdate, LossModule
 
+from torchrl_gn.dynamics.executors.compiled import check_compiler, check_torch
 from torchrl_gn.finite import require_finite
-from torchrl_gn.modules import Agent
-from torchrl_gn.modules.compiled_step import check_compiler, check_torch
+from torchrl_gn.policies import Agent
 
 _KEPT = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torchrl.data import ReplayBuffer
 
-from torchrl_gn.modules import fast_matmul
+from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss, SeveralScenesLoss
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.optimizers import ScheduledOptimizer

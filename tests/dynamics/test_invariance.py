@@ -1,0 +1,139 @@
+"""Predictions move and turn with the scene."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_gn.maths import BODY_STATE, quaternion
+from torchrl_gn.scenes import load_scene
+
+# An arm that turns about the vertical.
+ARM = """
+<mujoco model="arm">
+  <worldbody>
+    <body pos=".1 .2 1" euler="180 0 0">
+      <joint axis="0 0 1"/><geom type="capsule" size=".05 .2" pos=".1 0 0"/>
+      <body pos=".3 0 0"><joint name="elbow" axis="0 1 0"/><geom size=".1" pos=".2 .1 0"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="elbow" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["swimmer6", "cheetah", "falling"])
+def test_predictions_do_not_depend_on_the_place(scenes, make_model, random_states, random_actions, name, dtype):
+    """A thousand kilometres away, along axes without landmarks, the same change is predicted."""
+    scene = scenes[name]
+    bound = make_model(scene).to(dtype).bind(scene)
+    state, action = random_states(scene, 10, seed=3), random_actions(scene, 10)
+    delta = bound.delta(state, action)
+    axes = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
+    assert axes.any()
+    far = state.clone()
+    far[:, 1:, :3] += 1e6 * axes
+    assert (bound.delta(far, action) - delta).norm() < 1e-6 * delta.norm()
+    # Near places to the last digits: the float32 input is the same up to float64's rounding.
+    near = state.clone()
+    near[:, 1:, :3] += axes
+    assert (bound.delta(near, action) - delta).norm() < 1e-7 * delta.norm()
+
+
+def test_place_matters_along_other_axes_and_without_recentring(scenes, make_model, random_states, random_actions):
+    scene = scenes["cheetah"]
+    state, action = random_states(scene, 10, seed=3), random_actions(scene, 10)
+    up, along = state.clone(), state.clone()
+    up[:, 1:, 2] += 1
+    along[:, 1:, 0] += 1
+    bound = make_model(scene).bind(scene)
+    assert (bound.delta(up, action) - bound.delta(state, action)).norm() > 1e-3
+    absolute = make_model(scene, recenter=False).bind(scene)
+    assert (absolute.delta(along, action) - absolute.delta(state, action)).norm() > 1e-3
+
+
+@pytest.mark.parametrize(("name", "hidden"), [("swimmer6", [0, 1]), ("cheetah", [0]), ("pendulum", [])])
+def test_positions_along_invariant_axes_can_be_hidden(scenes, make_model, random_states, random_actions, name, hidden):
+    """One body moved alone, which no joint would let it, changes what the network sees of other axes only."""
+    scene = scenes[name]
+    bound = make_model(scene, positions=False, project=False, recenter=False).bind(scene)
+    state, action = random_states(scene, 10, seed=3), random_actions(scene, 10)
+    seen = bound.dynamic_graph(state, action).nodes
+    for axis in range(3):
+        moved = state.clone()
+        moved[:, 1, axis] += 0.5
+        same = torch.equal(bound.dynamic_graph(moved, action).nodes, seen)
+        assert same or axis not in hidden
+        assert not same or axis in hidden or not scene.movable[:, axis].any()
+    default = make_model(scene, project=False, recenter=False).bind(scene)
+    for axis in hidden:
+        moved = state.clone()
+        moved[:, 1, axis] += 0.5
+        assert not torch.equal(default.dynamic_graph(moved, action).nodes, default.dynamic_graph(state, action).nodes)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["swimmer6", "arm"])
+def test_predictions_turn_with_the_scene(scenes, make_model, random_states, random_actions, name, dtype):
+    """Turned by any angle about the axis of its yaw_frame, a scene changes in the same way, turned."""
+    scene = load_scene(ARM) if name == "arm" else scenes[name]
+    yaw_frame = scene.yaw_frame
+    assert yaw_frame is not None
+    bound = make_model(scene).to(dtype).bind(scene)
+    state, action = random_states(scene, 10, seed=3), random_actions(scene, 10)
+    # The root's orientation is a turn about the axis, as its joint allows.
+    spin = torch.zeros(10, 3, dtype=state.dtype)
+    spin[:, yaw_frame.axis] = torch.linspace(-3, 3, 10)
+    rest = torch.as_tensor(yaw_frame.rest).expand(10, 4)
+    state[:, yaw_frame.node, 3:7] = quaternion.product(quaternion.exp(spin), rest)
+    delta = bound.delta(state, action)
+    for angle in (1e-8, 0.8, torch.pi, -2.0):
+        turn = quaternion.exp(angle * torch.eye(3, dtype=state.dtype)[yaw_frame.axis]).expand(10, 4)
+        pivot = torch.zeros(13, dtype=state.dtype)
+        pivot[:3] = torch.as_tensor(yaw_frame.pivot)
+        turned = torch.cat((state[:, :1], (BODY_STATE.turn(state - pivot, turn) + pivot)[:, 1:]), 1)
+        error = bound.delta(turned, action) - BODY_STATE.rotate_delta(delta, turn)
+        assert error.norm() < (1e-12 if dtype == torch.float64 else 1e-5) * delta.norm()
+    plain = make_model(scene, align=False).bind(scene)
+    error = plain.delta(turned, action) - BODY_STATE.rotate_delta(plain.delta(state, action), turn)
+    assert error.norm() > 1e-3 * delta.norm()
+
+
+def test_where_the_world_can_be_touched_it_shows_the_heading(make_model, random_states):
+    scene = load_scene(ARM.replace("<worldbody>", '<worldbody><geom type="plane" size="1 1 1"/>'))
+    bound = make_model(scene).bind(scene)
+    assert scene.yaw_frame is not None and not scene.yaw_frame.exact
+    state = random_states(scene, 5)
+    seen = bound.frame.see(state, bound.values).state
+    rest = torch.as_tensor(scene.yaw_frame.rest).expand(5, 4)
+    turn = bound.frame.yaw_rotation(state, bound.values).rotation
+    assert turn is not None
+    torch.testing.assert_close(seen[:, 0, 3:7], quaternion.product(quaternion.conjugate(turn), state[:, 0, 3:7]))
+    unmoved = make_model(load_scene(ARM)).bind(load_scene(ARM))
+    free = unmoved.frame.see(state, unmoved.values).state
+    assert torch.equal(free[:, 0], state[:, 0])
+    assert torch.equal(free[:, 1:], seen[:, 1:])
+    state[:, 1, 3:7] = rest
+    torch.testing.assert_close(bound.frame.see(state, bound.values).state, state, rtol=0, atol=1e-12)
+
+
+def test_joint_axes_turn_with_the_scene(scenes, make_model, random_states, random_actions):
+    scene = scenes["jaco"] if "jaco" in scenes else load_scene("jaco")
+    bound = make_model(scene, joint_axes=True).bind(scene)
+    state, action = random_states(scene, 5), random_actions(scene, 5)
+    features = bound.frame.features(bound.frame.see(state, bound.values), action, bound.values)[1]
+    assert features.shape == (5, scene.num_edges, 7)
+    axes, pushes = features[..., 1:4], features[..., 4:]
+    torch.testing.assert_close(axes.norm(dim=-1), torch.ones(5, scene.num_edges, dtype=axes.dtype))
+    torch.testing.assert_close(pushes, features[..., :1] * axes)
+    # With the place and yaw_frame as they are, every body turned by one rotation turns every axis.
+    bound = make_model(scene, align=False).bind(scene)
+    axes = bound.frame.features(bound.frame.see(state, bound.values), action, bound.values)[1][..., 1:4]
+    turn = quaternion.exp(torch.tensor([0.3, -0.5, 0.8], dtype=state.dtype))
+    turned = state.clone()
+    turned[..., 3:7] = quaternion.product(turn, state[..., 3:7])
+    matrix = quaternion.to_matrix(turn).reshape(3, 3)
+    torch.testing.assert_close(
+        bound.frame.features(bound.frame.see(turned, bound.values), action, bound.values)[1][..., 1:4], axes @ matrix.T
+    )

@@ -1,0 +1,231 @@
+"""Samples with physical parameters of their own: variants of a scene, and inferred graphs."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.envs import ModelEnv
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+SIZES = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8, 8), "global_hidden": (8,)}
+
+
+def child_anchor(length: float = 0.3, size: float = 0.05, turned: float = 0.0, slide: str = ""):
+    """An arm of two links that turns about the vertical, in variants."""
+    return load_scene(f"""
+      <mujoco model="arm">
+        <worldbody>
+          <body pos=".1 .2 {1 + length}" euler="180 0 {turned}">
+            <joint axis="0 0 1"/><geom type="capsule" size="{size} .2" pos=".1 0 0"/>
+            <body pos="{length} 0 0">{slide or '<joint name="elbow" axis="0 1 0" damping=".1"/>'}
+              <geom size=".1" pos=".2 .1 0"/>
+            </body>
+          </body>
+        </worldbody>
+        <actuator><motor joint="elbow" ctrlrange="-1 1"/></actuator>
+      </mujoco>
+    """)
+
+
+@pytest.fixture(scope="module")
+def variants():
+    return [child_anchor(), child_anchor(0.5, 0.07, 30), child_anchor(0.2, 0.04, -70)]
+
+
+@pytest.fixture(scope="module")
+def samples(variants):
+    """Trajectories of every variant, [3, 2, ...]."""
+    return torch.stack([collect_trajectories(scene, 2, 4, seed) for seed, scene in enumerate(variants)])
+
+
+@pytest.fixture
+def model(variants, samples):
+    torch.manual_seed(0)
+    model = ForwardModel(ParameterNames.of(variants[0]), **SIZES).double()
+    bound = model.bind(variants[0], parameters_key="parameters")
+    statics = torch.stack([bound.parameters_of(scene) for scene in variants])
+    for index in range(3):
+        loss = ForwardModelLoss(bound)
+        one = samples[index].clone().set("parameters", statics[index].expand(2))
+        loss.fit_normalizers(trajectory_buffer(one, batch_size=64, seed=0).sample())
+    return model
+
+
+def inputs(samples, bound, variants):
+    """One state and action of every variant, and its physical parameters."""
+    parameters = torch.stack([bound.parameters_of(scene) for scene in variants])
+    return samples["state"][:, 0, 0], samples["action"][:, 0, 0], parameters
+
+
+@pytest.mark.parametrize("way", ["plain", "folded", "specialised"])
+def test_every_sample_is_predicted_as_its_own_scene(variants, samples, model, way):
+    bound = model.bind(variants[0], parameters_key="parameters", plain=way == "plain")
+    assert bound.in_keys == ["state", "action", "parameters"]
+    state, action, parameters = inputs(samples, bound, variants)
+    model.requires_grad_(False)
+    module = specialize(bound) if way == "specialised" else bound
+    state.requires_grad_()
+    action.requires_grad_()
+    ours = module.step(state, action, parameters)
+    theirs = torch.stack([model.bind(s, plain=True).step(*x) for s, *x in zip(variants, state, action, strict=True)])
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-10)
+    assert (ours - bound.step(state, action, parameters[0])).abs().max() > 1e-4
+    weight = torch.randn(ours.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    gradients = [torch.autograd.grad((out * weight).sum(), (state, action)) for out in (ours, theirs)]
+    for got, expected in zip(*gradients, strict=True):
+        assert (got - expected).norm() <= 1e-10 * expected.norm()
+    written = module(TensorDict({"state": state, "action": action, "parameters": parameters}, [3]))["next", "state"]
+    assert torch.equal(written, ours)
+
+
+@pytest.mark.parametrize("special", [False, True])
+@pytest.mark.parametrize("core", ["gn", "mlp"])
+def test_rollouts_of_variants(variants, samples, model, special, core):
+    if core == "mlp":
+        items = (variants[0].num_nodes, variants[0].num_edges)
+        mlp = ForwardModel(ParameterNames.of(variants[0]), core="mlp", mlp_hidden=(8, 8), items=items).double()
+        mlp.load_state_dict({**mlp.state_dict(), **{k: v for k, v in model.state_dict().items() if "core" not in k}})
+        model = mlp
+    bound = model.requires_grad_(False).bind(variants[0], parameters_key="parameters")
+    module = specialize(bound) if special else bound
+    state, _, parameters = inputs(samples, bound, variants)
+    actions = samples["action"][:, 0]
+    states = module.rollout(state, actions, parameters)
+    for index, scene in enumerate(variants):
+        expected = model.bind(scene).rollout(state[index], actions[index])
+        torch.testing.assert_close(states[index], expected, rtol=0, atol=1e-10)
+
+
+def test_a_snapshot_is_kept_for_the_same_values_and_never_used_for_others(variants, samples, model):
+    bound = model.requires_grad_(False).bind(variants[0], parameters_key="parameters")
+    quick = specialize(bound)
+    state, action, parameters = inputs(samples, bound, variants)
+    quick.step(state, action, parameters)
+    core = quick.fold(parameters).core
+    sample = TensorDict({"state": state, "action": action, "parameters": parameters}, [3])
+    quick(sample.select("state", "action", "parameters"))
+    assert quick.fold(parameters).core is core and quick._folds == 1
+    parameters["child_anchor"].mul_(1.01)  # in place
+    torch.testing.assert_close(quick.step(state, action, parameters), bound.step(state, action, parameters))
+    assert quick._folds == 2
+    parameters["nodes"] = parameters["nodes"] * 1.5  # another tensor
+    torch.testing.assert_close(quick.step(state, action, parameters), bound.step(state, action, parameters))
+    turned = parameters[[1, 2, 0]]
+    torch.testing.assert_close(quick.step(state, action, turned), bound.step(state, action, turned))
+    torch.testing.assert_close(quick.step(state, action), bound.step(state, action))  # back to the scene's own
+
+
+def test_a_model_of_one_scene_refuses_samples_of_another(variants, samples, model):
+    bound = model.requires_grad_(False).bind(variants[0])
+    state, action = samples["state"][0, :, 0], samples["action"][0, :, 0]
+    for module in (bound, specialize(bound)):
+        sample = TensorDict(
+            {"state": state, "action": action, "parameters": bound.parameters_of(variants[0]).expand(2)}, [2]
+        )
+        assert ("next", "state") in module(sample).keys(True)
+        sample["parameters"] = bound.parameters_of(variants[1]).expand(2)
+        with pytest.raises(ValueError, match="other static 'nodes' than scene 'arm'.*parameters_key='parameters'"):
+            module(sample)
+    sample.set(("next", "state"), state)
+    with pytest.raises(ValueError, match="other static 'nodes'"):
+        ForwardModelLoss(bound)(sample)
+
+
+@pytest.mark.parametrize("options", [{"parameters": "none"}, {"features": ParameterNames(nodes=("mass",))}])
+def test_a_model_of_fewer_features_compares_all_that_samples_bring(variants, samples, options):
+    model = ForwardModel(**{"features": ParameterNames.of(variants[0]), **options}, **SIZES).double()
+    bound = model.bind(variants[0])
+    sample = TensorDict({"state": samples["state"][0, :, 0], "action": samples["action"][0, :, 0]}, [2])
+    sample["parameters"] = PhysicalParameters.of(variants[0]).tensordict().expand(2)
+    assert ("next", "state") in bound(sample).keys(True)
+    sample["parameters", "edges"] = sample["parameters", "edges"] + 1.0
+    with pytest.raises(ValueError, match="other static 'edges' than scene 'arm'"):
+        bound(sample)
+
+
+def test_what_is_no_variant_is_refused(variants, model):
+    bound = model.bind(variants[0], parameters_key="parameters")
+    with pytest.raises(ValueError, match="no variant of 'arm': components that move, joint anchors differ"):
+        bound.parameters_of(child_anchor(slide='<joint name="elbow" type="slide" axis="0 1 0"/>'))
+    with pytest.raises(ValueError, match="'swimmer3' is no variant of 'arm': number of nodes, edges"):
+        bound.parameters_of(load_scene("swimmer3"))
+
+
+def test_bad_static_values_are_named(variants, samples, model):
+    bound = model.bind(variants[0], parameters_key="parameters")
+    state, action, parameters = inputs(samples, bound, variants)
+    with pytest.raises(KeyError, match="reads each sample's physical parameters at 'parameters'"):
+        bound(TensorDict({"state": state, "action": action}, [3]))
+    with pytest.raises(ValueError, match=r"no batch or that of the state, \[3\], got \[2\]"):
+        bound.step(state, action, parameters[:2])
+    with pytest.raises(KeyError, match=r"\['mass'\] are not known; use some of \['nodes'"):
+        bound.step(state, action, parameters.set("mass", torch.zeros(3)))
+    with pytest.raises(ValueError, match=r"'arm' must be \[3, 3, 3\], got \[3, 3, 2\]"):
+        bound.step(state, action, parameters.exclude("mass").set("child_anchor", torch.zeros(3, 3, 2)))
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_the_loss_reads_every_samples_values(variants, samples, model, window):
+    bound = model.bind(variants[0], parameters_key="parameters")
+    loss = ForwardModelLoss(bound)
+    assert loss.in_keys == ["state", "action", ("next", "state"), "parameters"]
+    parameters = torch.stack([bound.parameters_of(scene) for scene in variants])
+    every = samples.clone().set("parameters", parameters.unsqueeze(1).expand(3, 2)).flatten()
+    batch = trajectory_buffer(every, batch_size=12, window=window, seed=0).sample()
+    total = loss(batch)["loss_forward_model"]
+    total.backward()
+    assert all(p.grad is not None for p in model.core.first.parameters())
+    alone = []
+    for sample in batch:
+        which = int(sample["index"].flatten()[0]) // 2
+        own = ForwardModelLoss(model.bind(variants[which]))
+        alone.append(own(sample.exclude("parameters").unsqueeze(0))["loss_forward_model"])
+    torch.testing.assert_close(total, torch.stack(alone).mean())
+
+
+def test_a_model_env_of_variants(variants, samples, model):
+    bound = model.requires_grad_(False).bind(variants[0], parameters_key="parameters")
+    state, _, parameters = inputs(samples, bound, variants)
+    start = TensorDict({"state": state, "parameters": parameters}, [3])
+    for module in (bound, specialize(bound)):
+        env = ModelEnv(module, seed=0)
+        played = env.rollout(4, tensordict=env.reset(start.clone(), set_state=True), auto_reset=False)
+        expected = bound.rollout(state, played["action"], parameters)
+        torch.testing.assert_close(played["next", "state"], expected[:, 1:])
+    assert module._folds == 1  # not at every step
+    # Without values of its own a start has the scene's.
+    played = env.rollout(3, tensordict=TensorDict(batch_size=[2]))
+    expected = model.bind(variants[0]).rollout(played["state"][:, 0], played["action"])
+    torch.testing.assert_close(played["next", "state"], expected[:, 1:])
+
+
+@pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenFeatureWarning")
+def test_an_inferred_graph_is_read_as_it_is_and_gets_gradients(variants, samples):
+    torch.manual_seed(0)
+    scene = variants[0]
+    model = ForwardModel(ParameterNames.of(scene), parameters="inferred", inferred=(4, 3, 2), **SIZES).double()
+    bounds = [model.bind(scene, parameters_key="parameters", plain=plain) for plain in (True, False)]
+    ForwardModelLoss(model.bind(scene)).fit_normalizers(trajectory_buffer(samples[0], batch_size=64, seed=0).sample())
+    state, action = samples["state"][:, 0, 0], samples["action"][:, 0, 0]
+    shapes = {"nodes": (scene.num_nodes, 4), "edges": (scene.num_edges, 3), "globals_": (2,)}
+    leaves = {name: torch.randn(3, *shape, dtype=torch.float64, requires_grad=True) for name, shape in shapes.items()}
+    parameters = (
+        bounds[0].own_parameters().expand(3).clone().update(leaves)
+    )  # joint anchors beside the graph, where bodies are linked
+    outs = [bound.step(state, action, parameters) for bound in bounds]
+    torch.testing.assert_close(*outs, rtol=0, atol=1e-12)
+    gradients = [torch.autograd.grad(out.square().sum(), list(leaves.values())) for out in outs]
+    for plain, folded in zip(*gradients, strict=True):
+        assert plain.norm() > 0
+        torch.testing.assert_close(plain, folded)
+    quick = specialize(bounds[1]).step(state, action, parameters)
+    torch.testing.assert_close(quick, outs[0], rtol=0, atol=1e-12)
+    assert not quick.requires_grad
+    nothing = model.bind(scene).step(state, action)  # without a graph: zeros
+    assert (nothing - outs[0]).abs().max() > 1e-6

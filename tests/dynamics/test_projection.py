@@ -1,0 +1,253 @@
+"""Bodies that joints joint anchor together stay together, and are predicted better for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.dynamics.constraints.generalized_coordinates import GeneralizedProjection
+from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection
+from torchrl_gn.maths import BODY_STATE, quaternion
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes.joint_axes import joint_axes
+
+SYSTEMS = ["cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", "jaco"]
+# A free body with a universal joint, a ball, three hinges in one place, and an arm of hinges on it and on the world.
+CREATURE = """
+  <mujoco><option gravity="0 0 -1"/><worldbody>
+    <body pos="0 0 2" name="free"><freejoint/><geom size=".1"/>
+      <body pos=".2 0 0"><joint axis="0 1 0"/><joint axis="0 0 1"/><geom size=".05" pos=".1 .1 0"/>
+        <body pos=".2 0 .1"><joint type="ball"/><geom type="box" size=".05 .1 .02" pos=".1 0 0"/>
+          <body pos=".2 0 0"><joint axis="1 0 0"/><joint axis="0 1 0"/><joint axis="0 0 1"/>
+            <geom size=".05" pos="0 .1 0"/>
+          </body>
+        </body>
+      </body>
+      <body pos="-.2 0 0"><joint axis="1 1 0"/><geom size=".05" pos=".1 .1 0"/></body>
+    </body>
+    <body pos="3 0 1" euler="20 30 40"><joint axis="0 1 0" pos="-.1 0 0"/><geom size=".1" pos=".2 0 0"/>
+      <body pos=".3 0 0" euler="0 0 30"><joint axis="1 0 1"/><geom size=".1" pos=".2 .1 0"/></body>
+    </body>
+  </worldbody></mujoco>
+"""
+LINKED = [*SYSTEMS, CREATURE]
+
+
+def project(bound, state, delta):
+    return bound.projection(state, bound.frame.matrices(state), delta, bound.model.delta_normalizer.std, bound.values)
+
+
+def gaps(scene, state):
+    """How far, and how fast, every joint's joint anchor is apart on its two bodies."""
+    joint_anchors = scene.joint_anchors
+    frame = quaternion.to_matrix(state[..., 3:7]).unflatten(-1, (3, 3))
+    places, speeds = [], []
+    for node, anchors in (
+        (joint_anchors.parent, joint_anchors.parent_anchor),
+        (range(scene.num_nodes), joint_anchors.child_anchor),
+    ):
+        node = torch.as_tensor(list(node))
+        child_anchor = (frame[..., node, :, :] @ torch.as_tensor(anchors).unsqueeze(-1)).squeeze(-1)
+        places.append(state[..., node, :3] + child_anchor)
+        speeds.append(state[..., node, 7:10] + torch.linalg.cross(state[..., node, 10:], child_anchor))
+    return (places[1] - places[0]).abs().max(), (speeds[1] - speeds[0]).abs().max()
+
+
+@pytest.mark.parametrize("name", LINKED)
+def test_true_changes_are_linked_already(make_model, name):
+    scene = load_scene(name)
+    trajectories = collect_trajectories(scene, 2, 20)
+    state, after = trajectories["state"][:, :-1], trajectories["state"][:, 1:]
+    assert max(gaps(scene, state)) < 1e-12
+    bound = make_model(scene, fitted=False).bind(scene)
+    delta = BODY_STATE.delta(state, after)
+    torch.testing.assert_close(project(bound, state, delta), delta, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", LINKED)
+def test_pinned_bodies_stay_together(make_model, random_actions, name):
+    scene = load_scene(name)
+    trajectories = collect_trajectories(scene, 2, 20)
+    state = trajectories["state"][:, -1].clone()
+    moving = torch.as_tensor(scene.movable[:, :3]).double()
+    state[..., :3] += 0.01 * moving  # where the network's errors may have led
+    bound, loose = (make_model(scene, project=project).bind(scene) for project in (True, False))
+    actions = random_actions(scene, 2, 20)
+    assert max(gaps(scene, bound.rollout(state, actions)[:, 1:].detach())) < 1e-10
+    assert max(gaps(scene, loose.rollout(state, actions)[:, 1:].detach())) > 1e-4
+
+
+def test_parallel_hinges_at_one_place_share_their_turn_in_single_precision_too(make_model, random_states):
+    scene = load_scene("""
+      <mujoco><worldbody>
+        <body><joint axis="0 0 1"/><geom size=".1" pos=".3 0 0"/>
+          <body pos=".3 .1 0"><joint axis="1 1 0" armature=".1"/><joint axis="1 1 0" armature=".1"/>
+            <geom size=".1" pos=".2 0 .1"/>
+          </body>
+        </body>
+      </worldbody></mujoco>
+    """)
+    bound = make_model(scene, fitted=False).bind(scene)
+    assert isinstance(bound.projection, GeneralizedProjection)
+    state = collect_trajectories(scene, 20, 5, seed=0)["state"][:, -1]
+    delta = BODY_STATE.delta(state, random_states(scene, 20, scale=0.1))
+    delta = 0.1 * delta / delta.abs().amax((-2, -1), keepdim=True)
+    single, double = (project(bound, state.to(dtype), delta.to(dtype)) for dtype in (torch.float32, torch.float64))
+    assert (single - double).norm() < 1e-5 * double.norm()
+
+
+def test_a_body_that_turns_about_one_place_needs_no_linking(make_model):
+    scene = load_scene("pendulum")
+    bound, projection = make_model(scene).bind(scene), MaximalProjection(scene)
+    assert scene.joint_anchors.ancestors.any() and bound.projection is None
+    trajectories = collect_trajectories(scene, 2, 20)
+    state = trajectories["state"][:, :-1]
+    delta, matrices = bound.delta(state, trajectories["action"]).detach(), bound.frame.matrices(state)
+    assert torch.equal(projection(state, matrices, delta, bound.model.delta_normalizer.std, bound.values), delta)
+
+
+def off_axis(scene, state):
+    """How far hinges have turned about other axes than their own, rad, and at what rate, rad/s."""
+    joints = scene.model.jnt_bodyid
+    edges, count = np.arange(0, 2 * len(joints), 2), np.bincount(joints)[joints]
+    single = (scene.model.jnt_type == 3) & (count == 1)
+    edges, nodes = edges[single], joint_axes(scene)
+    parent, child = (torch.as_tensor(index[edges].copy()) for index in (scene.senders, scene.receivers))
+    axis = quaternion.rotate(state[..., nodes[0][single], 3:7], torch.as_tensor(nodes[1][single]))
+    spin = state[..., child, 10:] - state[..., parent, 10:]
+    relative = quaternion.product(quaternion.conjugate(state[..., parent, 3:7]), state[..., child, 3:7])
+    return relative, spin - (spin * axis).sum(-1, keepdim=True) * axis
+
+
+@pytest.mark.parametrize("name", ["jaco", CREATURE])
+def test_hinges_turn_about_their_axes_alone(make_model, random_actions, name):
+    scene = load_scene(name)
+    bound = make_model(scene).bind(scene)
+    assert isinstance(bound.projection, GeneralizedProjection)
+    state = collect_trajectories(scene, 2, 20)["state"][:, -1]
+    states = bound.rollout(state, random_actions(scene, 2, 20)).detach()
+    relative, spin = off_axis(scene, states)
+    assert spin.abs().max() < 1e-9
+    # From step to step the relative rotation changes about the axis, which its parent carries.
+    nodes, axes = joint_axes(scene)
+    step = quaternion.log(quaternion.product(relative[:, 1:], quaternion.conjugate(relative[:, :-1])))
+    joints = np.bincount(scene.model.jnt_bodyid)[scene.model.jnt_bodyid]
+    single = (scene.model.jnt_type == 3) & (joints == 1)
+    axis = torch.as_tensor(axes[single])
+    assert step.norm(dim=-1).max() > 1e-3
+    assert torch.linalg.cross(step, axis.expand_as(step)).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("name", ["jaco", CREATURE])
+def test_linking_by_joints_takes_noise_away(make_model, name):
+    """Less is left of a random error than by projection joint anchors alone, and least squares leaves less than it was."""
+    scene = load_scene(name)
+    bound = make_model(scene).bind(scene)
+    states = collect_trajectories(scene, 4, 20)["state"]
+    delta = BODY_STATE.delta(states[:, :-1], states[:, 1:])
+    std = delta.flatten(0, 2).std(0)
+    generator = torch.Generator().manual_seed(0)
+    noisy = delta + 0.1 * std * torch.randn(delta.shape, generator=generator, dtype=torch.float64) * bound.movable
+    seen = std > 1e-9
+    seen_from = states[:, :-1], bound.frame.matrices(states[:, :-1])
+    left = [
+        ((by(*seen_from, noisy, std, bound.values) - delta)[..., seen] / std[seen]).square().mean()
+        for by in (GeneralizedProjection(scene), MaximalProjection(scene), lambda _, __, change, *___: change)
+    ]
+    assert left[0] < 0.9 * left[1] < 0.8 * left[2]
+
+
+@pytest.mark.parametrize("name", ["cartpole", "swimmer6", "cheetah"])
+def test_in_the_plane_both_ways_are_the_same(make_model, name):
+    scene = load_scene(name)
+    bound = make_model(scene).bind(scene)
+    assert type(bound.projection) is MaximalProjection
+    state = collect_trajectories(scene, 4, 20)["state"][:, -1].clone()
+    state[..., 7:] = 0  # where bodies move, the one solves for rates before turning and the other after
+    generator = torch.Generator().manual_seed(0)
+    raw = 1e-4 * torch.randn(4, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * bound.movable
+    std = torch.ones(12, dtype=torch.float64)
+    matrices = bound.frame.matrices(state)
+    ours, theirs = (
+        by(state, matrices, raw, std, bound.values) for by in (GeneralizedProjection(scene), MaximalProjection(scene))
+    )
+    assert (ours - theirs).norm() < 1e-3 * raw.norm()
+
+
+def test_gradients_of_linking_by_joints(make_model):
+    scene = load_scene("jaco")
+    bound = make_model(scene).bind(scene)
+    state = collect_trajectories(scene, 1, 5)["state"][0, -1:]
+    generator = torch.Generator().manual_seed(0)
+    raw = 1e-2 * torch.randn(1, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * bound.movable
+    std = torch.ones(12, dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda delta: bound.projection(state, bound.frame.matrices(state), delta * bound.movable, std, bound.values),
+        (raw.requires_grad_(),),
+    )
+
+
+def test_a_linkage_moves_as_its_bodies_mean(scenes, make_model, random_actions):
+    """What the bodies disagree on is averaged; what they agree on is kept."""
+    scene = scenes["swimmer6"]
+    bound = make_model(scene, fitted=False).bind(scene)
+    state = collect_trajectories(scene, 2, 3)["state"][:, -1]
+    generator = torch.Generator().manual_seed(0)
+    change = 0.01 * torch.randn(2, 7, 12, generator=generator, dtype=torch.float64) * bound.movable
+    change[..., 3:6] = change[..., 9:] = 0
+    linked = project(bound, state, change)
+    shared = change[:, 1:, [0, 1, 6, 7]].mean(1, keepdim=True).expand(-1, 6, -1)
+    torch.testing.assert_close(linked[:, 1:, [0, 1, 6, 7]], shared, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", LINKED)
+def test_levers_are_the_derivative_of_places(make_model, name):
+    """How turning moves the bodies of a joint_anchors, against differences."""
+    scene = load_scene(name)
+    bound = make_model(scene).bind(scene)
+    state = collect_trajectories(scene, 2, 5)["state"][:, -1]
+    generator = torch.Generator().manual_seed(0)
+    movable = torch.as_tensor(scene.movable)
+    turn = torch.randn(2, scene.num_nodes, 3, generator=generator, dtype=torch.float64) * movable[:, 9:]
+    still = torch.zeros_like(turn)
+
+    anchors = bound.projection.anchors(bound.frame.matrices(state), bound.values)
+
+    root = torch.as_tensor(scene.joint_anchors.root)
+    together = (root[:, None] == root).double()
+    mean, root_moves = together / together.sum(1, keepdim=True), movable[root, :3]
+
+    def apart(turn):
+        places = bound.projection.pins(state, anchors, turn, still)[1][:, 0].view_as(turn)
+        return places - torch.where(root_moves, mean @ places, still)
+
+    moved = torch.zeros_like(turn).flatten(1)
+    turned = turn.flatten(1)[:, bound.projection.turning].unsqueeze(-1)
+    moved[:, bound.projection.placed] = (bound.projection.moves(anchors) @ turned).squeeze(-1)
+    moved = moved.view_as(turn)
+    torch.testing.assert_close((apart(1e-6 * turn) - apart(-1e-6 * turn)) / 2e-6, moved, rtol=1e-6, atol=1e-8)
+
+
+def test_what_bodies_disagree_on_is_settled_by_least_squares(make_model):
+    """No other linked change is nearer to the network's, in units of each component's spread."""
+    scene = load_scene("swimmer6")
+    bound = make_model(scene).bind(scene)
+    state = collect_trajectories(scene, 2, 5)["state"][:, -1]
+    generator = torch.Generator().manual_seed(0)
+    raw = 1e-5 * torch.randn(2, 7, 12, generator=generator, dtype=torch.float64) * bound.movable
+    linked = project(bound, state, raw)
+    std = bound.model.delta_normalizer.std
+    v, w = std[6:9].norm(), std[9:].norm()
+
+    def distance(delta):
+        return ((delta - raw)[..., 6:9] / v).square().sum() + ((delta - raw)[..., 9:] / w).square().sum()
+
+    nearest = distance(linked)
+    assert nearest < distance(torch.zeros_like(raw))
+    for seed in range(5):
+        other = (
+            torch.randn(2, 7, 12, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * bound.movable
+        )
+        assert distance(project(bound, state, linked + 1e-6 * other)) > nearest * (1 - 1e-6)

@@ -1,0 +1,1 @@
+"""Projection onto joint constraints."""

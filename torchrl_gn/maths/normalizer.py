@@ -1,0 +1,141 @@
+"""Feature statistics that stay accurate, and the linear maps built from them."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+
+
+class Normalizer(Float64Buffers):
+    """Scale features to zero mean and unit variance (paper, SM "Data normalization").
+
+    Statistics are one count, mean and sum of squared deviations a feature, shared
+    by all nodes or edges, in float64, updated in batches by Chan's parallel
+    formula, so that they can also be merged from several processes.
+
+    Paper: the sum and squared sum that the paper accumulates cancel
+    catastrophically when the mean is large against the spread.
+
+    A feature that never varied maps to exactly 0, and back to its mean.
+
+    Args:
+        size: number of features ``F``.
+        floor: standard deviations up to this are rounding noise: the feature counts as
+            constant. (Spreads below 1e-7 of the mean always do.)
+        limit: normalised features are cut off at plus and minus this, so that a network is never asked about
+            what is far outside of all that it learned from.
+
+    Raises:
+        ValueError: if the floor is negative or not finite, or the limit is not positive.
+    """
+
+    count: Tensor
+    mean: Tensor
+    m2: Tensor
+    std: Tensor
+    inverse_std: Tensor
+
+    def __init__(self, size: int, *, floor: float = 0.0, limit: float = math.inf) -> None:
+        super().__init__()
+        if not 0 <= floor < math.inf:
+            raise ValueError(f"floor={floor} must be a finite standard deviation, 0 or above.")
+        if not limit > 0:
+            raise ValueError(f"limit={limit} must be above 0.")
+        self.size, self.floor, self.limit = size, floor, limit
+        for name in ("count", "mean", "m2"):
+            self.register_buffer(name, torch.zeros(size, dtype=torch.float64))
+        for name in ("std", "inverse_std"):
+            self.register_buffer(name, torch.zeros(size, dtype=torch.float64), persistent=False)
+        self.register_load_state_dict_post_hook(_refresh_derived)
+
+    @property
+    def fitted(self) -> bool:
+        """Whether it has seen data, or has no features. Waits for the device: not for every step."""
+        return self.size == 0 or bool((self.count > 0).any())
+
+    @property
+    def constant(self) -> Tensor:
+        """``[F]`` bool, features that never varied in what was seen."""
+        return self.std == 0
+
+    @torch.no_grad()
+    def update(self, features: Tensor, mask: Tensor | None = None) -> None:
+        """Take a batch into the statistics.
+
+        Args:
+            features: ``[..., F]``.
+            mask: bool, broadcast against ``features``; entries that are False are not counted.
+
+        Raises:
+            ValueError: if the size is wrong or a counted entry is not finite.
+        """
+        if features.shape[-1] != self.size:
+            raise ValueError(f"Normalizer of {self.size} features got {features.shape[-1]} in {tuple(features.shape)}.")
+        if features.shape[:-1].numel() == 0 or self.size == 0:
+            return
+        flat = features.to(torch.float64)
+        weight = torch.ones_like(flat) if mask is None else mask.to(torch.float64).expand_as(flat)
+        flat, weight = flat.reshape(-1, self.size), weight.reshape(-1, self.size)
+        flat = torch.where(weight > 0, flat, torch.zeros_like(flat))
+        if not torch.isfinite(flat).all():
+            bad = (~torch.isfinite(flat)).any(0).nonzero().flatten().tolist()
+            raise ValueError(f"Normalizer got NaN or Inf in features {bad}.")
+        count = weight.sum(0)
+        mean = flat.sum(0) / count.clamp(min=1)
+        m2 = (weight * (flat - mean)).square().sum(0)
+        self._combine(count, mean, m2)
+
+    @torch.no_grad()
+    def merge(self, other: Normalizer) -> None:
+        """Add the statistics of another normaliser, as if this one had seen its data too."""
+        if other.size != self.size:
+            raise ValueError(f"Cannot merge a normaliser of {other.size} features into one of {self.size}.")
+        self._combine(*(getattr(other, name).to(self.mean.device) for name in ("count", "mean", "m2")))
+
+    def _combine(self, count: Tensor, mean: Tensor, m2: Tensor) -> None:
+        # Chan, Golub, LeVeque: the shift of means is weighted by counts, nothing large is subtracted.
+        total = self.count + count
+        share = count / total.clamp(min=1)
+        shift = mean - self.mean
+        self.mean += shift * share
+        self.m2 += m2 + shift.square() * self.count * share
+        self.count.copy_(total)
+        self._refresh()
+
+    @torch.no_grad()
+    def _refresh(self) -> None:
+        std = (self.m2 / self.count.clamp(min=1)).sqrt()
+        constant = (std <= self.floor) | (std <= 1e-7 * self.mean.abs())
+        # In place: TorchRL's losses hold on to a module's buffers.
+        self.std.copy_(torch.where(constant, 0.0, std))
+        self.inverse_std.copy_(torch.where(constant, 0.0, 1 / torch.where(constant, 1.0, std)))
+
+    def forward(self, features: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+        """Normalise.
+
+        Args:
+            features: ``[..., F]``; the mean is subtracted in their own dtype.
+            dtype: dtype of the result, by default that of ``features``.
+
+        Returns:
+            ``[..., F]``.
+        """
+        normalized = (features - self.mean.to(features.dtype)) * self.inverse_std.to(features.dtype)
+        if self.limit < math.inf:
+            normalized = normalized.clamp(-self.limit, self.limit)
+        return normalized if dtype is None else normalized.to(dtype)
+
+    def inverse(self, normalized: Tensor) -> Tensor:
+        """Undo :meth:`forward` (but for the limit): ``[..., F]`` to ``[..., F]``, in the dtype of the input."""
+        return normalized * self.std.to(normalized.dtype) + self.mean.to(normalized.dtype)
+
+    def extra_repr(self) -> str:
+        return f"{self.size}, floor={self.floor}"
+
+
+def _refresh_derived(module: Normalizer, _) -> None:
+    module._refresh()

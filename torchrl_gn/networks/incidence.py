@@ -1,0 +1,80 @@
+"""Which nodes the edges of a graph join, as matrices."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+
+Rows = Tensor | slice
+
+
+class Incidence(Float64Buffers):
+    """What a folded core (:func:`~torchrl_gn.networks.folded_gn_core.fold_core`) needs to know of a graph but its features.
+
+    Gathering at edges and summing at nodes are products with small matrices of zeros and ones. They are made once for
+    a scene, for every later fold.
+
+    Args:
+        edge_index: ``[2, E]`` senders above receivers.
+        num_nodes: nodes of the graph.
+        predicted: ``[P]`` indices of the nodes to predict, in any order; None: all.
+
+    Attributes:
+        ends: ``[2 E, N]`` picks every edge's sender, then every edge's receiver.
+        reduce: ``[N + 1, E]`` sums edges at their receivers, and all of them in its last row.
+        degree: ``[N, 1, 1]`` edges that a node receives.
+        gather: ``[E', 2 N + 1]`` adds, for every edge that leads to a predicted node, its sender's row of the first
+            ``N``, its receiver's row of the next ``N`` and the last row.
+        reduce_last: ``[P, E']`` sums those edges at the predicted nodes.
+    """
+
+    edge_index: Tensor
+    predicted: Tensor
+    kept: Tensor
+    ends: Tensor
+    reduce: Tensor
+    degree: Tensor
+    gather: Tensor
+    reduce_last: Tensor
+
+    def __init__(self, edge_index: Tensor, num_nodes: int, predicted: Tensor | None = None) -> None:
+        super().__init__()
+        self.num_nodes, self.num_edges = num_nodes, edge_index.shape[1]
+        predicted = torch.arange(num_nodes, device=edge_index.device) if predicted is None else predicted
+        kept = torch.isin(edge_index[1], predicted).nonzero().flatten()
+        sender, receiver = (F.one_hot(index, num_nodes).float() for index in edge_index)
+        ones = torch.ones(self.num_edges, 1, device=edge_index.device)
+        reduce = torch.cat((receiver, ones), 1).T.contiguous()
+        self._slices = _slice(predicted), _slice(kept)
+        self.constants(
+            {
+                "edge_index": edge_index,
+                "predicted": predicted,
+                "kept": kept,
+                "ends": torch.cat((sender, receiver)),
+                "reduce": reduce,
+                "degree": receiver.sum(0)[:, None, None],
+                "gather": torch.cat((sender, receiver, ones), 1)[kept],
+                "reduce_last": reduce[predicted][:, kept].contiguous(),
+            }
+        )
+
+    @property
+    def predicted_rows(self) -> Rows:
+        """The nodes that are predicted."""
+        return self.predicted if self._slices[0] is None else self._slices[0]
+
+    @property
+    def kept_rows(self) -> Rows:
+        """The edges that lead to them."""
+        return self.kept if self._slices[1] is None else self._slices[1]
+
+
+def _slice(index: Tensor) -> slice | None:
+    """Indices in a row as a slice, which picks without a copy."""
+    first, count = int(index[0]) if len(index) else 0, len(index)
+    in_a_row = torch.arange(first, first + count, device=index.device)
+    return slice(first, first + count) if torch.equal(index, in_a_row) else None

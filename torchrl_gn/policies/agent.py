@@ -1,0 +1,150 @@
+"""The networks of an agent that learns a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, cast
+
+import torch
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
+
+from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
+from torchrl_gn.policies.graph_policy import GraphPolicy
+from torchrl_gn.policies.learned_reward import LearnedReward
+from torchrl_gn.policies.observation_model import ObservationModel
+from torchrl_gn.policies.output_normalization import OutputNormalization
+from torchrl_gn.scenes import ObservationGraph
+
+
+class Agent(nn.Module):
+    """Policy, value and, to plan with, a forward model and a reward, on one task's flat observations.
+
+    Each is a module of its own, to be wired into TorchRL's losses and collectors; this class only makes them alike
+    every time and describes them for checkpoints. Actions lie in -1 to 1, as in the suite: policies end in
+    :class:`OutputNormalization` and a tanh.
+
+    Args:
+        graph: the task's observations and actions.
+        stochastic: a Gaussian policy, squashed by a tanh (SVG), or a deterministic one (DDPG).
+        policy: ``"mlp"``, or ``"graph"``: a :class:`~torchrl_gn.policies.GraphPolicy`.
+        hidden: hidden sizes of policy and value (:class:`LayerNormMLP`).
+        min_scale: smallest standard deviation of a stochastic policy, before the tanh.
+        model: forward model: ``"gn"``, ``"mlp"`` or None.
+        model_options: further options of :class:`~torchrl_gn.policies.ObservationModel`.
+        policy_options: of the graph policy.
+        learned_reward: whether there is a network for the reward.
+
+    Raises:
+        ValueError: if ``policy`` is not known, or a graph policy shall be deterministic.
+
+    Attributes:
+        policy: TensorDict module from ``observation`` ``[*B, O]`` to ``action`` ``[*B, A]``.
+        value: TensorDict module from both to ``state_action_value`` ``[*B, 1]``.
+        model: :class:`~torchrl_gn.policies.ObservationModel` or None.
+        reward: :class:`~torchrl_gn.policies.LearnedReward` or None.
+    """
+
+    def __init__(
+        self,
+        graph: ObservationGraph,
+        *,
+        stochastic: bool = True,
+        policy: Literal["mlp", "graph"] = "mlp",
+        hidden: Sequence[int] = (256, 256),
+        min_scale: float = 0.1,
+        model: Literal["gn", "mlp"] | None = None,
+        model_options: Mapping[str, Any] | None = None,
+        policy_options: Mapping[str, Any] | None = None,
+        learned_reward: bool = False,
+    ) -> None:
+        super().__init__()
+        if policy not in ("mlp", "graph"):
+            raise ValueError(f"policy={policy!r} is not known; use 'mlp' or 'graph'.")
+        if policy == "graph" and not stochastic:
+            raise ValueError("A graph policy is stochastic; use policy='mlp' for a deterministic one.")
+        self.graph = graph
+        self.options = {
+            "stochastic": stochastic,
+            "policy": policy,
+            "hidden": list(hidden),
+            "min_scale": min_scale,
+            "model": model,
+            "model_options": dict(model_options or {}),
+            "policy_options": dict(policy_options or {}),
+            "learned_reward": learned_reward,
+        }
+        observations, actions = graph.num_observations, graph.num_actions
+        if stochastic:
+            parameters: nn.Module
+            if policy == "graph":
+                parameters = GraphPolicy(graph, min_scale=min_scale, **(policy_options or {}))
+            else:
+                mlp = LayerNormMLP(observations, 2 * actions, hidden)
+                parameters = nn.Sequential(mlp, NormalParamExtractor(scale_lb=cast(Any, min_scale)))
+            self.policy = _actor(parameters)
+        else:
+            mlp = LayerNormMLP(observations, actions, hidden)
+            self.policy = TensorDictSequential(
+                [
+                    TensorDictModule(mlp, ["observation"], ["action"]),
+                    TensorDictModule(OutputNormalization(), ["action"], ["action"]),
+                    TanhModule(in_keys=["action"]),
+                ]
+            )
+        value = LayerNormMLP(observations + actions, 1, hidden)
+        self.value = ValueOperator(value, in_keys=["observation", "action"])
+        self.model = None if model is None else ObservationModel(graph, core=model, **(model_options or {}))
+        self.reward = LearnedReward(observations, actions, hidden) if learned_reward else None
+
+    @property
+    def graph_policy(self) -> GraphPolicy | None:
+        """The graph network that chooses actions, if one does."""
+        return next((module for module in self.policy.modules() if isinstance(module, GraphPolicy)), None)
+
+    def policy_for(self, graph: ObservationGraph) -> ProbabilisticActor:
+        """The policy for another body, sharing the weights: of a swimmer of another length, say.
+
+        Raises:
+            ValueError: if the policy is no graph network, or has identities of this body's nodes.
+        """
+        if self.graph_policy is None:
+            raise ValueError("Only a graph network drives other bodies; build the agent with policy='graph'.")
+        return _actor(self.graph_policy.for_graph(graph))
+
+    @torch.no_grad()
+    def update_normalizers(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> None:
+        """Take newly collected transitions ``[*B, O]``, ``[*B, A]`` and ``[*B, O]`` into all statistics, each once.
+
+        Raises:
+            ValueError: if a number is not finite.
+        """
+        if self.model is not None:
+            self.model.update_normalizers(observation, action, next_observation)
+        if self.graph_policy is not None:
+            self.graph_policy.update_normalizers(observation)
+
+    def description(self) -> dict:
+        """Everything needed to build this agent again, as plain JSON-able values."""
+        return {"graph": self.graph.description(), "options": self.options}
+
+    @classmethod
+    def from_description(cls, description: dict) -> Agent:
+        """Build the agent that :meth:`description` described, with fresh weights."""
+        return cls(ObservationGraph.from_description(description["graph"]), **description["options"])
+
+
+def _actor(parameters: nn.Module) -> ProbabilisticActor:
+    """Gaussian policy, bounded and then squashed, whose location and scale a module gives."""
+    return ProbabilisticActor(
+        TensorDictSequential(
+            [
+                TensorDictModule(parameters, ["observation"], ["loc", "scale"]),
+                TensorDictModule(OutputNormalization(), ["loc"], ["loc"]),
+            ]
+        ),
+        in_keys=["loc", "scale"],
+        out_keys=["action"],
+        distribution_class=TanhNormal,
+    )

@@ -1,0 +1,129 @@
+"""Forward model of flat observations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+
+from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.policies.observation_network import ObservationNetwork, sharing_weights
+from torchrl_gn.scenes import ObservationGraph
+
+
+class ObservationModel(TensorDictModuleBase):
+    """Predict a task's next observation (paper, SM "SVG": the model of the agents that learn by planning).
+
+    Reads ``observation`` ``[*B, O]`` and ``action`` ``[*B, A]``, writes ``("next", "observation")``. The network
+    predicts changes, of node, joint and global features, in their normalised scale. Those of a joint are read at the
+    node that the joint moves and those of the whole graph as a sum over its nodes: what the paper reads at edges and
+    globals of the second graph network, with one output for all, so that everything folds as it does for bodies.
+
+    Differentiable in observations, actions and weights.
+
+    Args:
+        graph: where observations and actions belong.
+        observation_key: where to read the observation.
+        action_key: where to read the action.
+        **options: of :class:`ObservationNetwork`.
+    """
+
+    take: Tensor
+
+    def __init__(
+        self,
+        graph: ObservationGraph,
+        *,
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        self.in_keys: list[NestedKey] = [observation_key, action_key]
+        self.out_keys: list[NestedKey] = [unravel_key(("next", observation_key))]
+        slots, globals_ = graph.node_entries.shape[1], len(graph.global_entries)
+        self.network = ObservationNetwork(graph, slots + globals_, actions=True, **options)
+        self.change_normalizer = Normalizer(slots, floor=1e-6)
+        self.global_change_normalizer = Normalizer(globals_, floor=1e-6)
+        self.register_buffer("take", torch.as_tensor(graph.observation_at), persistent=False)
+
+    @property
+    def graph(self) -> ObservationGraph:
+        """The graph that observations are arranged as."""
+        return self.network.graph
+
+    def for_graph(self, graph: ObservationGraph) -> ObservationModel:
+        """The same weights for another graph, see :meth:`ObservationNetwork.for_graph`."""
+        model = sharing_weights(self)
+        model.network = self.network.for_graph(graph)
+        model.take = torch.as_tensor(graph.observation_at).to(self.take.device)
+        return model
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the normalisers have seen data. Waits for the device."""
+        changes = self.change_normalizer, self.global_change_normalizer
+        return self.network.fitted and all(each.fitted for each in changes)
+
+    @property
+    def change_std(self) -> Tensor:
+        """``[O]`` spread of each number's change, 0 where it never varied."""
+        return self._flat(self.change_normalizer.std, self.global_change_normalizer.std)
+
+    def _flat(self, slots: Tensor, globals_: Tensor) -> Tensor:
+        """Numbers of slots and globals in the order of the observation."""
+        every_node = slots.expand(self.graph.num_nodes, -1).flatten()
+        return torch.cat((every_node, globals_))[self.take]
+
+    @torch.no_grad()
+    def update_normalizers(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> None:
+        """Take transitions, ``[*B, O]``, ``[*B, A]`` and ``[*B, O]``, into the statistics.
+
+        Raises:
+            ValueError: if a shape does not fit the graph or a number is not finite.
+        """
+        places = self.network.places
+        if next_observation.shape != observation.shape:
+            raise ValueError(
+                f"Next observations must be {list(observation.shape)} as observations, got"
+                f" {list(next_observation.shape)}."
+            )
+        self.network.update_normalizers(observation, action)
+        change = next_observation - observation
+        slots = torch.nn.functional.pad(change, (0, 1))[..., places.slots]
+        self.change_normalizer.update(slots, places.mask)
+        self.global_change_normalizer.update(change[..., places.globals_])
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the predicted next observation into ``tensordict`` and return it."""
+        observation, action = (tensordict[key] for key in self.in_keys)
+        return tensordict.set(self.out_keys[0], self.step(observation, action))
+
+    def step(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Next observation ``[*B, O]``.
+
+        Raises:
+            ValueError: if a shape does not fit the graph.
+        """
+        mean = self._flat(self.change_normalizer.mean, self.global_change_normalizer.mean)
+        change = self._change(observation, action) * self.change_std.to(observation.dtype)
+        return observation + change + mean.to(observation.dtype)
+
+    def normalized_change(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predicted change ``[*B, O]`` in its spread, nothing to go by where the change never varied."""
+        change = self._change(observation, action)
+        mean = self._flat(self.change_normalizer.mean, self.global_change_normalizer.mean)
+        inverse = self._flat(self.change_normalizer.inverse_std, self.global_change_normalizer.inverse_std)
+        return change + (mean * inverse).to(change.dtype)
+
+    def _change(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predicted change ``[*B, O]`` in its spread, about its mean."""
+        out = self.network(observation, action).to(observation.dtype)
+        slots = self.network.places.slots.shape[1]
+        nodes, globals_ = out[..., :slots], out[..., slots:].sum(-2)
+        return torch.cat((nodes.flatten(-2), globals_), dim=-1)[..., self.take]

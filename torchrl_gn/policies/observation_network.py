@@ -1,0 +1,236 @@
+"""Graph networks over flat observations."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, Literal, TypeVar, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.networks.gn_core import GNCore
+from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
+from torchrl_gn.networks.incidence import Incidence
+from torchrl_gn.networks.mlp_core import MLPCore
+from torchrl_gn.scenes import ObservationGraph
+
+M = TypeVar("M", bound=nn.Module)
+
+# Spreads below this are rounding noise of float32 observations.
+_FLOOR = 1e-6
+
+
+class ObservationNetwork(nn.Module):
+    """Two graph networks, or their rival, from flat observations to features of every node.
+
+    The first linear layers see normalised observations, arranged as the :class:`~torchrl_gn.scenes.ObservationGraph`
+    says, with the actions at their joints' edges, a feature 1 or -1 for the direction of an edge, and which node is
+    which if the graph shows identities. Everything constant is folded away at each call
+    (:func:`~torchrl_gn.networks.folded_gn_core.fold_core`), exactly and differentiably in the weights.
+
+    Args:
+        graph: where observations and actions belong.
+        out_nodes: features of every output node.
+        actions: whether actions are seen.
+        core: ``"gn"``, or ``"mlp"``, one MLP over the flattened graph.
+        latent: features between the two graph networks.
+        hidden: hidden sizes of all their MLPs.
+        mlp_hidden: hidden sizes of the rival.
+        activation: between the layers.
+        plain: evaluate the core as the paper writes it, by message passing: the same function, slowly.
+
+    Raises:
+        ValueError: if the core is not known.
+    """
+
+    def __init__(
+        self,
+        graph: ObservationGraph,
+        out_nodes: int,
+        *,
+        actions: bool,
+        core: Literal["gn", "mlp"] = "gn",
+        latent: int = 64,
+        hidden: Sequence[int] = (64, 64),
+        mlp_hidden: Sequence[int] = (256, 256),
+        activation: str = "silu",
+        plain: bool = False,
+    ) -> None:
+        super().__init__()
+        self.actions, self.plain = actions, plain
+        acting = graph.node_actions.shape[1] if actions else 0
+        self.size = GraphSize(graph.num_node_features, graph.num_joint_features + acting, len(graph.global_entries))
+        self.node_normalizer = Normalizer(self.size.nodes, floor=_FLOOR)
+        self.edge_normalizer = Normalizer(self.size.edges, floor=_FLOOR)
+        self.global_normalizer = Normalizer(self.size.globals_, floor=_FLOOR)
+        in_size = self.size + GraphSize(graph.num_nodes if graph.identity else 0, 1, 0)
+        self.core: GNCore | MLPCore
+        if core == "gn":
+            sizes: dict[str, Any] = {"edge_hidden": hidden, "node_hidden": hidden, "global_hidden": hidden}
+            self.core = GNCore(in_size, out_nodes, latent=latent, activation=activation, **sizes)
+        elif core == "mlp":
+            items = graph.num_nodes, graph.num_edges
+            self.core = MLPCore(in_size, out_nodes, items=items, hidden=mlp_hidden, activation=activation)
+        else:
+            raise ValueError(f"core={core!r} is not known; use 'gn' or 'mlp'.")
+        self.graph, self.places = graph, _Places(graph)
+
+    def for_graph(self, graph: ObservationGraph) -> ObservationNetwork:
+        """The same weights and normalisers for another graph, a swimmer of another length, say.
+
+        Raises:
+            ValueError: if its nodes, joints or globals have other numbers of features, or the weights are tied to one
+                graph: by identities, or an MLP.
+        """
+        own, other = _widths(self.graph), _widths(graph)
+        if own != other:
+            raise ValueError(f"The network reads {own} features, graph {graph.name!r} has {other}.")
+        if graph.identity != self.graph.identity:
+            raise ValueError(f"The network and graph {graph.name!r} must both show identities, or neither.")
+        sizes = [(each.num_nodes, each.num_edges // 2) for each in (self.graph, graph)]
+        if sizes[0] != sizes[1] and (self.graph.identity or isinstance(self.core, MLPCore)):
+            raise ValueError(
+                f"The network is tied to graphs of {sizes[0][0]} nodes and {sizes[0][1]} joints, {graph.name!r} has"
+                f" {sizes[1][0]} and {sizes[1][1]}. Use core='gn' and a graph without identity."
+            )
+        network = sharing_weights(self)
+        network.graph, network.places = graph, _Places(graph).to(self.places.slots.device)
+        return network
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the normalisers have seen data. Waits for the device."""
+        return all(each.fitted for each in (self.node_normalizer, self.edge_normalizer, self.global_normalizer))
+
+    @torch.no_grad()
+    def update_normalizers(self, observation: Tensor, action: Tensor | None = None) -> None:
+        """Take observations ``[*B, O]`` and actions ``[*B, A]`` into the statistics.
+
+        Raises:
+            ValueError: if a shape does not fit the graph or a number is not finite.
+        """
+        nodes, edges, globals_ = self._arrange(observation, action)
+        mask_nodes, mask_edges = self._masks()
+        self.node_normalizer.update(nodes, mask_nodes)
+        self.edge_normalizer.update(edges, mask_edges)
+        self.global_normalizer.update(globals_)
+
+    def _arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Features of nodes, edges and globals, of inputs that fit the graph."""
+        graph = self.graph
+        if observation.shape[-1] != graph.num_observations:
+            raise ValueError(
+                f"Observations of {graph.name!r} must be [*B, {graph.num_observations}], got {list(observation.shape)}."
+            )
+        if self.actions and (action is None or action.shape != (*observation.shape[:-1], graph.num_actions)):
+            raise ValueError(
+                f"Actions of {graph.name!r} must be {[*observation.shape[:-1], graph.num_actions]} to go with"
+                f" observations {list(observation.shape)}, got {None if action is None else list(action.shape)}."
+            )
+        return self.places.arrange(observation, action if self.actions else None)
+
+    def _masks(self) -> tuple[Tensor, Tensor]:
+        places = self.places
+        edges = places.edge_mask if self.actions else places.edge_mask[:, : self.graph.num_joint_features]
+        return places.node_mask, edges
+
+    @property
+    def _weight(self) -> Tensor:
+        # Not one of parameters(): under TorchRL's losses weights may be plain tensors.
+        mlp = self.core.mlp if isinstance(self.core, MLPCore) else self.core.first.edge_mlp
+        assert mlp is not None
+        return cast(nn.Linear, mlp[0]).weight
+
+    def dynamic_graph(self, observation: Tensor, action: Tensor | None = None) -> Graph:
+        """Normalised graph ``[*B, ...]`` of observations ``[*B, O]`` and actions ``[*B, A]``.
+
+        Raises:
+            ValueError: if a shape does not fit the graph.
+        """
+        dtype = self._weight.dtype
+        nodes, edges, globals_ = self._arrange(observation, action)
+        mask_nodes, mask_edges = self._masks()
+        return Graph(
+            self.node_normalizer(nodes, dtype) * mask_nodes,
+            self.edge_normalizer(edges, dtype) * mask_edges,
+            self.global_normalizer(globals_, dtype),
+            self.places.incidence.edge_index,
+        )
+
+    def static_graph(self) -> Graph:
+        """What is the same for every sample: directions of edges, identities of nodes."""
+        like = self._weight
+        count = self.graph.num_nodes
+        nodes = torch.eye(count).to(like) if self.graph.identity else like.new_zeros(count, 0)
+        direction = like.new_tensor([1.0, -1.0]).repeat(self.graph.num_edges // 2).unsqueeze(-1)
+        return Graph(nodes, direction, like.new_zeros(0), self.places.incidence.edge_index)
+
+    def forward(self, observation: Tensor, action: Tensor | None = None) -> Tensor:
+        """Features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if they are seen, actions ``[*B, A]``."""
+        dynamic, parameters = self.dynamic_graph(observation, action), self.static_graph()
+        if self.plain:
+            return self.core(graph_concat(dynamic, parameters)).nodes
+        return self.core.fold(self.size, self.places.incidence, parameters).predict(dynamic)
+
+
+def sharing_weights(module: M) -> M:
+    """Copy of a module that shares its weights and statistics, and whose parts can be exchanged."""
+    twin = copy.copy(module)
+    twin._modules, twin._buffers = dict(module._modules), dict(module._buffers)
+    return twin
+
+
+def _widths(graph: ObservationGraph) -> tuple[int, int, int, int]:
+    acting = graph.node_actions.shape[1]
+    return graph.num_node_features, graph.num_joint_features, acting, len(graph.global_entries)
+
+
+class _Places(Float64Buffers):
+    """Tables that arrange the numbers of one observation graph.
+
+    Attributes:
+        incidence: all nodes are predicted.
+        slots: ``[N, F_n + F_j]`` index in the observation, its length where there is none.
+        mask: bool like ``slots``, where there is one.
+    """
+
+    slots: Tensor
+    mask: Tensor
+    actions: Tensor
+    globals_: Tensor
+    moved: Tensor
+    node_mask: Tensor
+    edge_mask: Tensor
+
+    def __init__(self, graph: ObservationGraph) -> None:
+        super().__init__()
+        slots, actions, self.split = graph.node_entries, graph.node_actions, graph.num_node_features
+        moved = graph.moved.repeat(2)
+        there = slots >= 0
+        self.incidence = Incidence(torch.as_tensor(graph.edge_index), graph.num_nodes)
+        self.constants(
+            {
+                "slots": torch.as_tensor(slots) % (graph.num_observations + 1),
+                "mask": there,
+                "actions": torch.as_tensor(actions) % (graph.num_actions + 1),
+                "globals_": graph.global_entries,
+                "moved": moved,
+                "node_mask": there[:, : self.split],
+                "edge_mask": torch.cat(
+                    [torch.as_tensor(part) for part in (there[moved, self.split :], actions[moved] >= 0)], dim=1
+                ),
+            }
+        )
+
+    def arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Node ``[*B, N, F_n]``, edge ``[*B, E, F_j + C]`` and global features ``[*B, F_g]``, 0 where there is none."""
+        slots = F.pad(observation, (0, 1))[..., self.slots]
+        edges = slots[..., self.moved, self.split :]
+        if action is not None:
+            at_joints = F.pad(action, (0, 1))[..., self.actions[self.moved]]
+            edges = torch.cat((edges, at_joints.to(edges.dtype)), dim=-1)
+        return slots[..., : self.split], edges, observation[..., self.globals_]

@@ -1,0 +1,251 @@
+"""Logged robots as graphs: what joint encoders see, without a model of the body."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from torchrl_gn.scenes.joint_anchors import JointAnchors
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+from torchrl_gn.scenes.scene import StaticGraph
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicTree:
+    """Robot known by its joints alone (paper, SM "Real JACO").
+
+    A node for the base and one for each body, which holds cosine and sine of its joint's angle, the joint's velocity,
+    and what else was logged of it; a pair of edges for each joint, which hold its commands. The state of each node is
+    laid out as :func:`~torchrl_gn.maths.joint_layout` says. Takes the place of a
+    :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors.
+
+    Args:
+        name: name of the robot.
+        joint_names: names of its ``J`` joints, from the base on.
+        timestep: control time step, seconds.
+        commands: for each joint the indices of the commands that act on it, none of a joint without motor.
+        extras: names of what else is logged of every joint, each one channel.
+        action_low: ``[A]`` lower bounds of the commands; by default there are none.
+        action_high: ``[A]`` upper bounds.
+        joint_parents: for each joint the one before it, -1 for the base; by default each is carried by the last: an arm.
+
+    Raises:
+        ValueError: if there is no joint, commands are not given for each, bounds are not as many, or a number does not
+            fit.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    timestep: float
+    commands: tuple[tuple[int, ...], ...]
+    extras: tuple[str, ...] = ()
+    action_low: np.ndarray = field(default_factory=lambda: np.empty(0))
+    action_high: np.ndarray = field(default_factory=lambda: np.empty(0))
+    joint_parents: tuple[int, ...] = ()
+
+    yaw_frame = None
+    contact_points = None
+
+    def __post_init__(self) -> None:
+        # NumPy's numbers could not be saved.
+        object.__setattr__(self, "timestep", float(self.timestep))
+        object.__setattr__(self, "commands", tuple(tuple(map(int, indices)) for indices in self.commands))
+        object.__setattr__(self, "joint_parents", tuple(map(int, self.joint_parents)))
+        if not self.joint_names or len(self.commands) != len(self.joint_names):
+            raise ValueError(
+                f"Robot {self.name!r} needs joints, and commands for each; got {len(self.commands)} of"
+                f" {len(self.joint_names)}."
+            )
+        if any(index < 0 for indices in self.commands for index in indices):
+            raise ValueError(f"commands={self.commands} of {self.name!r} must be counted from 0.")
+        if not 0 < self.timestep < np.inf:
+            raise ValueError(f"timestep={self.timestep} of {self.name!r} must be positive.")
+        if not self.joint_parents:
+            object.__setattr__(self, "joint_parents", tuple(range(-1, self.num_joints - 1)))
+        if len(self.joint_parents) != self.num_joints or any(
+            not -1 <= before < joint for joint, before in enumerate(self.joint_parents)
+        ):
+            raise ValueError(
+                f"joint_parents={self.joint_parents} of {self.name!r} must name an earlier joint, or -1, for each."
+            )
+        for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
+            count = len(getattr(self, which))
+            if count == 0:
+                object.__setattr__(self, which, np.full(self.num_actions, infinite))
+            elif count != self.num_actions:
+                raise ValueError(
+                    f"{which} of {self.name!r} must be of its {self.num_actions} commands, got {count} numbers."
+                )
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints ``J``."""
+        return len(self.joint_names)
+
+    @property
+    def num_nodes(self) -> int:
+        """Base and bodies."""
+        return self.num_joints + 1
+
+    @property
+    def num_edges(self) -> int:
+        """Two for each joint."""
+        return 2 * self.num_joints
+
+    @property
+    def num_actions(self) -> int:
+        """Number of commands ``A``."""
+        return 1 + max((index for indices in self.commands for index in indices), default=-1)
+
+    @property
+    def state_size(self) -> int:
+        """Numbers of a node's state: cosine, sine, velocity, extras."""
+        return 3 + len(self.extras)
+
+    @property
+    def node_names(self) -> tuple[str, ...]:
+        """The base and the bodies, named after their joints."""
+        return ("base", *self.joint_names)
+
+    @property
+    def parent(self) -> np.ndarray:
+        """``[N]`` parent node of each node; the base's is -1."""
+        return np.array([-1, *(before + 1 for before in self.joint_parents)])
+
+    @property
+    def senders(self) -> np.ndarray:
+        """``[E]`` sending node of each edge."""
+        return np.stack((self.parent[1:], np.arange(self.num_joints) + 1), 1).reshape(-1)
+
+    @property
+    def receivers(self) -> np.ndarray:
+        """``[E]`` receiving node of each edge."""
+        return np.stack((np.arange(self.num_joints) + 1, self.parent[1:]), 1).reshape(-1)
+
+    @property
+    def edge_action(self) -> np.ndarray:
+        """``[E, C]`` commands at each edge's joint, C the most that a joint has (or 1); -1 where one has fewer."""
+        most = max(1, *map(len, self.commands))
+        padded = [[*indices, *[-1] * (most - len(indices))] for indices in self.commands]
+        return np.repeat(np.array(padded, dtype=np.int64), 2, axis=0)
+
+    @property
+    def movable(self) -> np.ndarray:
+        """``[N, 2 + extras]`` bool: all of the bodies, nothing of the base."""
+        return np.repeat(np.arange(self.num_nodes)[:, None] > 0, 2 + len(self.extras), axis=1)
+
+    @property
+    def predicted(self) -> np.ndarray:
+        """``[N]`` bool, all but the base."""
+        return np.any(self.movable, axis=1)
+
+    @property
+    def translation_invariant(self) -> np.ndarray:
+        """``[3]`` bool, no axis: there are no positions in space."""
+        return np.zeros(3, dtype=bool)
+
+    @property
+    def joint_anchors(self) -> JointAnchors:
+        """No pins: angles cannot come apart."""
+        itself, child_anchor = np.arange(self.num_nodes), np.zeros((self.num_nodes, 3))
+        return JointAnchors(itself, child_anchor, child_anchor, np.zeros((self.num_nodes, self.num_nodes)), itself)
+
+    @property
+    def static(self) -> StaticGraph:
+        """Which joint each body and edge is of: nothing else is known."""
+        which = np.eye(self.num_nodes)
+        edges = np.repeat(np.eye(self.num_joints), 2, axis=0)
+        direction = np.tile([1.0, -1.0], self.num_joints)[:, None]
+        return StaticGraph(
+            nodes=which,
+            edges=np.concatenate((direction, edges), 1),
+            globals_=np.zeros(0),
+            node_names=tuple(f"is_{name}" for name in self.node_names),
+            edge_names=("direction", *(f"is_{name}" for name in self.joint_names)),
+            global_names=(),
+        )
+
+    def values(self) -> PhysicalParameters:
+        """Static features; of a body in space nothing."""
+        n, e = self.num_nodes, self.num_edges
+        static = self.static
+        arrays = (static.nodes, static.edges, static.globals_, np.zeros((e, 3)), np.array([1.0, 0, 0, 0]), np.zeros(3))
+        arrays += (np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 3)), np.zeros((n, 0)))
+        return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
+
+    def description(self) -> dict:
+        """Plain values from which :func:`~torchrl_gn.scenes.scene_from_description` makes the chain again."""
+        tree = {
+            "name": self.name,
+            "joint_names": list(self.joint_names),
+            "timestep": self.timestep,
+            "commands": [list(indices) for indices in self.commands],
+            "extras": list(self.extras),
+            "joint_parents": list(self.joint_parents),
+            # JSON has no infinity.
+            "action_low": [None if np.isinf(value) else float(value) for value in self.action_low],
+            "action_high": [None if np.isinf(value) else float(value) for value in self.action_high],
+        }
+        return {"joint_chain": tree, "fingerprint": self.fingerprint()}
+
+    @classmethod
+    def from_description(cls, description: dict) -> KinematicTree:
+        """The chain that :meth:`description` described."""
+        tree = description["joint_chain"]
+        bounds = {
+            which: np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
+            for which, infinite in (("action_low", -np.inf), ("action_high", np.inf))
+        }
+        return cls(
+            name=tree["name"],
+            joint_names=tuple(tree["joint_names"]),
+            timestep=tree["timestep"],
+            commands=tuple(tuple(indices) for indices in tree["commands"]),
+            extras=tuple(tree["extras"]),
+            joint_parents=tuple(tree["joint_parents"]),
+            **bounds,
+        )
+
+    def fingerprint(self) -> str:
+        """Hash of all that it is."""
+        text = [
+            self.name,
+            *self.joint_names,
+            f"{self.timestep:.6g}",
+            str(self.commands),
+            str(self.joint_parents),
+            *self.extras,
+        ]
+        text += [f"{value:.6g}" for value in (*self.action_low, *self.action_high)]
+        return hashlib.sha256("\n".join(text).encode()).hexdigest()[:16]
+
+    def __str__(self) -> str:
+        """Readable summary."""
+        lines = [
+            f"Arm {self.name}: {self.num_joints} joints, {self.num_actions} commands, step {1e3 * self.timestep:g} ms"
+        ]
+        for name, indices, before in zip(self.joint_names, self.commands, self.joint_parents, strict=True):
+            acting = ", ".join(map(str, indices)) or "none"
+            lines.append(f"  {name}, carried by {self.node_names[before + 1]}: commands {acting}")
+        return "\n".join(lines)
+
+
+def tree_states(angle: np.ndarray, velocity: np.ndarray, extras: Sequence[np.ndarray] = ()) -> np.ndarray:
+    """States of a chain's nodes.
+
+    Args:
+        angle: ``[..., J]`` radians.
+        velocity: ``[..., J]`` rad/s.
+        extras: ``[..., J]`` each, in the order of :attr:`KinematicTree.extras`.
+
+    Returns:
+        ``[..., J + 1, 3 + extras]`` float64: cosine and sine of the angle, velocity, extras; of the base 1, 0, 0 ....
+    """
+    bodies = np.stack((np.cos(angle), np.sin(angle), velocity, *extras), axis=-1).astype(np.float64)
+    base = np.zeros((*bodies.shape[:-2], 1, bodies.shape[-1]))
+    base[..., 0] = 1
+    return np.concatenate((base, bodies), axis=-2)
