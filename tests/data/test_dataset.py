@@ -5,12 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDictBase
+from filelock import FileLock, Timeout
+from tensordict import TensorDict, TensorDictBase
 
 from torchrl_gn.data import (
     DatasetError,
@@ -79,7 +83,8 @@ def test_on_disk_as_in_memory(tmp_path: Path, pendulum: Scene) -> None:
         assert _equal(getattr(made, split), getattr(loaded, split))
         expected = collect_trajectories(pendulum, SIZES[split], 6, seed=3, split=number)
         assert _equal(getattr(loaded, split), expected)
-    assert {path.suffix for path in (tmp_path / "d").rglob("*") if path.is_file()} == {".bin", ".json"}
+        assert _equal(TensorDict.load_memmap(tmp_path / "d" / split), expected)
+    assert {path.suffix for path in (tmp_path / "d").rglob("*") if path.is_file()} == {".memmap", ".json"}
     assert loaded.rejected == {"train": 0, "validation": 0, "test": 0}
     assert load_dataset(tmp_path / "d", pendulum).scene is pendulum
     before = _digest(tmp_path)
@@ -117,10 +122,10 @@ def test_interrupted_resumes_to_identical_data(
         if len(calls) == after:
             raise KeyboardInterrupt
 
-    def interrupted_write(files: DatasetFiles, manifest: dict) -> None:
-        if any(manifest["chunks"].values()):  # the rows are on disk, the manifest is not
+    def interrupted_write(files: DatasetFiles) -> None:
+        if any(files.manifest["chunks"].values()):  # the rows are on disk, the manifest is not
             interrupt()
-        write(files, manifest)
+        write(files)
 
     with monkeypatch.context() as patch:
         if where == "write":
@@ -140,6 +145,53 @@ def test_interrupted_resumes_to_identical_data(
     assert whole == parts
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
+def test_killed_resumes_to_identical_data(tmp_path: Path, pendulum: Scene) -> None:
+    script = f"""if True:
+        import os
+        from torchrl_gn.data import collect, create_dataset, dataset
+        from torchrl_gn.data.dataset_files import DatasetFiles
+        from torchrl_gn.scenes import load_scene
+        collect.CHUNK = dataset.CHUNK = 4
+        write = DatasetFiles._write
+        def killed(files):  # while the second chunk's rows are in the file and its checksums are not
+            if len(files.manifest["chunks"]["train"]) == 2:
+                os.kill(os.getpid(), {int(signal.SIGKILL)})
+            write(files)
+        DatasetFiles._write = killed
+        create_dataset({str(tmp_path / "parts")!r}, load_scene("pendulum"), **{SIZES})
+    """
+    assert subprocess.run([sys.executable, "-c", script]).returncode == -signal.SIGKILL
+    seen = []
+    parts = create_dataset(tmp_path / "parts", pendulum, **SIZES, progress=lambda done, _: seen.append(done))
+    assert seen == [8, 10, 14, 15, 19]
+    whole = create_dataset(tmp_path / "whole", pendulum, **SIZES)
+    assert all(_equal(getattr(parts, split), getattr(whole, split)) for split in ("train", "validation", "test"))
+
+
+def test_a_full_disk_leaves_it_to_be_gone_on_with(
+    tmp_path: Path, pendulum: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_) -> None:
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.posix_fallocate", full, raising=False)
+        with pytest.raises(OSError, match="no space left"):
+            create_dataset(tmp_path / "d", pendulum, **SIZES)
+    assert len(create_dataset(tmp_path / "d", pendulum, **SIZES).train) == 10
+
+
+def test_others_wait_while_it_is_made(tmp_path: Path, pendulum: Scene) -> None:
+    def locked(*_) -> None:
+        with pytest.raises(Timeout), FileLock(tmp_path / ".d.lock", timeout=0):
+            pass
+
+    create_dataset(tmp_path / "d", pendulum, **SIZES, progress=locked)
+    with FileLock(tmp_path / ".d.lock", timeout=0):
+        assert len(load_dataset(tmp_path / "d").train) == 10
+
+
 def test_interrupted_before_its_manifest_it_can_be_made_again(
     tmp_path: Path, pendulum: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,19 +206,19 @@ def test_interrupted_before_its_manifest_it_can_be_made_again(
 
 
 def _truncate(folder: Path) -> Path:
-    file = folder / "train" / "state.bin"
+    file = folder / "train" / "state.memmap"
     file.write_bytes(file.read_bytes()[:-8])
     return file
 
 
 def _extend(folder: Path) -> Path:
-    file = folder / "test" / "physics.bin"
+    file = folder / "test" / "physics.memmap"
     file.write_bytes(file.read_bytes() + b"\0" * 8)
     return file
 
 
 def _flip(folder: Path) -> Path:
-    file = folder / "validation" / "action.bin"
+    file = folder / "validation" / "action.memmap"
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
@@ -174,8 +226,19 @@ def _flip(folder: Path) -> Path:
 
 
 def _remove(folder: Path) -> Path:
-    (folder / "test" / "action.bin").unlink()
-    return folder / "test" / "action.bin"
+    (folder / "test" / "action.memmap").unlink()
+    return folder / "test" / "action.memmap"
+
+
+def _edit_shapes(folder: Path) -> Path:
+    file = folder / "train" / "meta.json"
+    file.write_text(file.read_text().replace("[10,7,2,13]", "[10,7,13,2]"))
+    return file
+
+
+def _remove_shapes(folder: Path) -> Path:
+    (folder / "test" / "meta.json").unlink()
+    return folder / "test" / "meta.json"
 
 
 def _break_manifest(folder: Path) -> Path:
@@ -200,12 +263,24 @@ def _newer(folder: Path) -> Path:
 
 def _older(folder: Path) -> Path:
     file = folder / "manifest.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "format": 2}))
+    file.write_text(json.dumps({**json.loads(file.read_text()), "format": 3}))
     return file
 
 
 @pytest.mark.parametrize(
-    "damage", [_truncate, _extend, _flip, _remove, _break_manifest, _drop_from_manifest, _newer, _older]
+    "damage",
+    [
+        _truncate,
+        _extend,
+        _flip,
+        _remove,
+        _edit_shapes,
+        _remove_shapes,
+        _break_manifest,
+        _drop_from_manifest,
+        _newer,
+        _older,
+    ],
 )
 def test_damaged_is_refused_named_and_kept(damage, tmp_path: Path, pendulum: Scene) -> None:
     create_dataset(tmp_path / "d", pendulum, **SIZES)
@@ -214,6 +289,7 @@ def test_damaged_is_refused_named_and_kept(damage, tmp_path: Path, pendulum: Sce
     for attempt in (
         lambda: load_dataset(tmp_path / "d"),
         lambda: create_dataset(tmp_path / "d", pendulum, **SIZES),
+        *([] if damage is _flip else [lambda: load_dataset(tmp_path / "d", verify=False)]),
     ):
         with pytest.raises(DatasetError) as caught:
             attempt()

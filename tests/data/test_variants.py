@@ -147,11 +147,11 @@ def test_damaged_and_other_data_are_refused(tmp_path: Path) -> None:
     for other in (None, 7):
         with pytest.raises(DatasetError, match=f"variants is 6, not {other}"):
             create_dataset(tmp_path / "d", scene, **SIZES, variants=other)
-    file = tmp_path / "d" / "validation" / "parameters" / "nodes.bin"
+    file = tmp_path / "d" / "validation" / "parameters" / "nodes.memmap"
     content = bytearray(file.read_bytes())
     content[50] ^= 1
     file.write_bytes(content)
-    with pytest.raises(DatasetError, match="nodes.bin.*do not have their checksum"):
+    with pytest.raises(DatasetError, match="nodes.memmap.*do not have their checksum"):
         load_dataset(tmp_path / "d")
 
 

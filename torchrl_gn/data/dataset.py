@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from operator import index
 from pathlib import Path
 
@@ -13,19 +13,18 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.data.collect import CHUNK, collect_chunk, collect_trajectories, variant_parameters
+from torchrl_gn.data.collect import CHUNK, collect_chunk, variant_parameters
 from torchrl_gn.data.controls import check_knot_interval
-from torchrl_gn.data.dataset_files import FORMAT, SPLITS, DatasetFiles, simulation_versions
+from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.errors import SceneError
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.parameter_names import ParameterNames, take_columns
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters
 
-__all__ = ["TrajectoryDataset", "collect_trajectories", "create_dataset", "load_dataset"]
+__all__ = ["TrajectoryDataset", "create_dataset", "load_dataset"]
 
 
 @dataclass(frozen=True)
@@ -126,9 +125,7 @@ def create_dataset(
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     check_knot_interval(knot_interval)
-    ranges = None
-    if variants is not None:
-        ranges = {name: [one.low, one.high] for name, one in parameter_ranges(_system(scene)).items()}
+    ranges = {} if variants is None else parameter_ranges(_system(scene))
     files = DatasetFiles(Path(path))
     request = {
         "scene": scene.name,
@@ -139,32 +136,16 @@ def create_dataset(
         "knot_interval": float(knot_interval),
         "chunk": CHUNK,
         "variants": None if variants is None else index(variants),
-        "parameters": ranges,
+        "parameters": {name: [one.low, one.high] for name, one in ranges.items()},
     }
     with files.lock():
-        if files.exists():
-            manifest = files.read()
-            _check_same(files, manifest, request)
-            files.verify(manifest)
-        else:
-            manifest = {
-                "format": FORMAT,
-                "request": request,
-                "description": _description(scene),
-                "entries": {
-                    "state": [steps + 1, scene.num_nodes, 13],
-                    "action": [steps, scene.num_actions],
-                    "physics": [steps + 1, scene.physics_size],
-                    **({} if ranges is None else _variant_entries(scene, len(ranges))),
-                },
-                "features": None if ranges is None else asdict(ParameterNames.of(scene)),
-                "versions": simulation_versions(),
-                "chunks": {split: [] for split in SPLITS},
-            }
-            files.create(manifest)
-        if not files.is_complete(manifest):
-            _collect_missing(files, manifest, scene, num_threads, progress, map_chunks)
-    return _open(files, manifest, scene)
+        if not files.find(request):
+            features = None if variants is None else asdict(ParameterNames.of(scene))
+            described = _description(scene)
+            files.create(request=request, description=described, features=features, versions=simulation_versions())
+        if not files.is_complete():
+            _collect_missing(files, scene, num_threads, progress, map_chunks)
+    return _open(files, scene, checksums=False)
 
 
 def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify: bool = True) -> TrajectoryDataset:
@@ -180,119 +161,87 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
             or newer version of this library. The message names the file and what to do.
     """
     files = DatasetFiles(Path(path))
-    manifest = files.read()
-    if not files.is_complete(manifest):
+    files.read()
+    manifest, request = files.manifest, files.manifest["request"]
+    if not files.is_complete():
         done = {split: len(chunks) for split, chunks in manifest["chunks"].items()}
         raise DatasetError(
             f"{files.manifest_path}: the data set is unfinished (chunks done: {done}). Call create_dataset "
             "with the arguments it was begun with to finish it."
         )
-    files.verify(manifest, checksums=verify)
     if scene is None:
         if manifest["description"] is None:
             raise DatasetError(
-                f"{files.manifest_path}: scene {manifest['request']['scene']!r} was made from an MjSpec and "
+                f"{files.manifest_path}: scene {request['scene']!r} was made from an MjSpec and "
                 "cannot be built again from the data set. Pass it as load_dataset(path, scene)."
             )
         scene = scene_from_description(manifest["description"])
-    elif scene.fingerprint() != manifest["request"]["fingerprint"]:
+    elif scene.fingerprint() != request["fingerprint"]:
         raise DatasetError(
-            f"{files.manifest_path}: the data set is of scene {manifest['request']['scene']!r} "
-            f"(fingerprint {manifest['request']['fingerprint']}), not of {scene.name!r} "
+            f"{files.manifest_path}: the data set is of scene {request['scene']!r} "
+            f"(fingerprint {request['fingerprint']}), not of {scene.name!r} "
             f"({scene.fingerprint()}). Load the data set of that scene, or create one in another folder."
         )
-    return _open(files, manifest, scene)
+    return _open(files, scene, checksums=verify)
 
 
 def _collect_missing(
     files: DatasetFiles,
-    manifest: dict,
     scene: Scene,
     num_threads: int | None,
     progress: Callable[[int, int], None] | None,
     map_chunks: Callable[[Callable, Iterable], Iterable],
 ) -> None:
-    request, versions = manifest["request"], simulation_versions()
-    if manifest["versions"] != versions:
+    request, versions = files.manifest["request"], simulation_versions()
+    if files.manifest["versions"] != versions:
         raise DatasetError(
-            f"{files.manifest_path}: the data set was begun with {manifest['versions']} and would go on "
+            f"{files.manifest_path}: the data set was begun with {files.manifest['versions']} and would go on "
             f"differently with {versions}. Finish it with those versions, or use another folder."
         )
-    total = sum(request["sizes"].values())
-    done = sum(min(len(manifest["chunks"][split]) * CHUNK, size) for split, size in request["sizes"].items())
-    chunks = list(_missing_chunks(manifest, scene))
-    collector = _ChunkCollector(scene, request["steps"], request["seed"], request["knot_interval"], num_threads)
-    stored, here = _stored_features(manifest), ParameterNames.of(scene)
+    stored, here = _stored_features(files), ParameterNames.of(scene)
     if stored and (missing := stored.missing_in(here)):
         raise DatasetError(
             f"{files.manifest_path}: the data set was begun with static features {missing}, which this version of"
             " torchrl_gn does not have. Finish it with that version, or use another folder."
         )
-    for chunk, (data, rejected) in zip(chunks, map_chunks(collector, chunks), strict=True):
+    chunks = list(_missing_chunks(files, scene))
+    collect = partial(_collect, scene, request, num_threads)
+    for (key, *_), (rows, rejected) in zip(chunks, map_chunks(collect, chunks), strict=True):
         if stored:
-            _take_columns(data, stored.columns_in(here))
-        arrays = {name: data.get(tuple(name.split("/"))).numpy() for name in manifest["entries"]}
-        files.append(manifest, SPLITS[chunk.key[0]], arrays, rejected)
-        done += chunk.count
+            _take_columns(rows, stored.columns_in(here))
+        files.append(SPLITS[key[0]], rows, rejected)
         if progress is not None:
-            progress(done, total)
+            progress(sum(map(files.rows_done, SPLITS)), sum(request["sizes"].values()))
 
 
-@dataclass(frozen=True)
-class _Chunk:
-    """Sequences that are made together: seed key, number, and the parameters of each if they are of variants."""
-
-    key: tuple[int, int]
-    count: int
-    parameters: np.ndarray | None
-
-
-def _missing_chunks(manifest: dict, scene: Scene) -> Iterator[_Chunk]:
-    request = manifest["request"]
+def _missing_chunks(files: DatasetFiles, scene: Scene) -> Iterator[tuple]:
+    """Seed key, number of sequences, and for variants the parameters of each, of chunks that are to be made."""
+    request = files.manifest["request"]
     for number, (split, size) in enumerate(request["sizes"].items()):
         parameters = None
         if request["variants"] is not None:
             rng = np.random.default_rng(np.random.SeedSequence(request["seed"], spawn_key=(number,)))
             parameters = sample_parameters(_system(scene), min(request["variants"], size), rng)
-        for first in range(len(manifest["chunks"][split]) * CHUNK, size, CHUNK):
+        for first in range(files.rows_done(split), size, CHUNK):
             rows = np.arange(first, min(first + CHUNK, size))
             own = None if parameters is None else parameters[rows % len(parameters)]
-            yield _Chunk((number, first // CHUNK), len(rows), own)
+            yield (number, first // CHUNK), len(rows), own
 
 
-@dataclass
-class _ChunkCollector:
-    """Makes chunks, here or in another process."""
-
-    scene: Scene
-    steps: int
-    seed: int
-    knot_interval: float
-    num_threads: int | None
-
-    def __call__(self, chunk: _Chunk) -> tuple[TensorDict, int]:
-        if chunk.parameters is None:
-            simulator, variant = self.simulator, np.zeros(chunk.count, dtype=np.int64)
-        else:
-            # Built chunk by chunk: thousands of models at once would take gigabytes.
-            distinct, variant = np.unique(chunk.parameters, axis=0, return_inverse=True)
-            variant = variant.reshape(-1)  # some versions of NumPy keep the axis
-            simulator = Simulator(_variants(self.scene, distinct), self.num_threads)
-        data, rejected = collect_chunk(
-            simulator, variant, self.steps, self.seed, chunk.key, knot_interval=self.knot_interval
-        )
-        if chunk.parameters is not None:
-            data["parameters"] = variant_parameters(simulator.scenes, variant)
-            data["variant_parameters"] = torch.from_numpy(chunk.parameters)
-        return data, rejected
-
-    @functools.cached_property
-    def simulator(self) -> Simulator:
-        return Simulator(self.scene, self.num_threads)
-
-    def __getstate__(self) -> dict:
-        """Without the simulator, whose threads stay in their process."""
-        return {name: value for name, value in vars(self).items() if name != "simulator"}
+def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple) -> tuple[TensorDict, int]:
+    """Simulate a chunk, here or in another process."""
+    key, count, parameters = chunk
+    scenes, variant = [scene], np.zeros(count, dtype=np.int64)
+    if parameters is not None:
+        # Built chunk by chunk: thousands of models at once would take gigabytes.
+        distinct, variant = np.unique(parameters, axis=0, return_inverse=True)
+        scenes, variant = _variants(scene, distinct), variant.reshape(-1)  # some versions of NumPy keep the axis
+    options = {name: request[name] for name in ("steps", "seed", "knot_interval")}
+    rows, rejected = collect_chunk(Simulator(scenes, num_threads), variant, key=key, **options)
+    if parameters is not None:
+        rows["parameters"] = variant_parameters(scenes, variant)
+        rows["variant_parameters"] = torch.from_numpy(parameters)
+    return rows, rejected
 
 
 def _system(scene: Scene) -> str:
@@ -315,26 +264,21 @@ def _variants(scene: Scene, parameters: np.ndarray) -> list[Scene]:
     return make_variants(_system(scene), parameters, timestep=scene.timestep, name=scene.name)
 
 
-def _variant_entries(scene: Scene, parameters: int) -> dict[str, list[int]]:
-    """Shapes of what sequences of variants have besides their states."""
-    parameters = {f"static/{name}": list(value.shape) for name, value in PhysicalParameters.of(scene)._asdict().items()}
-    return {**parameters, "variant_parameters": [parameters]}
-
-
-def _open(files: DatasetFiles, manifest: dict, scene: Scene) -> TrajectoryDataset:
-    rejected = {split: sum(chunk["rejected"] for chunk in chunks) for split, chunks in manifest["chunks"].items()}
-    splits = {split: files.open(manifest, split) for split in SPLITS}
-    features = _stored_features(manifest)
-    if features:
+def _open(files: DatasetFiles, scene: Scene, *, checksums: bool) -> TrajectoryDataset:
+    chunks, features = files.manifest["chunks"], None
+    rejected = {split: sum(chunk["rejected"] for chunk in chunks[split]) for split in SPLITS}
+    splits = {split: files.open(split, checksums=checksums) for split in SPLITS}
+    if stored := _stored_features(files):
         # In the order in which samples that are collected now have them.
-        stored, features = features, ParameterNames.of(scene).common(features)
+        features = ParameterNames.of(scene).common(stored)
         for data in splits.values():
             _take_columns(data, features.columns_in(stored))
-    return TrajectoryDataset(scene=scene, rejected=rejected, manifest=manifest, features=features, **splits)
+    return TrajectoryDataset(scene=scene, rejected=rejected, manifest=files.manifest, features=features, **splits)
 
 
-def _stored_features(manifest: dict) -> ParameterNames | None:
-    return None if manifest["features"] is None else ParameterNames.from_names(manifest["features"])
+def _stored_features(files: DatasetFiles) -> ParameterNames | None:
+    names = files.manifest["features"]
+    return None if names is None else ParameterNames.from_names(names)
 
 
 def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
@@ -343,16 +287,6 @@ def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
         values = data["parameters", part]
         if wanted != list(range(values.shape[-1])):
             data["parameters", part] = take_columns(values, wanted)
-
-
-def _check_same(files: DatasetFiles, manifest: dict, request: dict) -> None:
-    there = manifest["request"]
-    differing = [key for key in request if there.get(key) != request[key]]
-    if differing:
-        what = ", ".join(f"{key} is {there.get(key)}, not {request[key]}" for key in differing)
-        raise DatasetError(
-            f"{files.manifest_path}: another data set is there ({what}). Use another folder, or delete this one."
-        )
 
 
 def _description(scene: Scene) -> dict | None:

@@ -1,35 +1,33 @@
-"""Files of a data set: raw float64 rows, written in checksummed chunks, and a manifest.
+"""Files of a data set: a manifest, and a memory-mapped TensorDict for each split, filled chunk by chunk.
 
 ::
 
-    manifest.json                                 what the data are, which chunks are done
-    train/state.bin, action.bin, physics.bin      little-endian float64, row after row
-    train/static/nodes.bin, ...                   of variants, the numbers of each sequence's scene
+    manifest.json                                        request, versions, finished chunks and their checksums
+    train/meta.json, state.memmap, action.memmap, ...    TensorDict's own format (TensorDict.load_memmap)
+    train/static/meta.json, nodes.memmap, ...            of variants, the numbers of each sequence's scene
     validation/..., test/...
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
-import sys
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
+from typing import cast
 
-import numpy as np
 import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
 from torchrl_gn.data.errors import DatasetError
 
-FORMAT = 3
+FORMAT = 4
 SPLITS = ("train", "validation", "test")
-_KEYS = {"format", "request", "description", "entries", "features", "versions", "chunks"}
+_KEYS = {"format", "request", "description", "features", "versions", "chunks"}
+_REMEDY = "Restore it from a copy, or delete the data set's folder and create it again."
 
 
 def simulation_versions() -> dict[str, str]:
@@ -38,172 +36,174 @@ def simulation_versions() -> dict[str, str]:
 
 
 class DatasetFiles:
-    """Read and write the folder of a data set, whose manifest is the caller's to keep.
+    """Read and write the folder of a data set.
 
-    Rows of a split are written chunk by chunk, each followed by the manifest, which is replaced
-    atomically: whatever interrupts this, the chunks in the manifest are whole.
+    A chunk enters the manifest once its rows are on disk, and the manifest is replaced atomically: an interruption
+    leaves every chunk in the manifest whole.
 
     Args:
         root: the folder.
+
+    Attributes:
+        manifest: empty until :meth:`read` or :meth:`create`.
     """
 
     def __init__(self, root: Path):
-        self.root = root
-        self.manifest_path = root / "manifest.json"
+        self.root, self.manifest_path = root, root / "manifest.json"
         self._temporary = root / "manifest.json.tmp"
-        if sys.byteorder != "little":
-            raise NotImplementedError("Data sets are little-endian.")
+        self.manifest: dict = {}
 
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Keep other processes from making the same data set; they wait. Nobody does where nothing can be written."""
+    def lock(self) -> AbstractContextManager:
+        """Make other processes that want the same data set wait; does nothing where nothing can be written."""
         root = self.root.absolute()
         root.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(root.parent, os.W_OK):
-            yield
-            return
-        with FileLock(root.with_name(f".{root.name}.lock")):
-            yield
+        writable = os.access(root.parent, os.W_OK)
+        return FileLock(root.with_name(f".{root.name}.lock")) if writable else nullcontext()
 
-    def exists(self) -> bool:
-        """Whether a data set is there.
+    def find(self, request: dict) -> bool:
+        """Whether the data set of a request is there, finished or begun; reads its manifest and checks all its files.
 
         Raises:
-            DatasetError: something else is.
+            DatasetError: something else is there, another or a damaged data set.
         """
-        if self.manifest_path.is_file():
-            return True
-        if self.root.exists() and not self.root.is_dir():
-            raise DatasetError(f"{self.root}: not a folder. Use another path.")
-        if self.root.is_dir() and any(file != self._temporary for file in self.root.iterdir()):
+        if not self.manifest_path.is_file():
+            if self.root.exists() and not self.root.is_dir():
+                raise DatasetError(f"{self.root}: not a folder. Use another path.")
+            if self.root.is_dir() and any(file != self._temporary for file in self.root.iterdir()):
+                raise DatasetError(
+                    f"{self.root}: the folder is not empty and has no manifest.json, so it is no data set or a "
+                    "damaged one. Use another folder."
+                )
+            return False
+        self.read()
+        there = self.manifest["request"]
+        if differing := [key for key in request if there.get(key) != request[key]]:
+            what = ", ".join(f"{key} is {there.get(key)}, not {request[key]}" for key in differing)
             raise DatasetError(
-                f"{self.root}: the folder is not empty and has no manifest.json, so it is no data set or a "
-                "damaged one. Use another folder."
+                f"{self.manifest_path}: another data set is there ({what}). Use another folder, or delete this one."
             )
-        return False
+        for split in filter(self.rows_done, SPLITS):
+            self.open(split, checksums=True)
+        return True
 
-    def create(self, manifest: dict) -> None:
-        """Make the folder and a manifest without chunks."""
-        # Nothing before the manifest, without which the folder would be none of ours.
-        self.root.mkdir(parents=True, exist_ok=True)
-        self._write(manifest)
-
-    def read(self) -> dict:
-        """The manifest.
+    def read(self) -> None:
+        """Read the manifest.
 
         Raises:
             DatasetError: it is missing, damaged or of another format.
         """
+        file = self.manifest_path
         try:
-            manifest = json.loads(self.manifest_path.read_text(encoding="utf-8"))
+            manifest = json.loads(file.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise DatasetError(
-                f"{self.manifest_path}: no such file, so there is no data set. Make one with create_dataset."
+                f"{file}: no such file, so there is no data set. Make one with create_dataset."
             ) from None
         except ValueError as error:
-            raise DatasetError(f"{self.manifest_path}: damaged ({error}). {_REMEDY}") from error
+            raise DatasetError(f"{file}: damaged ({error}). {_REMEDY}") from error
         if not isinstance(manifest, dict) or not isinstance(manifest.get("format"), int):
-            raise DatasetError(f"{self.manifest_path}: damaged (no format number). {_REMEDY}")
-        if manifest["format"] > FORMAT:
+            raise DatasetError(f"{file}: damaged (no format number). {_REMEDY}")
+        if manifest["format"] != FORMAT:
+            order, remedy = "newer", "Update torchrl_gn."
+            if manifest["format"] < FORMAT:
+                order, remedy = "older", "Delete the folder and create it again, with the same seed, or use another."
             raise DatasetError(
-                f"{self.manifest_path}: format {manifest['format']} is newer than {FORMAT}, the only one that "
-                "this version reads. Update torchrl_gn."
-            )
-        if manifest["format"] < FORMAT:
-            raise DatasetError(
-                f"{self.manifest_path}: format {manifest['format']} is older than {FORMAT}, the only one that this "
-                "version reads. Delete the data set's folder and create it again, with the same seed, or use another."
+                f"{file}: format {manifest['format']} is {order} than {FORMAT}, the only one that this version reads. "
+                + remedy
             )
         if missing := _KEYS - manifest.keys():
-            raise DatasetError(f"{self.manifest_path}: damaged (no {sorted(missing)}). {_REMEDY}")
-        return manifest
+            raise DatasetError(f"{file}: damaged (no {sorted(missing)}). {_REMEDY}")
+        self.manifest = manifest
 
-    def is_complete(self, manifest: dict) -> bool:
-        """Whether all chunks are done."""
-        return all(_rows_done(manifest, split) == manifest["request"]["sizes"][split] for split in SPLITS)
+    def create(self, **entries: object) -> None:
+        """Make the folder and a manifest of these entries, the format and no chunks."""
+        self.root.mkdir(parents=True, exist_ok=True)
+        self.manifest = {"format": FORMAT, **entries, "chunks": {split: [] for split in SPLITS}}
+        self._write()
 
-    def verify(self, manifest: dict, *, checksums: bool = True) -> None:
-        """Compare the files with the manifest's chunks.
-
-        Raises:
-            DatasetError: a file is missing, too short or changed.
-        """
-        complete = self.is_complete(manifest)
-        for split in SPLITS:
-            done = _rows_done(manifest, split)
-            for name, shape in manifest["entries"].items():
-                file, row = self._file(split, name), 8 * math.prod(shape)
-                if not done:
-                    continue
-                if not file.is_file():
-                    raise DatasetError(f"{file}: missing. {_REMEDY}")
-                size = file.stat().st_size
-                if size < done * row or (complete and size != done * row):
-                    raise DatasetError(f"{file}: {size} bytes, should be {done * row}: truncated or changed. {_REMEDY}")
-                if checksums:
-                    self._check_checksums(manifest, split, name, file, row)
-
-    def append(self, manifest: dict, split: str, arrays: dict[str, np.ndarray], rejected: int) -> None:
-        """Write the next chunk of a split, then the manifest with it.
-
-        Args:
-            manifest: gets the chunk's entry.
-            split: name of the split.
-            arrays: ``[rows, *shape]`` float64 by name; a part of a name before ``/`` is a folder.
-            rejected: simulations that were drawn again for this chunk.
-        """
-        done, sums = _rows_done(manifest, split), {}
-        for name, array in arrays.items():
-            values = np.ascontiguousarray(array, dtype=np.float64)
-            path = self._file(split, name)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with open(path, "r+b" if done else "wb") as file:
-                file.seek(done * 8 * math.prod(manifest["entries"][name]))
-                file.truncate()
-                file.write(values.data)
-                file.flush()
-                os.fsync(file.fileno())
-            sums[name] = zlib.crc32(values.data)
-        manifest["chunks"][split].append({"rejected": rejected, "crc32": sums})
-        self._write(manifest)
-
-    def open(self, manifest: dict, split: str) -> TensorDict:
-        """The split, mapped from disk copy-on-write: writing to it never reaches the files."""
-        size = manifest["request"]["sizes"][split]
-        entries = {}
-        for name, shape in manifest["entries"].items():
-            numel = size * math.prod(shape)
-            if numel:
-                file = str(self._file(split, name))
-                flat = torch.from_file(file, shared=False, size=numel, dtype=torch.float64)
-            else:  # a scene without actuators
-                flat = torch.empty(0, dtype=torch.float64)
-            entries[tuple(name.split("/"))] = flat.view(size, *shape)
-        return TensorDict(entries, batch_size=[size])
-
-    def _file(self, split: str, name: str) -> Path:
-        return self.root / split / f"{name}.bin"
-
-    def _check_checksums(self, manifest: dict, split: str, name: str, file: Path, row: int) -> None:
-        chunk, size = manifest["request"]["chunk"], manifest["request"]["sizes"][split]
-        with open(file, "rb") as stream:
-            for number, written in enumerate(manifest["chunks"][split]):
-                first, last = number * chunk, min((number + 1) * chunk, size)
-                if zlib.crc32(stream.read((last - first) * row)) != written["crc32"][name]:
-                    raise DatasetError(
-                        f"{file}: sequences {first} to {last - 1} do not have their checksum: damaged. " + _REMEDY
-                    )
-
-    def _write(self, manifest: dict) -> None:
+    def _write(self) -> None:
         with open(self._temporary, "w", encoding="utf-8") as file:
-            json.dump(manifest, file, indent=1)
+            json.dump(self.manifest, file, indent=1)
             file.flush()
             os.fsync(file.fileno())
         os.replace(self._temporary, self.manifest_path)
 
+    def rows_done(self, split: str) -> int:
+        """Number of rows in a split's finished chunks."""
+        request = self.manifest["request"]
+        return min(len(self.manifest["chunks"][split]) * request["chunk"], request["sizes"][split])
 
-_REMEDY = "Restore it from a copy, or delete the data set's folder and create it again."
+    def is_complete(self) -> bool:
+        """Whether all chunks are finished."""
+        return all(self.rows_done(split) == size for split, size in self.manifest["request"]["sizes"].items())
+
+    def append(self, split: str, rows: TensorDict, rejected: int) -> None:
+        """Write the next chunk of a split, then the manifest with its checksums.
+
+        Args:
+            split: name of the split.
+            rows: the chunk, ``[rows]``.
+            rejected: simulations that were drawn again for this chunk.
+        """
+        folder, chunks, first = self.root / split, self.manifest["chunks"][split], self.rows_done(split)
+        if not chunks:
+            size = self.manifest["request"]["sizes"][split]
+            cast(TensorDict, rows[:1]).expand(size).memmap_like(str(folder))
+            for file in folder.rglob("*.memmap") if hasattr(os, "posix_fallocate") else ():
+                with open(file, "r+b") as stream:  # a full disk raises here; later it would kill the process
+                    os.posix_fallocate(stream.fileno(), 0, file.stat().st_size)
+        TensorDict.load_memmap(folder, allow_pickle=False)[first : first + len(rows)] = rows
+        for file in folder.rglob("*.*"):
+            with open(file, "r+b") as stream:
+                os.fsync(stream.fileno())
+        layout = {file.relative_to(folder).as_posix(): file for file in sorted(folder.rglob("meta.json"))}
+        sums = {name: zlib.crc32(file.read_bytes()) for name, file in layout.items()}
+        chunks.append({"rejected": rejected, "crc32": {**sums, **_checksums(rows)}})
+        self._write()
+
+    def open(self, split: str, *, checksums: bool) -> TensorDict:
+        """A split that was begun, mapped from disk copy-on-write: writing to it never reaches the files.
+
+        Args:
+            split: name of the split.
+            checksums: compare the finished chunks with their checksums.
+
+        Raises:
+            DatasetError: a file is missing, changed or of another size.
+        """
+        folder, chunks, count = self.root / split, self.manifest["chunks"][split], self.manifest["request"]["chunk"]
+        for name, expected in chunks[0]["crc32"].items():
+            file = folder / name
+            if not file.is_file():
+                raise DatasetError(f"{file}: missing. {_REMEDY}")
+            if file.suffix == ".json" and zlib.crc32(file.read_bytes()) != expected:
+                raise DatasetError(f"{file}: does not have its checksum: damaged. {_REMEDY}")
+        # Shapes only: load_memmap maps files to write to them, and enlarges those that are too short.
+        shapes = TensorDict.load_memmap(folder, device=torch.device("meta"), allow_pickle=False).flatten_keys("/")
+        entries = {tuple(name.split("/")): _map(folder / f"{name}.memmap", like) for name, like in shapes.items()}
+        data = TensorDict(entries, batch_size=shapes.batch_size)
+        for number, chunk in enumerate(chunks if checksums else ()):
+            first = number * count
+            rows = cast(TensorDict, data[first : first + count])
+            for name, found in _checksums(rows).items():
+                if chunk["crc32"].get(name) != found:
+                    raise DatasetError(
+                        f"{folder / name}: sequences {first} to {first + len(rows) - 1} do not have their checksum: "
+                        f"damaged. {_REMEDY}"
+                    )
+        return data
 
 
-def _rows_done(manifest: dict, split: str) -> int:
-    return min(len(manifest["chunks"][split]) * manifest["request"]["chunk"], manifest["request"]["sizes"][split])
+def _checksums(rows: TensorDict) -> dict[str, int]:
+    """Checksum of each file's rows, by its name; a tensor without elements has no file."""
+    leaves = rows.flatten_keys("/").items()
+    return {f"{name}.memmap": zlib.crc32(leaf.contiguous().numpy().data) for name, leaf in leaves if leaf.numel()}
+
+
+def _map(file: Path, like: torch.Tensor) -> torch.Tensor:
+    if not like.numel():  # a scene without actuators
+        return torch.empty(like.shape, dtype=like.dtype)
+    size, wanted = file.stat().st_size, like.numel() * like.element_size()
+    if size != wanted:
+        raise DatasetError(f"{file}: {size} bytes, should be {wanted}: truncated or changed. {_REMEDY}")
+    return torch.from_file(str(file), shared=False, size=like.numel(), dtype=like.dtype).view(like.shape)
