@@ -151,7 +151,7 @@ def test_a_model_of_fewer_features_compares_all_that_samples_bring(variants, sam
 
 def test_what_is_no_variant_is_refused(variants, model):
     bound = model.bind(variants[0], parameters_key="parameters")
-    with pytest.raises(ValueError, match="no variant of 'arm': components that move, joint anchors differ"):
+    with pytest.raises(ValueError, match="no variant of 'arm': movable components, joint anchors differ"):
         bound.parameters_of(child_anchor(slide='<joint name="elbow" type="slide" axis="0 1 0"/>'))
     with pytest.raises(ValueError, match="'swimmer3' is no variant of 'arm': number of nodes, edges"):
         bound.parameters_of(load_scene("swimmer3"))

@@ -157,7 +157,7 @@ def test_true_parameters_cannot_leak(system, parameters):
     sample = TensorDict({"state": data["state"][:, 2], "action": data["action"][:, 2]}, [3])
     modules = [bound]
     if parameters == "inferred":
-        with pytest.raises(ValueError, match="Static entry 'nodes' must be|true parameters"):
+        with pytest.raises(ValueError, match="Physical parameter 'nodes' must be|true parameters"):
             bound(sample.clone().set("parameters", data["parameters"]))
         identifying = IdentifyingModel(model, edge_hidden=(8,), node_hidden=(8,), global_hidden=(8,)).double()
         bound, inference = identifying.bind(scene)

@@ -4,12 +4,9 @@ from torchrl_gn.data.collect import collect_trajectories
 from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.dataset import TrajectoryDataset, create_dataset, load_dataset
 from torchrl_gn.data.errors import DatasetError, UnstableSimulationError
-from torchrl_gn.data.logged_trajectories import LogReport, log_trajectories
+from torchrl_gn.data.logs import LogReport, RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log
 from torchrl_gn.data.replay import TrajectoryStorage, WindowSampler, trajectory_buffer
-from torchrl_gn.data.robot_log import RobotLog, log_chain
-from torchrl_gn.data.robot_log_files import load_robot_log
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.data.simulated_log import simulate_log
 from torchrl_gn.data.start_states import sample_start_states
 
 __all__ = [

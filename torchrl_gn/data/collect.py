@@ -1,4 +1,4 @@
-"""Trajectories under random control, in memory."""
+"""Collect trajectories under random control, in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Scene
 
 CHUNK = 250
-"""Sequences that share one derived seed; part of what makes data repeat, so it never changes."""
+"""Sequences per derived seed; data depend on it, so it never changes."""
 
 _ATTEMPTS = 20
 _MAX_REJECTED = 0.1
@@ -36,42 +36,38 @@ def collect_trajectories(
 ) -> TensorDict:
     """Simulate a scene under random control (paper, SM "Datasets").
 
-    Starts are those of :func:`~torchrl_gn.data.sample_start_states`, actions those of
-    :func:`~torchrl_gn.data.spline_controls`. The result depends on the arguments alone, not on
-    the number of threads.
+    Starts come from :func:`~torchrl_gn.data.sample_start_states`, actions from
+    :func:`~torchrl_gn.data.spline_controls`. The result does not depend on the number of threads.
 
     Args:
-        scene: the scene, or variants of one (:func:`~torchrl_gn.scenes.sample_variants`), which the sequences
-            take in turn; each then brings its variant's numbers.
+        scene: the scene, or variants of one, which the sequences take in turn.
         num: number of sequences.
         steps: control steps ``T`` of each.
         seed: seed of starts and actions.
-        split: data of equal seed and another split are independent;
-            :func:`~torchrl_gn.data.create_dataset` gives 0, 1, 2 to train, validation, test.
+        split: index of an independent split; :func:`~torchrl_gn.data.create_dataset` uses 0, 1, 2.
         knot_interval: control steps between the knots of the random actions.
-        simulator: simulator of that scene, or of those, to reuse its threads.
-        progress: called with sequences done and wanted.
+        simulator: simulator of the same scenes, to reuse its threads.
+        progress: called with the numbers of sequences done and wanted.
 
     Returns:
-        TensorDict ``[num]``, float64: ``state`` ``[num, T+1, N, 13]``, ``action`` ``[num, T, A]``,
-        ``physics`` ``[num, T+1, S]``; of variants also ``parameters``, a TensorDict ``[num]`` of the entries of
-        :class:`~torchrl_gn.scenes.PhysicalParameters` that a model bound with ``parameters_key="parameters"`` reads.
+        TensorDict ``[num]``, float64: ``state`` ``[num, T+1, N, 13]``, ``action`` ``[num, T, A]``, ``physics``
+        ``[num, T+1, S]``; with variants also ``parameters``, the physical parameters of each sequence's scene
+        (:class:`~torchrl_gn.scenes.PhysicalParameters`).
 
     Raises:
-        ValueError: ``num`` or ``steps`` is below one, or ``simulator`` is of another scene.
-        UnstableSimulationError: of up to 250 simulations made together more than a tenth, and more than ten, become
-            unstable (fewer are drawn again).
+        ValueError: if ``num`` or ``steps`` is below one, or ``simulator`` is of another scene.
+        UnstableSimulationError: if over a tenth, and over ten, of a chunk's simulations become unstable; fewer are
+            redrawn.
     """
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
     simulator = simulator or Simulator(scene)
     if simulator.scenes != ((scene,) if isinstance(scene, Scene) else tuple(scene)):
         raise ValueError(f"simulator is of another {simulator.scene.name!r} than the scene; give both the same.")
-    scenes = len(simulator.scenes)
     chunks = []
     for first in range(0, num, CHUNK):
         count = min(CHUNK, num - first)
-        variant = np.arange(first, first + count) % scenes
+        variant = np.arange(first, first + count) % len(simulator.scenes)
         chunk, _ = collect_chunk(simulator, variant, steps, seed, (split, first // CHUNK), knot_interval=knot_interval)
         if not isinstance(scene, Scene):
             chunk["parameters"] = variant_parameters(simulator.scenes, variant)
@@ -82,7 +78,7 @@ def collect_trajectories(
 
 
 def variant_parameters(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDict:
-    """Numbers of each sequence's scene, a TensorDict ``[n]`` for ``[n]`` indices of scenes."""
+    """Return the physical parameters ``[n]`` of the scenes with indices ``[n]``."""
     which, row = np.unique(variant, return_inverse=True)
     values = torch.stack([PhysicalParameters.of(scenes[index]).tensordict() for index in which])
     return cast(TensorDict, values[torch.from_numpy(row)])
@@ -97,19 +93,11 @@ def collect_chunk(
     *,
     knot_interval: float,
 ) -> tuple[TensorDict, int]:
-    """Simulate the sequences that share one derived seed, drawing unstable ones again.
-
-    Args:
-        simulator: simulator of one scene, or of several.
-        variant: ``[count]`` integers, which of its scenes each sequence is of.
-        steps: control steps of each.
-        seed: the data set's seed.
-        key: distinguishes the chunk's seed from all others'.
-        knot_interval: control steps between the knots of the random actions.
+    """Simulate sequences of the scenes ``variant`` ``[count]`` with the one seed of (``seed``, ``key``).
 
     Returns:
-        TensorDict ``[count]`` of ``state``, ``action`` and ``physics``, and the number of
-        unstable simulations that were rejected.
+        TensorDict ``[count]`` of ``state``, ``action`` and ``physics``, and the number of unstable, redrawn
+        simulations.
     """
     scene, count = simulator.scene, len(variant)
     result, rejected, pending = None, 0, torch.arange(count)
@@ -132,7 +120,7 @@ def collect_chunk(
         if not len(pending):
             return result, rejected
     raise UnstableSimulationError(
-        f"{rejected} simulations of {scene.name!r} became unstable while {count} sequences of {steps} steps "
-        "were wanted. Use a smaller physics step in the model, smaller action bounds, or a larger "
+        f"{rejected} simulations of {scene.name!r} became unstable while drawing {count} sequences of {steps} steps. "
+        "Use a smaller physics step in the model, smaller action bounds, or a larger "
         "knot_interval."
     )

@@ -1,40 +1,34 @@
-"""Random control signals (paper, SM "Random control")."""
+"""Random controls (paper, SM "Random control"), and NumPy generators from seeds."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import torch
 
 from torchrl_gn.scenes.scene import Scene
 
-_MARGIN = 2  # knots before and after the sequence, so that the ends are like the middle
+_MARGIN = 2  # knots before and after the sequence, against the spline's end conditions
 
 
 def spline_controls(
     scene: Scene, num: int, steps: int, rng: int | np.random.Generator, *, knot_interval: float = 10.0
 ) -> np.ndarray:
-    """Smooth random action sequences (paper, SM "Random control").
+    """Draw smooth action sequences ``[num, T, A]``, float64, in the actuators' units (paper, SM "Random control").
 
-    The paper takes "randomly selected time steps from spline interpolations of randomly
-    generated values": here cubic splines through knots uniform within each action's
-    bounds, read from a random phase between two knots on. A spline overshoots its knots, so
-    values are clipped to the bounds.
-
-    Paper: it does not say how far apart the knots are; 10 control steps is our choice.
+    Cubic splines through knots that are uniform within each action's bounds, from a random phase on, clipped to the
+    bounds. Paper: the distance of knots is not given; 10 control steps is our choice.
 
     Args:
-        scene: the scene, for the number of actions and their bounds.
+        scene: the scene.
         num: number of sequences.
         steps: control steps ``T`` of each.
-        rng: generator or seed; equal seeds give equal signals.
-        knot_interval: control steps between knots, above 0; the larger, the slower the signal.
-
-    Returns:
-        ``[num, T, A]`` float64, in the actuators' units.
+        rng: generator or seed.
+        knot_interval: control steps between knots, above 0.
 
     Raises:
-        ValueError: ``num`` or ``steps`` is negative or ``knot_interval`` not above 0 and finite.
+        ValueError: if ``num`` or ``steps`` is negative, or ``knot_interval`` is not above 0 and finite.
     """
     if num < 0 or steps < 0:
         raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")
@@ -60,10 +54,11 @@ def spline_controls(
 
 
 def check_knot_interval(knot_interval: float) -> None:
-    """Refuse what is no time between knots.
-
-    Raises:
-        ValueError: it is not above 0 and finite.
-    """
+    """Raise ValueError if the interval is not above 0 and finite."""
     if not 0 < knot_interval < math.inf:
         raise ValueError(f"knot_interval must be above 0 and finite, got {knot_interval}")
+
+
+def numpy_generator(seed: int | None) -> np.random.Generator:
+    """NumPy generator from a seed; None draws the seed from torch's global generator."""
+    return np.random.default_rng(int(torch.randint(2**31, ()).item()) if seed is None else seed)

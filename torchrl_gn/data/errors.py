@@ -4,8 +4,8 @@ from __future__ import annotations
 
 
 class UnstableSimulationError(RuntimeError):
-    """Too many simulations of a scene left the range that MuJoCo can integrate."""
+    """Too many simulations of a scene become unstable."""
 
 
 class DatasetError(RuntimeError):
-    """A data set on disk is damaged, incomplete, newer than this library or of another scene."""
+    """A data set on disk is damaged, incomplete, of a newer format or of another scene."""

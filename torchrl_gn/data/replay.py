@@ -1,4 +1,4 @@
-"""Replay buffer of transitions and windows over whole trajectories."""
+"""Replay buffer of transitions and windows from whole trajectories."""
 
 from __future__ import annotations
 
@@ -25,38 +25,29 @@ def trajectory_buffer(
     elsewhere: tuple[int, int] | None = None,
     shard: tuple[int, int] = (0, 1),
 ) -> TensorDictReplayBuffer:
-    """Replay buffer that draws transitions, or windows of them, from trajectories.
+    """Replay buffer that draws transitions, or windows of them, from trajectories without copying these.
 
-    Every (trajectory, start time) is equally likely, with replacement. Trajectories stay as
-    they are, in memory or on disk, and the next state is read from them: nothing is
-    stored twice.
-
-    ``sample()`` gives a TensorDict ``[batch_size]``, or ``[batch_size, window]`` for windows longer
-    than one, with ``state`` ``[..., N, 13]``, ``action`` ``[..., A]``, ``("next", "state")`` ``[..., N, 13]``
-    and ``index`` ``[..., 2]``, trajectory and time. Entries of ``parameters``, stored once per trajectory, are
-    gathered with them (windows see views). ``buffer[i]`` gives whole trajectories.
-
-    To resume a run save ``buffer.state_dict()``: it holds the state of the random draws, and the
-    trajectories only with ``capacity``.
+    Draws (trajectory, start time) uniformly with replacement. ``sample()`` gives a TensorDict ``[batch_size]``, or
+    ``[batch_size, window]`` for windows longer than one, of ``state`` ``[..., N, 13]``, ``action`` ``[..., A]``,
+    ``("next", "state")`` ``[..., N, 13]``, ``index`` ``[..., 2]`` (trajectory, time) and the trajectory's ``parameters``.
+    ``buffer[i]`` gives whole trajectories. ``state_dict()`` holds the random state, and with ``capacity`` the
+    trajectories.
 
     Args:
-        trajectories: ``[M]`` with ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and possibly
-            ``parameters`` (a tensor ``[M, ...]`` or a TensorDict ``[M]``); other entries are left out.
-        batch_size: how many transitions or windows a sample has.
-        window: consecutive transitions in one draw.
-        seed: seed of the draws. Default: drawn from torch's global generator.
-        capacity: number of trajectories to make room for in memory, to ``extend`` the buffer with
-            more of equal shape, the oldest giving way. Default: the buffer is read-only.
-        elsewhere: ``(count, length)``: every draw also has so many windows of that length from other
-            times of its trajectory (paper, SM "End-to-end training algorithm for System ID"); they follow the
-            first along the second dimension, ``[batch_size, window + count * length]``.
-        shard: ``(rank, size)``: of every draw of ``batch_size`` this buffer gives one part of ``size`` equal ones, the
-            ``rank``-th; buffers of one seed and the other ranks give the others (training in several processes).
+        trajectories: ``[M]`` of ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and optionally ``parameters`` (a
+            tensor ``[M, ...]`` or a TensorDict ``[M]``); other entries are ignored.
+        batch_size: transitions or windows in a sample.
+        window: consecutive transitions in a draw.
+        seed: seed of the draws; default: drawn from torch's global generator.
+        capacity: trajectories to allocate, for ``extend`` to add more and replace the oldest; default: read-only.
+        elsewhere: ``(count, length)`` of query windows at other times of the same trajectory, which follow the first
+            along the second dimension, ``[batch_size, window + count * length]`` (paper, SM "End-to-end training
+            algorithm for System ID").
+        shard: ``(rank, size)``: return only this equal part of each draw; ranks with one seed share the draws.
 
     Raises:
-        KeyError: ``state`` or ``action`` is missing.
-        ValueError: no trajectory, trajectories shorter than ``window``, shapes that do not fit, or
-            ``capacity`` smaller than the number of trajectories.
+        KeyError: if ``state`` or ``action`` is missing.
+        ValueError: if there is no trajectory, one is shorter than ``window``, or an argument does not fit.
 
     Example:
         >>> from torchrl_gn.data import collect_trajectories
@@ -91,12 +82,7 @@ def trajectory_buffer(
 
 
 class TrajectoryStorage(TensorStorage):
-    """TorchRL storage of whole trajectories that is read by (trajectory, time).
-
-    Args:
-        trajectories: ``[M]`` with ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]``, possibly ``parameters``.
-        writable: whether trajectories can be added; the storage then starts empty.
-    """
+    """TorchRL storage of whole trajectories ``[M]``, read by (trajectory, time); starts empty if ``writable``."""
 
     def __init__(self, trajectories: TensorDictBase, *, writable: bool = False):
         super().__init__(trajectories, device=cast(Tensor, trajectories["state"]).device)
@@ -106,7 +92,7 @@ class TrajectoryStorage(TensorStorage):
 
     @property
     def trajectories(self) -> TensorDictBase:
-        """All there is room for, ``[M]``."""
+        """``[M]`` trajectories, allocated ones included."""
         return cast(TensorDictBase, self._storage)
 
     @property
@@ -115,12 +101,11 @@ class TrajectoryStorage(TensorStorage):
         return self.trajectories.get("action").shape[1]
 
     def get(self, index: Any) -> TensorDictBase:
-        """Transitions at ``(trajectory, time)``, two integer tensors of one shape ``[B]`` or ``[B, W]``.
+        """Return transitions at ``(trajectory, time)``: integers ``[B]`` or ``[B, W]`` each, or one ``[..., 2]``.
 
-        One tensor ``[..., 2]`` of both does too (ReplayBufferEnsemble gives that). Rows of a
-        ``[B, W]`` index are windows of one trajectory each. Any other index gives whole trajectories.
+        Rows of ``[B, W]`` must each be of one trajectory. Other indices give whole trajectories.
         """
-        if isinstance(index, Tensor) and index.ndim > 1:
+        if isinstance(index, Tensor) and index.ndim > 1:  # from a ReplayBufferEnsemble
             index = index.unbind(-1)
         if not isinstance(index, tuple):
             return super().get(cast(Any, index))
@@ -138,29 +123,23 @@ class TrajectoryStorage(TensorStorage):
         return TensorDict(entries, batch_size=here.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
-        """Write trajectories of the stored shape; entries that are not stored are left out."""
+        """Write the stored entries of trajectories of the stored shape."""
         super().set(cursor, data.select(*self.trajectories.keys()), set_cursor=set_cursor)
 
     def state_dict(self) -> dict[str, Any]:
-        """Contents if trajectories can be added, else nothing: they are somebody else's."""
+        """Return the trajectories if writable, else nothing."""
         return super().state_dict() if self.writable else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore :meth:`state_dict`."""
         if self.writable:
             super().load_state_dict(state_dict)
 
 
 class WindowSampler(Sampler):
-    """TorchRL sampler of (trajectory, time), uniform over all windows, reproducible from a seed.
+    """TorchRL sampler of (trajectory, time) of a :class:`TrajectoryStorage`, uniform over all windows.
 
-    Reads a :class:`TrajectoryStorage`.
-
-    Args:
-        window: consecutive transitions in one draw.
-        seed: seed of the draws. Default: drawn from torch's global generator.
-        elsewhere: number and length of further windows of the same trajectory in one draw.
-        shard: rank and size; all ranks draw the same and each keeps its part.
+    Args are those of :func:`trajectory_buffer`.
     """
 
     def __init__(
@@ -176,11 +155,7 @@ class WindowSampler(Sampler):
         self._generator.manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
     def sample(self, storage: TrajectoryStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
-        """Draw ``batch_size`` windows and keep this shard's.
-
-        Returns:
-            Trajectory and time, ``[batch_size / size]`` or ``[batch_size / size, window]`` each, and no metadata.
-        """
+        """Draw ``batch_size`` windows; return this shard's (trajectory, time), ``[B]`` or ``[B, W]``, no metadata."""
         starts = storage.steps - self.window + 1
         if not len(storage):
             raise RuntimeError("The buffer has no trajectory yet: extend it first.")
@@ -190,14 +165,14 @@ class WindowSampler(Sampler):
         if self.window > 1 or self.elsewhere:
             time = time[:, None] + torch.arange(self.window)
             if self.elsewhere:
-                time = torch.cat((time, self._others(time[:, 0], storage.steps)), dim=1)
+                time = torch.cat((time, self._query_windows(time[:, 0], storage.steps)), dim=1)
             trajectory = trajectory[:, None].expand_as(time)
         rank, size = self.shard
         own = slice(rank * batch_size // size, (rank + 1) * batch_size // size)
         return (trajectory[own], time[own]), {}
 
-    def _others(self, start: Tensor, steps: int) -> Tensor:
-        """Times ``[B, count * length]`` of windows that start anywhere but where the first does."""
+    def _query_windows(self, start: Tensor, steps: int) -> Tensor:
+        """Draw times ``[B, count * length]`` of windows that do not start at ``start``."""
         assert self.elsewhere is not None
         count, length = self.elsewhere
         starts = steps - length + 1
@@ -206,31 +181,28 @@ class WindowSampler(Sampler):
         return (drawn[..., None] + torch.arange(length)).flatten(1)
 
     def _empty(self) -> None:
-        """Nothing is remembered between draws."""
+        """Do nothing: draws are independent."""
 
     def state_dict(self) -> dict[str, Any]:
-        """State of the random draws."""
+        """Return the random state."""
         return {"generator": self._generator.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue the random draws where they were."""
+        """Restore the random state."""
         self._generator.set_state(state_dict["generator"])
 
     def dumps(self, path: str) -> None:
-        """Not needed: :meth:`state_dict` holds everything."""
         raise NotImplementedError("Save state_dict() instead.")
 
     def loads(self, path: str) -> None:
-        """Not needed: :meth:`load_state_dict` restores everything."""
         raise NotImplementedError("Use load_state_dict() instead.")
 
 
 def _rows(values: Tensor, row: Tensor) -> Tensor:
-    """``values`` ``[M, T, ...]`` at flat positions ``row`` of its first two dimensions."""
+    """Select flat positions ``row`` from the first two dimensions of ``values`` ``[M, T, ...]``."""
     flat, row_shape = values.flatten(0, 1).flatten(1), row.shape
     if values.device.type == "cpu":
-        # On one thread: index_select would wake all of them for a copy of a megabyte, which takes
-        # a hundred times longer when another process has the cores.
+        # On one thread: index_select uses all of them for a megabyte, a hundred times slower on busy cores.
         picked = torch.from_numpy(np.take(flat.numpy(), row.reshape(-1).numpy(), axis=0))
     else:
         picked = flat.index_select(0, row.reshape(-1).to(flat.device))
@@ -266,5 +238,5 @@ def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:
             f"window is {window} transitions, but the trajectories have {action.shape[1]}: "
             "use a smaller window or longer trajectories"
         )
-    # Samples are gathered from flat views, which strided tensors (a part of the time, say) do not have.
+    # Samples are gathered from flat views, which strided tensors lack.
     return trajectories.apply(lambda x: x.detach().contiguous())

@@ -17,31 +17,24 @@ from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
-_HUGE = float(mujoco.mjMAXVAL)  # MuJoCo resets a simulation whose numbers grow beyond this
+_HUGE = float(mujoco.mjMAXVAL)  # MuJoCo resets a simulation with larger numbers
 
 
 class Simulator:
-    """Simulate a scene: any batch, float64, with a control held over each control step.
+    """Simulate scenes: any batch, float64, actions held over each control step.
 
-    The next state is a function of (physics, action) alone, so a recorded physics state
-    and actions replay bit for bit, whatever the batch or the number of threads.
-
-    Actions outside the bounds are clamped by MuJoCo as it applies them.
-
-    A simulation is unstable when MuJoCo gives a warning (positions, velocities or
-    accelerations that are not finite or above 1e10, or a full contact buffer): MuJoCo then
-    stops advancing it, which ``stable`` tells; what was recorded from there on has no meaning.
-    The same goes if its last state cannot be simulated on from under its last action. MuJoCo's
-    own messages and log file about it are suppressed.
+    The next state depends on (physics, action) alone, bit for bit, whatever the batch and the threads. MuJoCo clamps
+    actions to their bounds. A simulation is unstable if MuJoCo warns (values not finite or above 1e10, or a full
+    contact buffer), also at the step after the last; what follows in it is meaningless. MuJoCo's own messages are
+    suppressed.
 
     Args:
-        scenes: the scene, or several of equal topology (random variants of one system).
-        num_threads: threads of the simulation. Default: the cores this process may use.
-        memory: bytes of MuJoCo's output to hold at a time; larger batches are simulated in chunks.
-            Default: 8 MB a thread, at most 256 MB: fastest where measured.
+        scenes: the scene, or several of equal topology (variants of one system).
+        num_threads: threads of the simulation; default: the cores this process may use.
+        memory: bytes of MuJoCo's output held at a time; default: 8 MB a thread, at most 256 MB.
 
     Raises:
-        ValueError: ``scenes`` is empty or their topology differs, or ``num_threads`` is below one.
+        ValueError: if there is no scene, topologies differ, or ``num_threads`` is below one.
 
     Example:
         >>> import numpy as np
@@ -78,18 +71,16 @@ class Simulator:
 
         Args:
             physics: ``[*B, S]`` float64, full MuJoCo states (``mjSTATE_FULLPHYSICS``).
-            actions: ``[*B, T, A]`` floating point, one control per control step.
-            variant: ``[*B]`` integers, which of the scenes each sequence is simulated with.
-                Default: in turn over the flattened batch, so one each if there are as many.
+            actions: ``[*B, T, A]`` floating point, one a control step.
+            variant: ``[*B]`` integers, scene of each sequence; default: the scenes in turn.
 
         Returns:
-            TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, 13]`` and ``physics`` ``[*B, T+1, S]``, both
-            float64 and starting with the given states, and ``stable`` ``[*B]`` bool. Quaternion
-            signs are MuJoCo's. Nothing is differentiated.
+            TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, 13]`` and ``physics`` ``[*B, T+1, S]``, float64, given
+            states first, and ``stable`` ``[*B]`` bool. Quaternion signs are MuJoCo's. No gradients.
 
         Raises:
-            ValueError: a wrong shape, or a value that is not finite (its index is named).
-            TypeError: ``physics`` is not float64 or ``actions`` not floating point.
+            ValueError: if a shape is wrong, or a value not finite (the message has its index).
+            TypeError: if ``physics`` is not float64 or ``actions`` not floating point.
         """
         scene = self.scene
         start = self._checked_physics(physics)
@@ -114,11 +105,11 @@ class Simulator:
         stable = np.empty(count, dtype=bool)
         held = scene.substeps
         for rows in self._chunks(count, steps * held + 1):
-            # Sensor row t is the state before physics step t: one more step shows the last state.
+            # Sensors show the state before a physics step: one more step shows the last state.
             repeated = np.repeat(controls[rows], held, axis=1)
             last = controls[rows, -1:] if steps else np.zeros((len(repeated), 1, scene.num_actions))
-            controls_now = np.concatenate([repeated, last], axis=1)
-            after, sensors, stable[rows] = self._advance(start[rows], controls_now, which[rows])
+            held_controls = np.concatenate([repeated, last], axis=1)
+            after, sensors, stable[rows] = self._advance(start[rows], held_controls, which[rows])
             state[rows] = sensors[:, ::held, scene.sensor_slice].reshape(state[rows].shape)
             recorded[rows, 0] = start[rows]
             recorded[rows, 1:] = after[:, held - 1 :: held][:, :steps]
@@ -130,20 +121,9 @@ class Simulator:
         return TensorDict(result, batch_size=batch)
 
     def observe(self, physics: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None) -> Tensor:
-        """Body states of given physics states, equal to those of :meth:`rollout`.
+        """Return the body states ``[*B, N, 13]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`.
 
-        Kinematics only: nothing is simulated, so nothing can be unstable.
-
-        Args:
-            physics: ``[*B, S]`` float64, full MuJoCo states.
-            variant: as for :meth:`rollout`.
-
-        Returns:
-            ``[*B, N, 13]`` float64.
-
-        Raises:
-            ValueError: a wrong shape or a value that is not finite.
-            TypeError: ``physics`` is not float64.
+        Computes kinematics alone. Raises as :meth:`rollout`.
         """
         start = self._checked_physics(physics)
         batch = start.shape[:-1]
@@ -164,23 +144,18 @@ class Simulator:
     def step(
         self, physics: np.ndarray, actions: np.ndarray, variant: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Advance states by one control step, as :meth:`rollout` but seeing bodies before it only.
+        """Advance states by one control step.
 
-        That saves one physics step: half the time of scenes that take one a control step. But whether the next states
-        can be simulated on from, only the next step tells.
+        Saves the physics step that :meth:`rollout` adds to see the last state, so does not detect if that one is
+        unstable.
 
         Args:
-            physics: ``[n, S]`` float64, full MuJoCo states. Those that are not finite are unstable, so that steps can
-                follow steps.
+            physics: ``[n, S]`` float64; states that are not finite count as unstable.
             actions: ``[n, A]`` float64.
             variant: as for :meth:`rollout`.
 
         Returns:
             Next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, 13]``, float64.
-
-        Raises:
-            ValueError: a wrong shape.
-            TypeError: ``physics`` is not float64.
         """
         scene = self.scene
         start = self._checked_physics(physics, finite=False)
@@ -201,15 +176,10 @@ class Simulator:
     def settle(
         self, physics: np.ndarray, steps: int, variant: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Advance states by physics steps without control; their time is kept.
-
-        Args:
-            physics: ``[n, S]`` float64, full MuJoCo states.
-            steps: number of physics steps, at least 1.
-            variant: as for :meth:`rollout`.
+        """Advance states ``[n, S]``, float64, by physics steps without control, and keep their time.
 
         Returns:
-            States ``[n, S]`` and which of them ``[n]`` are stable.
+            States ``[n, S]`` and whether they are stable ``[n]``.
         """
         start = self._checked_physics(physics)
         which = self._variants(variant, start.shape[:-1])
@@ -224,8 +194,8 @@ class Simulator:
     def _advance(
         self, start: np.ndarray, controls: np.ndarray, which: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Physics ``[n, t, S]`` after and sensors ``[n, t, nsensordata]`` before each physics step; what is stable."""
-        # What is unstable is seen by its time, which MuJoCo's reset sets back to 0: from 0 on it could not be seen.
+        """Return physics ``[n, t, S]`` after and sensors ``[n, t, nsensordata]`` before each step, and stability."""
+        # Instability shows in the time, which MuJoCo's reset sets to 0: start above 0.
         zero = start[:, 0] == 0
         if zero.any():
             start = start.copy()
@@ -239,11 +209,12 @@ class Simulator:
                 nstep=controls.shape[1],
             )
         stable = self._is_stable(start, after)
-        after[zero, :, 0] = np.cumsum(np.full(after.shape[1], self.scene.model.opt.timestep))  # added up as MuJoCo does
+        # Summed in MuJoCo's order.
+        after[zero, :, 0] = np.cumsum(np.full(after.shape[1], self.scene.model.opt.timestep))
         return after, sensors, stable
 
     def _is_stable(self, start: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """MuJoCo repeats the state of an unstable simulation, after a reset that sets its time back."""
+        """Whether the time always advances, as MuJoCo resets it at instability and then repeats the state."""
         time = np.concatenate([start[:, :1], after[:, :, 0]], axis=1)
         advances = (np.diff(time, axis=1) > 0.5 * self.scene.model.opt.timestep).all(axis=1)
         # Comparisons with NaN are false.
@@ -257,7 +228,7 @@ class Simulator:
     def _checked_physics(self, physics: Tensor | np.ndarray, *, finite: bool = True) -> np.ndarray:
         array = _as_array(physics, "physics")
         if array.dtype != np.float64:
-            raise TypeError(f"physics must be float64 (anything else would round it), got {array.dtype}")
+            raise TypeError(f"physics must be float64 to keep every digit, got {array.dtype}")
         if array.ndim < 1 or array.shape[-1] != self.scene.physics_size:
             raise ValueError(
                 f"physics of {self.scene.name!r} must be [*B, {self.scene.physics_size}], got {list(array.shape)}"
@@ -304,16 +275,12 @@ def _check_topology(scenes: tuple[Scene, ...]) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep MuJoCo from printing its warnings and from writing MUJOCO_LOG.TXT; a user's handler stays."""
+    """Keep MuJoCo from printing warnings and writing MUJOCO_LOG.TXT, unless the user has a handler."""
     if mujoco.get_mju_user_warning() is not None:
         yield
         return
-    mujoco.set_mju_user_warning(_ignore)
+    mujoco.set_mju_user_warning(lambda message: None)
     try:
         yield
     finally:
         mujoco.set_mju_user_warning(None)
-
-
-def _ignore(message: str) -> None:
-    pass

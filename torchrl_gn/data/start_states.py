@@ -1,4 +1,4 @@
-"""Where simulations start: the suite's reset distributions, vectorised."""
+"""Start states of simulations: the suite's reset distributions, vectorised."""
 
 from __future__ import annotations
 
@@ -13,34 +13,20 @@ _ATTEMPTS = 10
 
 
 def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) -> np.ndarray:
-    """Draw start states of a scene.
+    """Draw full MuJoCo states ``[n, S]``, float64 (``mjSTATE_FULLPHYSICS``), as the suite's resets do.
 
-    The paper's systems start as ``dm_control.suite`` resets them:
-
-    - Cartpole: slider uniform in 0.1 m, hinge in 0.034 rad either side, velocities of
-      standard deviation 0.01 (the suite's balance task).
+    - Cartpole: slider uniform in 0.1 m, hinge in 0.034 rad either side, velocities with standard deviation 0.01.
     - Cheetah: limited joints uniform in their limits.
-    - Any other scene, ``randomize_limited_and_rotational_joints``: limited hinges and
-      sliders uniform in their limits, unlimited hinges uniform in [-pi, pi], balls and the
-      rotation of free joints uniform (limited balls: a uniform axis, an angle uniform in
-      the limit); unlimited sliders, the position of free joints and velocities as in
-      ``qpos0`` and zero.
-    - JACO, with no counterpart in the suite, likewise, and drawn again where parts of the arm
-      would overlap (about 4 %): those never come apart and spin at over 100 rad/s.
+    - Others: limited hinges and sliders uniform in their limits, unlimited hinges in [-pi, pi], rotations of balls and
+      free joints uniform (limited balls: uniform axis, angle uniform in the limit); all else as in ``qpos0``, at rest.
+    - JACO, not in the suite: as others, redrawn while bodies overlap (4 %), which would spin at over 100 rad/s.
 
-    Then ``scene.settle_steps`` physics steps without control (Cheetah falls to the floor),
-    with the time set back to 0. States that become unstable in it are drawn again.
-
-    Args:
-        scene: the scene.
-        n: number of states.
-        rng: generator or seed; equal seeds give equal states.
-
-    Returns:
-        ``[n, S]`` float64 full MuJoCo states (``mjSTATE_FULLPHYSICS``).
+    Then simulates ``scene.settle_steps`` physics steps without control, keeps the time, and redraws unstable states.
+    ``rng`` is a generator or a seed.
 
     Raises:
-        UnstableSimulationError: states still fall unstable after ten draws.
+        ValueError: if ``n`` is negative.
+        UnstableSimulationError: if states are still unstable after ten draws.
     """
     if n < 0:
         raise ValueError(f"n must not be negative, got {n}")
@@ -50,13 +36,7 @@ def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) ->
 def draw_start_states(
     simulator: Simulator, variant: np.ndarray, rng: int | np.random.Generator
 ) -> tuple[np.ndarray, int]:
-    """As :func:`sample_start_states`, with the number of unstable states that were drawn again.
-
-    Args:
-        simulator: simulator of one or several scenes.
-        variant: ``[n]`` integers, which of its scenes each state is for.
-        rng: generator or seed.
-    """
+    """Draw start states ``[n, S]`` of scenes ``variant`` ``[n]``, and count the unstable ones that were redrawn."""
     rng, n, scene = np.random.default_rng(rng), len(variant), simulator.scene
     states = _draw_apart(simulator, variant, rng)
     if n == 0 or scene.settle_steps == 0:
@@ -72,12 +52,12 @@ def draw_start_states(
     raise UnstableSimulationError(
         f"{len(pending)} of {n} start states of {scene.name!r} became unstable within the "
         f"{scene.settle_steps} physics steps after a reset, {_ATTEMPTS} times in a row. "
-        "A smaller physics step or softer contacts in the model may help."
+        "Use a smaller physics step or softer contacts in the model."
     )
 
 
 def _draw_apart(simulator: Simulator, variant: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Start states; for JACO, without overlapping bodies."""
+    """Draw start states, for JACO without overlapping bodies."""
     states, scenes = _draw_each(simulator, variant, rng), simulator.scenes
     if simulator.scene.origin.get("system") != "jaco":
         return states
@@ -121,11 +101,10 @@ def _draw(scene: Scene, n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _randomize_joints(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Generator, *, rotational: bool) -> None:
-    """``dm_control.suite.utils.randomizers.randomize_limited_and_rotational_joints``, in place.
+    """Randomise in place as ``dm_control.suite.utils.randomizers.randomize_limited_and_rotational_joints``.
 
-    Free joints get uniform rotations, where the suite draws their quaternions from the
-    positive orthant and calls that a mistake it keeps. ``rotational=False`` leaves out
-    unlimited joints, as Cheetah's reset does.
+    ``rotational=False`` keeps unlimited joints, as Cheetah's reset does. Unlike in the suite, whose quaternions are
+    from the positive orthant, rotations of free joints are uniform.
     """
     kind = mujoco.mjtJoint
     n = len(qpos)

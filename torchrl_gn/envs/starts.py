@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.data.generator import numpy_generator
+from torchrl_gn.data.controls import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.kinematic_tree import KinematicTree

@@ -14,8 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
-from torchrl_gn.data.controls import spline_controls
-from torchrl_gn.data.generator import numpy_generator
+from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.dynamics import Predictor
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.networks.frozen_weights import frozen

@@ -13,8 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
-from torchrl_gn.data.controls import spline_controls
-from torchrl_gn.data.generator import numpy_generator
+from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.ilqg_solver import ILQGSolver

@@ -1,4 +1,4 @@
-"""From an MJCF model to a scene: compile, add the frame sensors, read the graph."""
+"""Build a scene from an MJCF model: compile it with frame sensors, read its graph."""
 
 from __future__ import annotations
 
@@ -33,25 +33,19 @@ def build_scene(
 ) -> Scene:
     """Read a scene from an MJCF model.
 
-    Changes made to (a copy of) the model: frame sensors of every node are added
-    last, unnamed bodies that carry them are named, warm starts and sleeping are
-    switched off so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone,
-    and sensors are switched on. Contacts, equality constraints and passive tendons
-    have no edge: they act within the physics and a model learns them through nodes
-    and globals.
+    Works on a copy of the model: adds the frame sensors of every node last, names their unnamed bodies, switches
+    sensors on, and warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone.
 
     Args:
         spec: the MJCF model, left as it is.
-        name: the scene's name.
-        timestep: control step, seconds, a multiple of the physics step; None is one
-            physics step.
+        name: name of the scene.
+        timestep: control step, seconds, a multiple of the physics step; None: one physics step.
         settle_steps: physics steps without control after a reset.
-        origin: what :meth:`Scene.description` tells about where the model came from.
+        origin: source of the model, part of :meth:`Scene.description`.
 
     Raises:
-        SceneError: if MuJoCo cannot compile the model, a number in it is NaN or infinite, or ``timestep`` does
-            not fit it.
-        UnsupportedSceneError: if the graph cannot represent an element, which it names.
+        SceneError: if MuJoCo cannot compile the model, a number in it is not finite, or ``timestep`` does not fit.
+        UnsupportedSceneError: if the graph cannot represent an element, which the message names.
     """
     model, graph = _compile(spec, name)
     actuator_of_joint = _actuator_of_joint(model)
@@ -110,7 +104,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     except ValueError as error:
         raise SceneError(f"MuJoCo cannot compile scene {name!r}: {error}") from error
     if model.njnt == 0:
-        raise SceneError(f"Scene {name!r} has no joint: nothing in it can move.")
+        raise SceneError(f"Scene {name!r} has no joint, so nothing can move. Add one.")
     return model, graph
 
 
@@ -122,7 +116,7 @@ def _namer(model: mujoco.MjModel):
 
 
 def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
-    """``[J]`` actuator of each joint, -1 without; refuses what an edge cannot carry."""
+    """Return the actuator ``[J]`` of each joint, -1 without; refuse actuators that an edge cannot represent."""
     named = _namer(model)
     transmission = mujoco.mjtTrn
     actuators = np.full(model.njnt, -1, dtype=np.int64)
@@ -135,16 +129,16 @@ def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
         if kind not in (transmission.mjTRN_JOINT, transmission.mjTRN_JOINTINPARENT):
             what = kind.name.removeprefix("mjTRN_").lower()
             raise UnsupportedSceneError(
-                f"{label} acts through a {what}, but an action enters the graph at one joint's "
-                "edges. Give it a joint transmission or remove it."
+                f"{label} acts through a {what}, but an action must act on one joint."
+                " Give it a joint transmission or remove it."
             )
         joint = int(model.actuator_trnid[motor, 0])
         if controls[motor] != 1:
-            raise UnsupportedSceneError(f"{label} has {controls[motor]} controls; an edge carries one.")
+            raise UnsupportedSceneError(f"{label} has {controls[motor]} controls; an edge takes one.")
         if model.actuator_dyntype[motor] != mujoco.mjtDyn.mjDYN_NONE or delays[motor] > 0:
             raise UnsupportedSceneError(
-                f"{label} has activation dynamics or a delay, a hidden state that body frames do "
-                "not show. Use an actuator without (dyntype none)."
+                f"{label} has activation dynamics or a delay, a state that body states do not"
+                " show. Use dyntype none and no delay."
             )
         if not model.actuator_ctrllimited[motor]:
             raise UnsupportedSceneError(f"{label} has no bounds. Give it a ctrlrange (and ctrllimited).")
@@ -152,12 +146,12 @@ def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
             other = named(mujoco.mjtObj.mjOBJ_ACTUATOR, int(actuators[joint]))
             raise UnsupportedSceneError(
                 f"{label} and actuator {other!r} drive the same joint "
-                f"{named(mujoco.mjtObj.mjOBJ_JOINT, joint)!r}; an edge carries one action. Remove one."
+                f"{named(mujoco.mjtObj.mjOBJ_JOINT, joint)!r}; an edge takes one action. Remove one."
             )
         actuators[joint] = motor
     if model.npluginstate:
         raise UnsupportedSceneError(
-            f"Plugin {named(mujoco.mjtObj.mjOBJ_PLUGIN, 0)!r} keeps a hidden state that body frames do not show."
+            f"Plugin {named(mujoco.mjtObj.mjOBJ_PLUGIN, 0)!r} has a state that body states do not show. Remove it."
         )
     return actuators
 
@@ -165,7 +159,7 @@ def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
 def _refuse_non_finite(
     static: StaticGraph, name: str, node_names: tuple[str, ...], joint_names: tuple[str, ...]
 ) -> None:
-    """MuJoCo compiles NaN and infinity (damping="nan") and only prints a warning."""
+    """Raise for NaN and infinity (damping="nan"), which MuJoCo compiles with only a warning."""
     parts = (
         (static.nodes, static.node_names, [f"body {node!r}" for node in node_names]),
         (static.edges, static.edge_names, [f"joint {joint!r}" for joint in joint_names for _ in range(2)]),

@@ -1,4 +1,4 @@
-"""Where bodies can touch a plane that is fixed in the world."""
+"""Contact points: where bodies can touch a plane fixed in the world."""
 
 from __future__ import annotations
 
@@ -19,38 +19,29 @@ if TYPE_CHECKING:
 _GEOM = mujoco.mjtGeom
 
 SLOTS = 4
-"""Points of a body that a model is shown, the farthest out if it has more."""
+"""Contact points per node that models see: the ones farthest from the node's origin."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactPoints:
-    """Centres of spheres whose lowest point a body touches the plane with, by node.
+    """Spheres whose lowest points can touch the plane."""
 
-    Attributes:
-        node: ``[C]`` node that each point is fixed to.
-        offset: ``[C, 3]`` the sphere's centre in the node's frame, metres.
-        radius: ``[C]`` metres; 0 for a corner.
-        normal: ``[3]`` the plane's normal, in the world's frame.
-        origin: ``[3]`` a point on the plane, metres.
-    """
-
-    node: np.ndarray
-    offset: np.ndarray
-    radius: np.ndarray
-    normal: np.ndarray
-    origin: np.ndarray
+    node: np.ndarray  # [C] node of each point
+    offset: np.ndarray  # [C, 3] centre of the sphere in the node's frame, metres
+    radius: np.ndarray  # [C] metres; 0 for a corner
+    normal: np.ndarray  # [3] normal of the plane, world frame
+    origin: np.ndarray  # [3] a point on the plane, metres
 
 
 def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> ContactPoints | None:
-    """The points that can touch a scene's plane; None without a plane, or if nothing can touch it.
+    """Find the points that can touch a scene's first reachable plane; None if there are none.
 
-    Spheres, ends of capsules, corners of boxes and ends of an ellipsoid's axes; of cylinders and meshes
-    nothing is known. With several planes the first that can be touched is taken.
+    Takes spheres, ends of capsules, corners of boxes and ends of ellipsoid axes; cylinders and meshes give no points.
 
     Args:
-        model: the scene's model.
+        model: compiled model.
         data: of that model at its reference, kinematics done.
-        graph: its topology.
+        graph: topology of the model.
     """
     of_geom = graph.node_of_body[model.geom_bodyid]
     for plane in np.flatnonzero((model.geom_type == _GEOM.mjGEOM_PLANE) & (of_geom == 0)):
@@ -74,13 +65,13 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
 
 
 def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """Centres and radii in the geom's frame."""
+    """Return centres and radii in the geom's frame."""
     if kind == _GEOM.mjGEOM_SPHERE:
         return [(np.zeros(3), float(size[0]))]
     if kind == _GEOM.mjGEOM_CAPSULE:
         return [(np.array([0.0, 0.0, sign * size[1]]), float(size[0])) for sign in (1, -1)]
     if kind == _GEOM.mjGEOM_BOX:
-        # A tetrahedron first: of corners equally far out those are shown, and one face would hide the others.
+        # A tetrahedron first: with only SLOTS equally far corners kept, those of one face would hide the others.
         corners = sorted(itertools.product((1, -1), repeat=3), key=math.prod, reverse=True)
         return [(np.array(signs) * size, 0.0) for signs in corners]
     if kind == _GEOM.mjGEOM_ELLIPSOID:
@@ -89,7 +80,7 @@ def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
 
 
 def contact_slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Offsets ``[N, 4, 3]``, radii ``[N, 4]`` and which of them are there ``[N, 4]``."""
+    """Return the kept points as offsets ``[N, 4, 3]``, radii ``[N, 4]`` and mask ``[N, 4]``."""
     offset, radius = np.zeros((scene.num_nodes, SLOTS, 3)), np.zeros((scene.num_nodes, SLOTS))
     mask, points = np.zeros((scene.num_nodes, SLOTS), dtype=bool), scene.contact_points
     if points is None:
@@ -97,7 +88,7 @@ def contact_slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for node in np.unique(points.node):
         here = np.flatnonzero(points.node == node)
         reach = np.linalg.norm(points.offset[here], axis=1) + points.radius[here]
-        # Rounded: points equally far out keep their order in every variant of a scene.
+        # Rounded, so that equally far points keep their order in every variant of a scene.
         chosen = here[np.argsort(-reach.round(9), kind="stable")[:SLOTS]]
         offset[node, : len(chosen)] = points.offset[chosen]
         radius[node, : len(chosen)] = points.radius[chosen]

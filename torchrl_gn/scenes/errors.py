@@ -1,15 +1,15 @@
-"""Errors of the scenes part."""
+"""Errors and warnings of scenes."""
 
 from __future__ import annotations
 
 
 class SceneError(ValueError):
-    """A model cannot be read as a scene; the message names the element and what to do."""
+    """A model cannot be read as a scene."""
 
 
 class UnsupportedSceneError(SceneError):
-    """The model is valid MuJoCo but holds something that the graph cannot represent."""
+    """The graph cannot represent an element of a valid MuJoCo model."""
 
 
 class SceneChangedWarning(UserWarning):
-    """A scene rebuilt from its description has other physics than when it was described."""
+    """A scene rebuilt from its description has other physics than the original."""

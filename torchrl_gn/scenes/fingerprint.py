@@ -1,9 +1,7 @@
-"""What a scene's motion depends on, as text that is equal wherever the scene is compiled.
+"""Fingerprint of a scene: a hash of the physical quantities its motion depends on.
 
-Read from an explicit list of physical arrays of the MuJoCo model, not from the static features, so that a new feature
-changes nothing here. Left out: what is seen only (colours, cameras, lights, materials, geoms that touch nothing),
-sensors, keyframes, and what MuJoCo derives from the rest. Elements go by name. Quantities that are zero are not
-written, so that one listed here later leaves the fingerprints of models without it as they are.
+Reads an explicit list of MuJoCo arrays, by names of elements. Leaves out visuals, sensors, keyframes and derived
+quantities. Zero quantities give no text, so that one listed later keeps the fingerprints of models without it.
 """
 
 from __future__ import annotations
@@ -28,10 +26,10 @@ _OPTIONS = (
     *("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations", "sdf_initpoints"),
 )
 _OVERRIDES = ("o_margin", "o_solref", "o_solimp", "o_friction")
-_UNSEEN_FLAGS = {"mjDSBL_SENSOR", "mjENBL_ENERGY", "mjENBL_FWDINV"}  # they change what is reported, not what moves
+_REPORTING_FLAGS = {"mjDSBL_SENSOR", "mjENBL_ENERGY", "mjENBL_FWDINV"}  # no effect on motion
 _JOINTS = ("stiffness", "stiffnesspoly", "margin", "solref", "solimp", "actgravcomp")
 _DOFS = ("damping", "dampingpoly", "armature", "frictionloss", "solref", "solimp")
-_ACTUATORS = (*("gear", "gainprm", "biasprm", "ctrlrange", "armature", "damping", "dampingpoly"),)
+_ACTUATORS = ("gear", "gainprm", "biasprm", "ctrlrange", "armature", "damping", "dampingpoly")
 _CONTACTS = ("friction", "solref", "solimp", "solmix", "margin", "gap", "condim", "priority", "contype", "conaffinity")
 _GEOMS = (*_CONTACTS, "adhesion", "surfacevel", "fluid")
 _PAIRS = ("friction", "solref", "solreffriction", "solimp", "margin", "gap", "dim", "adhesion")
@@ -46,18 +44,16 @@ _FLEXES = (
 
 
 def fingerprint(scene: Scene) -> str:
-    """Hash of :func:`physics`: equal physics, equal hash."""
+    """Return the hash of :func:`physics`."""
     return hashlib.sha256("\n".join(physics(scene)).encode()).hexdigest()[:16]
 
 
 def physics(scene: Scene) -> list[str]:
-    """One line for every element and quantity, numbers to six significant digits."""
+    """List every element and quantity, one a line, numbers to six significant digits."""
     model, graph = scene.model, topology(scene.model)
     names = _Names(scene, graph)
     return [
-        *scene.node_names,
-        *scene.joint_names,
-        *scene.actuator_names,
+        *(*scene.node_names, *scene.joint_names, *scene.actuator_names),
         f"substeps {scene.substeps}",
         *_line("bounds", _digits([*scene.action_low, *scene.action_high])),
         *_options(model),
@@ -67,7 +63,7 @@ def physics(scene: Scene) -> list[str]:
         *_geoms(model, names),
         *_tendons(model, names),
         *_equalities(model, names),
-        *_others(model),
+        *_flexes_and_plugins(model),
     ]
 
 
@@ -75,13 +71,13 @@ def _options(model: mujoco.MjModel) -> Iterable[str]:
     option = model.opt
     for name in _OPTIONS:
         yield from _line(name, _digits(_field(option, name)))
-    yield from (mujoco.mjtIntegrator(option.integrator).name, mujoco.mjtCone(option.cone).name)
-    yield mujoco.mjtSolver(option.solver).name
+    kinds = (mujoco.mjtIntegrator(option.integrator), mujoco.mjtCone(option.cone), mujoco.mjtSolver(option.solver))
+    yield from (kind.name for kind in kinds)
     flags = [
         key
         for kind, value in ((mujoco.mjtDisableBit, option.disableflags), (mujoco.mjtEnableBit, option.enableflags))
         for key, bit in kind.__members__.items()
-        if value & int(bit) and not key.startswith("mjN") and key not in _UNSEEN_FLAGS
+        if value & int(bit) and not key.startswith("mjN") and key not in _REPORTING_FLAGS
     ]
     yield from flags
     if "mjENBL_OVERRIDE" in flags:
@@ -93,15 +89,15 @@ def _bodies(model: mujoco.MjModel, graph: Topology, names: _Names) -> Iterable[s
     for node, root in enumerate(graph.body[1:], 1):
         parent = int(graph.parent[node])
         pos, quat = offset(model, int(root), int(graph.body[parent]))
-        yield from _line(f"node {names.nodes[node]} on {names.nodes[parent]}", _places([*pos, *_matrix(quat)]))
+        yield from _line(f"node {names.nodes[node]} on {names.nodes[parent]}", _clean_digits([*pos, *_matrix(quat)]))
         for body in np.flatnonzero((graph.node_of_body == node) & (model.body_mass > 0)):
-            # Not ipos and iquat: principal axes of a round body are rounding noise.
+            # Rotated inertia, as the principal axes of a round body are rounding noise.
             pos, rotation = names.pose(int(body), model.body_ipos[body], model.body_iquat[body])
             inertia = rotation @ np.diag(model.body_inertia[body]) @ rotation.T
             of = f"body of {names.nodes[node]}"
             yield from _line(f"{of} mass", _digits(model.body_mass[body]))
-            yield from _line(f"{of} center", _places(pos))
-            yield from _line(f"{of} inertia", _places(inertia, np.abs(inertia).max()))
+            yield from _line(f"{of} center", _clean_digits(pos))
+            yield from _line(f"{of} inertia", _clean_digits(inertia, np.abs(inertia).max()))
             yield from _line(f"{of} gravcomp", _digits(model.body_gravcomp[body]))
 
 
@@ -111,12 +107,12 @@ def _joints(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
         of, dof, qpos = f"joint {label}", int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
         yield f"{of} {kind.name} {names.body(int(model.jnt_bodyid[joint]))}"
         dofs, numbers = {_JOINT.mjJNT_FREE: (6, 7), _JOINT.mjJNT_BALL: (3, 4)}.get(kind, (1, 1))
-        yield from _line(f"{of} axis", _places(model.jnt_axis[joint]))
-        yield from _line(f"{of} pos", _places(model.jnt_pos[joint]))
+        yield from _line(f"{of} axis", _clean_digits(model.jnt_axis[joint]))
+        yield from _line(f"{of} pos", _clean_digits(model.jnt_pos[joint]))
         if numbers == 1:
-            yield from _line(f"{of} reference", _places(model.qpos0[qpos]))
+            yield from _line(f"{of} reference", _clean_digits(model.qpos0[qpos]))
         if np.any(model.jnt_stiffness[joint]) or np.any(_field(model, "jnt_stiffnesspoly", joint)):
-            yield from _line(f"{of} spring", _places(model.qpos_spring[qpos : qpos + numbers]))
+            yield from _line(f"{of} spring", _clean_digits(model.qpos_spring[qpos : qpos + numbers]))
         yield from _arrays(of, model, "jnt", joint, _JOINTS)
         yield from _arrays(f"{of} freedom", model, "dof", slice(dof, dof + dofs), _DOFS)
         yield from _limits(of, model, "jnt", joint, ("range", "limited"), ("actfrcrange", "actfrclimited"))
@@ -136,9 +132,9 @@ def _actuators(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
 
 
 def _geoms(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
-    """Geoms that can touch others or that a fluid acts on, explicit pairs of them, and pairs of bodies left out."""
-    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    for geom in np.flatnonzero(touching | (model.geom_fluid[:, 0] > 0)):
+    """List geoms that can collide or feel a fluid, explicit contact pairs, and excluded pairs of bodies."""
+    colliding = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    for geom in np.flatnonzero(colliding | (model.geom_fluid[:, 0] > 0)):
         yield from _geom(model, int(geom), names)
     for pair in range(model.npair):
         for geom in (int(model.pair_geom1[pair]), int(model.pair_geom2[pair])):
@@ -156,30 +152,26 @@ def _geom(model: mujoco.MjModel, geom: int, names: _Names) -> Iterable[str]:
     if kind in (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_SDF):
         yield from _mesh(of, model, int(model.geom_dataid[geom]), pos, rotation)
     else:
-        yield from _line(f"{of} pose", _places([*pos, *rotation.flat]))
-        if kind != _GEOM.mjGEOM_PLANE:  # how far it is drawn
+        yield from _line(f"{of} pose", _clean_digits([*pos, *rotation.flat]))
+        if kind != _GEOM.mjGEOM_PLANE:  # its size is only drawn
             yield from _line(f"{of} size", _digits(model.geom_size[geom]))
     if kind == _GEOM.mjGEOM_HFIELD:
         field = int(model.geom_dataid[geom])
         yield from _line(f"{of} extent", _digits(model.hfield_size[field]))
         start, shape = int(model.hfield_adr[field]), (int(model.hfield_nrow[field]), int(model.hfield_ncol[field]))
         heights = model.hfield_data[start : start + shape[0] * shape[1]]
-        # Heights are single precision.
-        yield f"{of} heights {shape} " + hashlib.sha256(heights.round(4).tobytes()).hexdigest()[:16]
+        yield f"{of} heights {shape} " + hashlib.sha256(heights.round(4).tobytes()).hexdigest()[:16]  # single precision
     yield from _arrays(of, model, "geom", geom, _GEOMS)
 
 
 def _mesh(of: str, model: mujoco.MjModel, mesh: int, pos: np.ndarray, rotation: np.ndarray) -> Iterable[str]:
-    """Moments of a mesh's corners, in the node's frame.
-
-    MuJoCo turns a mesh to its principal axes, which may be rounding noise, and keeps single precision.
-    """
+    """List moments of a mesh's vertices in the node's frame; the mesh's own principal axes may be rounding noise."""
     start = int(model.mesh_vertadr[mesh])
-    corners = model.mesh_vert[start : start + int(model.mesh_vertnum[mesh])].astype(np.float64) @ rotation.T + pos
-    center = corners.mean(0)
-    spread = (corners - center).T @ (corners - center) / len(corners)
-    size = np.sqrt(np.trace(spread))
-    shape = np.concatenate((center / size, spread.ravel() / size**2)).round(4) + 0.0
+    vertices = model.mesh_vert[start : start + int(model.mesh_vertnum[mesh])].astype(np.float64) @ rotation.T + pos
+    center = vertices.mean(0)
+    covariance = (vertices - center).T @ (vertices - center) / len(vertices)
+    size = np.sqrt(np.trace(covariance))
+    shape = np.concatenate((center / size, covariance.ravel() / size**2)).round(4) + 0.0
     yield from _line(f"{of} mesh", [f"{size:.4g}", *(f"{value:.4f}" for value in shape)])
 
 
@@ -192,12 +184,12 @@ def _tendons(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
             around = (_WRAP.mjWRAP_SPHERE, _WRAP.mjWRAP_CYLINDER)
             yield f"{of} {kind.name}"
             yield from names.element(_OBJECT.mjOBJ_GEOM if kind in around else objects.get(kind), at)
-            if kind in around:  # which side, a site
+            if kind in around:  # the site that selects the side
                 yield from names.element(_OBJECT.mjOBJ_SITE, int(model.wrap_prm[wrap]))
             else:
                 yield from _line(f"{of} factor", _digits(model.wrap_prm[wrap]))
         if np.any(model.tendon_stiffness[tendon]) or np.any(_field(model, "tendon_stiffnesspoly", tendon)):
-            yield from _line(f"{of} spring", _places(model.tendon_lengthspring[tendon]))
+            yield from _line(f"{of} spring", _clean_digits(model.tendon_lengthspring[tendon]))
         yield from _arrays(of, model, "tendon", tendon, _TENDONS)
         yield from _limits(of, model, "tendon", tendon, ("range", "limited"), ("actfrcrange", "actfrclimited"))
 
@@ -208,23 +200,22 @@ def _equalities(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
         yield f"{of} {'on' if model.eq_active0[equality] else 'off'}"
         for at in (int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])):
             yield from names.element(_OBJECT(model.eq_objtype[equality]), at)
-        yield from _line(f"{of} data", _places(model.eq_data[equality]))
+        yield from _line(f"{of} data", _clean_digits(model.eq_data[equality]))
         yield from _arrays(of, model, "eq", equality, ("solref", "solimp"))
 
 
-def _others(model: mujoco.MjModel) -> Iterable[str]:
-    """Soft bodies and plugins."""
+def _flexes_and_plugins(model: mujoco.MjModel) -> Iterable[str]:
     for flex in range(model.nflex):
         yield from _arrays("flex", model, "flex", flex, _FLEXES)
     for name in ("elem", "stiffness", "bending"):
         values = getattr(model, f"flex_{name}").astype(np.float64)
-        yield from _line(f"flex {name}", _places(values, np.abs(values).max(initial=0.0)))
+        yield from _line(f"flex {name}", _clean_digits(values, np.abs(values).max(initial=0.0)))
     if model.nplugin:
         yield "plugins " + bytes(model.plugin_attr).decode(errors="replace")
 
 
 class _Names:
-    """Names of a scene's elements, and where they are in the frame of their node."""
+    """Names of a scene's elements, and their poses in the frame of their node."""
 
     def __init__(self, scene: Scene, graph: Topology) -> None:
         self.model, self.graph = scene.model, graph
@@ -234,17 +225,17 @@ class _Names:
         return mujoco.mj_id2name(self.model, kind, element) or ""
 
     def body(self, body: int) -> str:
-        """The node that carries a body."""
+        """Return the name of a body's node."""
         return self.nodes[int(self.graph.node_of_body[body])]
 
     def pose(self, body: int, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Position ``[3]`` and rotation matrix ``[3, 3]`` in the node's frame of what is fixed to a body."""
-        at, turned = offset(self.model, body, int(self.graph.body[self.graph.node_of_body[body]]))
-        frame = _matrix(turned).reshape(3, 3)
-        return at + frame @ pos, frame @ _matrix(quat).reshape(3, 3)
+        """Return position ``[3]`` and rotation ``[3, 3]`` in the node's frame of an element fixed to a body."""
+        origin, orientation = offset(self.model, body, int(self.graph.body[self.graph.node_of_body[body]]))
+        frame = _matrix(orientation).reshape(3, 3)
+        return origin + frame @ pos, frame @ _matrix(quat).reshape(3, 3)
 
     def element(self, kind: mujoco.mjtObj | None, element: int) -> Iterable[str]:
-        """What a tendon or a constraint acts on."""
+        """List the element that a tendon or constraint acts on."""
         model = self.model
         if kind is None or element < 0:
             return
@@ -253,10 +244,10 @@ class _Names:
         elif kind == _OBJECT.mjOBJ_SITE:
             body = int(model.site_bodyid[element])
             pos, rotation = self.pose(body, model.site_pos[element], model.site_quat[element])
-            yield from _line(f"site of {self.body(body)}", _places([*pos, *rotation.flat]))
+            yield from _line(f"site of {self.body(body)}", _clean_digits([*pos, *rotation.flat]))
         elif kind == _OBJECT.mjOBJ_BODY:
             pos, rotation = self.pose(element, np.zeros(3), np.array([1.0, 0, 0, 0]))
-            yield from _line(f"body of {self.body(element)}", _places([*pos, *rotation.flat]))
+            yield from _line(f"body of {self.body(element)}", _clean_digits([*pos, *rotation.flat]))
         elif kind == _OBJECT.mjOBJ_JOINT:
             yield f"joint {self.joints[element]}"
         else:
@@ -269,13 +260,13 @@ def _arrays(of: str, model: mujoco.MjModel, prefix: str, index: int | slice, nam
 
 
 def _field(owner: mujoco.MjModel | mujoco.MjOption, name: str, index: int | slice | None = None) -> Any:
-    """A field, or zero where this version of MuJoCo has no such quantity yet."""
+    """Return a field, or zero if this version of MuJoCo lacks it."""
     values = getattr(owner, name, None)
     return 0.0 if values is None else values if index is None else values[index]
 
 
 def _limits(of: str, model: mujoco.MjModel, prefix: str, index: int, *limits: tuple[str, str]) -> Iterable[str]:
-    """Ranges that are in force."""
+    """List the ranges that are in force."""
     for name, flag in limits:
         if getattr(model, f"{prefix}_{flag}")[index]:
             yield f"{of} {flag}"
@@ -283,7 +274,7 @@ def _limits(of: str, model: mujoco.MjModel, prefix: str, index: int, *limits: tu
 
 
 def _line(what: str, numbers: list[str]) -> Iterable[str]:
-    """Nothing of zeros; without those at the end, whose number is the version of MuJoCo's."""
+    """Join numbers without trailing zeros, whose count depends on MuJoCo's version; nothing if all are zero."""
     while numbers and numbers[-1] == "0":
         numbers.pop()
     if numbers:
@@ -291,20 +282,19 @@ def _line(what: str, numbers: list[str]) -> Iterable[str]:
 
 
 def _digits(values) -> list[str]:
-    """Six significant digits; no -0."""
-    # The factor moves what decimal numbers give, such as 0.001234375, off the border between two roundings, where
-    # compilers would decide.
+    """Round to six significant digits; no -0."""
+    # The factor moves decimals such as 0.001234375 off the border of two roundings, where compilers differ.
     return [f"{value:.6g}" for value in np.asarray(values, dtype=np.float64).ravel() * (1 + 1.4142e-7) + 0.0]
 
 
-def _places(values, scale: float = 1.0) -> list[str]:
-    """As :func:`_digits` of lengths, angles and other differences, of which 1e-9 of their scale is rounding noise."""
+def _clean_digits(values, scale: float = 1.0) -> list[str]:
+    """As :func:`_digits`, with magnitudes below 1e-9 of ``scale``, rounding noise, set to zero."""
     values = np.asarray(values, dtype=np.float64)
     return _digits(np.where(np.abs(values) < 1e-9 * scale, 0.0, values))
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:
-    """``[9]``; unlike a quaternion without a sign of its own."""
+    """Return the rotation matrix ``[9]``, which unlike the quaternion has no ambiguous sign."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quat)
     return matrix

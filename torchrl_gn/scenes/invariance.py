@@ -1,8 +1,6 @@
-"""World axes along which a whole scene can be shifted without changing its dynamics."""
+"""Translation invariance: world axes along which a scene can shift without changing its dynamics."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -14,20 +12,16 @@ _Disable = mujoco.mjtDisableBit
 
 
 def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> np.ndarray:
-    """Axes along which the dynamics do not depend on where the scene is.
+    """Return the axes along which the dynamics do not depend on where the scene is.
 
-    An axis counts if every tree that hangs from the world can move along it by
-    its slide or free joints alone; if those joints have no limit, spring or
-    actuator that feels position; and if nothing fixed in the world is felt:
-    contact only with planes parallel to the axis, no equality constraint or
-    tendon tied to the world or to those joints. What cannot be judged (plugins,
-    flexes) counts as not invariant. Gravity, wind and fluid drag are the same
-    everywhere.
+    Along such an axis, slide or free joints without limit, spring or position actuator move every root, contacts with
+    fixed geoms are with parallel planes alone, and no equality constraint or tendon acts on the world or those joints.
+    Scenes with plugins or flexes count as not invariant.
 
     Args:
-        model: the scene's model.
+        model: compiled model.
         data: of that model at its reference, kinematics done.
-        graph: its topology.
+        graph: topology of the model.
 
     Returns:
         ``[3]`` bool.
@@ -38,21 +32,21 @@ def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Top
 def _invariant_along(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
     if model.nplugin or model.nflex:
         return False
-    shifted: set[int] = set()  # joints that carry the shift
+    shifted: set[int] = set()  # joints whose displacement shifts the scene
     for node in np.flatnonzero(graph.parent == 0):
         joints = _joints_along(model, int(graph.body[node]), axis)
         if joints is None:
             return False
         shifted.update(joints)
     return (
-        not any(feels_position(model, joint) for joint in shifted)
-        and not touches_world(model, data, graph, axis)
-        and not any(tied(model, graph, shifted))
+        not any(depends_on_position(model, joint) for joint in shifted)
+        and not collides_with_world(model, data, graph, axis)
+        and not acts_on_position(model, graph, shifted)
     )
 
 
 def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[int] | None:
-    """Joints of a root body whose displacement shifts it along ``axis``; None if it cannot."""
+    """Return the joints that shift a root body along ``axis``; None if it cannot move along it."""
     slides, directions = [], []
     frame = reference_rotation(model, body)
     first = model.body_jntadr[body]
@@ -61,7 +55,7 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             return [joint]
         if kind != mujoco.mjtJoint.mjJNT_SLIDE:
-            break  # the axes of later slides turn with this joint
+            break  # this joint rotates the axes of later slides
         slides.append(joint)
         directions.append(frame @ model.jnt_axis[joint])
     if not slides:
@@ -74,7 +68,7 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
 
 
 def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
-    """``[3, 3]`` world orientation of a body that only fixed bodies carry."""
+    """Return the world orientation ``[3, 3]`` at the reference of a body below fixed bodies."""
     rotation = np.eye(3)
     while body:
         matrix = np.empty(9)
@@ -84,9 +78,9 @@ def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
     return rotation
 
 
-def feels_position(model: mujoco.MjModel, joint: int) -> bool:
+def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
     """Whether a limit, spring or actuator of a joint depends on the joint's position."""
-    stiffness = [model.jnt_stiffness, getattr(model, "jnt_stiffnesspoly", None)]  # MuJoCo before 3.7 has no polynomials
+    stiffness = [model.jnt_stiffness, getattr(model, "jnt_stiffnesspoly", None)]  # since MuJoCo 3.7
     if model.jnt_limited[joint] or any(np.any(table[joint]) for table in stiffness if table is not None):
         return True
     gains, biases = mujoco.mjtGain, mujoco.mjtBias
@@ -104,23 +98,23 @@ def feels_position(model: mujoco.MjModel, joint: int) -> bool:
     return False
 
 
-def touches_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray | None) -> bool:
-    """Whether a moving geom can collide with a fixed one, planes parallel to ``axis`` apart."""
+def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray | None) -> bool:
+    """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis``."""
     if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
         return False
     fixed = graph.node_of_body[model.geom_bodyid] == 0
-    for still in np.flatnonzero(fixed):
-        normal = data.geom_xmat[still].reshape(3, 3)[:, 2]
-        plane = model.geom_type[still] == mujoco.mjtGeom.mjGEOM_PLANE
+    for other in np.flatnonzero(fixed):
+        normal = data.geom_xmat[other].reshape(3, 3)[:, 2]
+        plane = model.geom_type[other] == mujoco.mjtGeom.mjGEOM_PLANE
         if plane and axis is not None and abs(normal @ axis) < _TOLERANCE:
             continue
-        if any(can_collide(model, int(still), int(moving)) for moving in np.flatnonzero(~fixed)):
+        if any(can_collide(model, int(other), int(moving)) for moving in np.flatnonzero(~fixed)):
             return True
     return False
 
 
 def can_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
-    """Whether two geoms' masks, or an explicit pair, let them touch."""
+    """Whether two geoms' masks, or an explicit pair, let them collide."""
     if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
         return False
     pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
@@ -131,31 +125,32 @@ def can_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
     )
 
 
-def tied(model: mujoco.MjModel, graph: Topology, shifted: set[int]) -> Iterator[bool]:
-    """For every equality constraint and tendon, whether it ties the scene to a place."""
-    if not model.opt.disableflags & (_Disable.mjDSBL_EQUALITY | _Disable.mjDSBL_CONSTRAINT):
-        for equality in range(model.neq):
-            yield _equality_ties(model, graph, equality, shifted)
+def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -> bool:
+    """Whether an equality constraint or tendon acts on the world or on one of ``joints``."""
+    constrained = not model.opt.disableflags & (_Disable.mjDSBL_EQUALITY | _Disable.mjDSBL_CONSTRAINT)
+    if constrained and any(_equality_acts(model, graph, equality, joints) for equality in range(model.neq)):
+        return True
     fixed_site = graph.node_of_body[model.site_bodyid] == 0
     fixed_geom = graph.node_of_body[model.geom_bodyid] == 0
     wrap = mujoco.mjtWrap
     for code, element in zip(model.wrap_type, model.wrap_objid, strict=True):
-        kind = wrap(code)
-        if kind == wrap.mjWRAP_JOINT:
-            yield int(element) in shifted
-        elif kind == wrap.mjWRAP_SITE:
-            yield bool(fixed_site[element])
-        elif kind in (wrap.mjWRAP_SPHERE, wrap.mjWRAP_CYLINDER):
-            yield bool(fixed_geom[element])
+        match wrap(code):
+            case wrap.mjWRAP_JOINT if int(element) in joints:
+                return True
+            case wrap.mjWRAP_SITE if fixed_site[element]:
+                return True
+            case wrap.mjWRAP_SPHERE | wrap.mjWRAP_CYLINDER if fixed_geom[element]:
+                return True
+    return False
 
 
-def _equality_ties(model: mujoco.MjModel, graph: Topology, equality: int, shifted: set[int]) -> bool:
+def _equality_acts(model: mujoco.MjModel, graph: Topology, equality: int, joints: set[int]) -> bool:
     kind = mujoco.mjtEq(model.eq_type[equality])
     ends = (int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality]))
     if kind == mujoco.mjtEq.mjEQ_JOINT:
-        return any(end in shifted for end in ends)
+        return any(end in joints for end in ends)
     if kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
         sites = model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE
         bodies = [int(model.site_bodyid[end]) if sites else end for end in ends]
         return any(graph.node_of_body[body] == 0 for body in bodies)
-    return kind != mujoco.mjtEq.mjEQ_TENDON  # a tendon's ends are judged with the tendon
+    return kind != mujoco.mjtEq.mjEQ_TENDON  # a tendon's ends are checked with the tendon

@@ -1,4 +1,4 @@
-"""Which body carries each joint's axis."""
+"""Joint axes: which body each is fixed to."""
 
 from __future__ import annotations
 
@@ -9,33 +9,25 @@ from torchrl_gn.scenes.scene import Scene
 
 
 def joint_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Node that each joint's axis is fixed to, and the axis in that node's frame.
+    """Return the node ``[J]`` that each joint's axis is fixed to, and the unit axis ``[J, 3]`` in its frame.
 
-    An axis is fixed to the parent if no rotation precedes the joint on its body, and else to
-    the child (exactly if no rotation follows it either: a body with three hinges has a
-    middle axis that neither carries, and the child is taken). A ball's axis, and a free
-    joint's, has no meaning; theirs is zero.
-
-    Args:
-        scene: the scene, ``J`` joints.
-
-    Returns:
-        ``[J]`` nodes and ``[J, 3]`` unit axes.
+    The node is the parent if no rotation precedes the joint on its body, else the child (approximate for the middle one
+    of three hinges). Axes of balls and free joints are 0.
     """
     model, kind = scene.model, mujoco.mjtJoint
     nodes, axes = scene.receivers[::2].copy(), np.zeros((model.njnt, 3))
-    turned: set[int] = set()
+    rotated: set[int] = set()
     for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
         if model.jnt_type[joint] not in (int(kind.mjJNT_HINGE), int(kind.mjJNT_SLIDE)):
-            turned.add(body)
+            rotated.add(body)
             continue
         axes[joint] = model.jnt_axis[joint]
-        if body not in turned:
+        if body not in rotated:
             child = nodes[joint]
             nodes[joint] = scene.senders[2 * joint]
             rest = scene.static.nodes[child, [scene.static.node_names.index(f"quat[{index}]") for index in range(4)]]
             mujoco.mju_rotVecQuat(axes[joint], model.jnt_axis[joint], rest)
         if model.jnt_type[joint] == int(kind.mjJNT_HINGE):
-            turned.add(body)
+            rotated.add(body)
     return nodes, axes

@@ -1,4 +1,4 @@
-"""Logged robots as graphs: what joint encoders see, without a model of the body."""
+"""Kinematic trees: robots as graphs that joint encoders observe, without a model of their bodies."""
 
 from __future__ import annotations
 
@@ -16,26 +16,23 @@ from torchrl_gn.scenes.scene import StaticGraph
 
 @dataclass(frozen=True, eq=False)
 class KinematicTree:
-    """Robot known by its joints alone (paper, SM "Real JACO").
+    """Kinematic tree of a robot known by its joint encoders (paper, SM "Real JACO").
 
-    A node for the base and one for each body, which holds cosine and sine of its joint's angle, the joint's velocity,
-    and what else was logged of it; a pair of edges for each joint, which hold its commands. The state of each node is
-    laid out as :func:`~torchrl_gn.maths.joint_layout` says. Takes the place of a
-    :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors.
+    Node 0 is the base, the others the joints' bodies; node states follow :func:`~torchrl_gn.maths.joint_layout`.
+    Takes the place of a :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors.
 
     Args:
         name: name of the robot.
         joint_names: names of its ``J`` joints, from the base on.
-        timestep: control time step, seconds.
-        commands: for each joint the indices of the commands that act on it, none of a joint without motor.
-        extras: names of what else is logged of every joint, each one channel.
-        action_low: ``[A]`` lower bounds of the commands; by default there are none.
+        timestep: control step, seconds.
+        commands: commands that act on each joint, by index; none for a joint without motor.
+        extras: names of further channels, one number per joint each.
+        action_low: ``[A]`` lower bounds of the commands; default: unbounded.
         action_high: ``[A]`` upper bounds.
-        joint_parents: for each joint the one before it, -1 for the base; by default each is carried by the last: an arm.
+        joint_parents: parent of each joint, -1 for the base; default: the joint before it.
 
     Raises:
-        ValueError: if there is no joint, commands are not given for each, bounds are not as many, or a number does not
-            fit.
+        ValueError: if there is no joint, or an argument does not fit.
     """
 
     name: str
@@ -51,17 +48,17 @@ class KinematicTree:
     contact_points = None
 
     def __post_init__(self) -> None:
-        # NumPy's numbers could not be saved.
+        # JSON takes no NumPy numbers.
         object.__setattr__(self, "timestep", float(self.timestep))
         object.__setattr__(self, "commands", tuple(tuple(map(int, indices)) for indices in self.commands))
         object.__setattr__(self, "joint_parents", tuple(map(int, self.joint_parents)))
         if not self.joint_names or len(self.commands) != len(self.joint_names):
             raise ValueError(
-                f"Robot {self.name!r} needs joints, and commands for each; got {len(self.commands)} of"
-                f" {len(self.joint_names)}."
+                f"Robot {self.name!r} needs at least one joint, and commands for each; got"
+                f" {len(self.joint_names)} joints and commands for {len(self.commands)}."
             )
         if any(index < 0 for indices in self.commands for index in indices):
-            raise ValueError(f"commands={self.commands} of {self.name!r} must be counted from 0.")
+            raise ValueError(f"commands={self.commands} of {self.name!r} must be indices from 0.")
         if not 0 < self.timestep < np.inf:
             raise ValueError(f"timestep={self.timestep} of {self.name!r} must be positive.")
         if not self.joint_parents:
@@ -70,7 +67,7 @@ class KinematicTree:
             not -1 <= before < joint for joint, before in enumerate(self.joint_parents)
         ):
             raise ValueError(
-                f"joint_parents={self.joint_parents} of {self.name!r} must name an earlier joint, or -1, for each."
+                f"joint_parents={self.joint_parents} of {self.name!r} must be an earlier joint, or -1, for each joint."
             )
         for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
             count = len(getattr(self, which))
@@ -78,7 +75,7 @@ class KinematicTree:
                 object.__setattr__(self, which, np.full(self.num_actions, infinite))
             elif count != self.num_actions:
                 raise ValueError(
-                    f"{which} of {self.name!r} must be of its {self.num_actions} commands, got {count} numbers."
+                    f"{which} of {self.name!r} must be [{self.num_actions}], one a command, got [{count}]."
                 )
 
     @property
@@ -88,12 +85,12 @@ class KinematicTree:
 
     @property
     def num_nodes(self) -> int:
-        """Base and bodies."""
+        """Number of nodes ``N``: base and bodies."""
         return self.num_joints + 1
 
     @property
     def num_edges(self) -> int:
-        """Two for each joint."""
+        """Number of directed edges ``E``, two for each joint."""
         return 2 * self.num_joints
 
     @property
@@ -103,12 +100,12 @@ class KinematicTree:
 
     @property
     def state_size(self) -> int:
-        """Numbers of a node's state: cosine, sine, velocity, extras."""
+        """Numbers in a node's state: cosine, sine, velocity, extras."""
         return 3 + len(self.extras)
 
     @property
     def node_names(self) -> tuple[str, ...]:
-        """The base and the bodies, named after their joints."""
+        """Names of base and bodies, the latter after their joints."""
         return ("base", *self.joint_names)
 
     @property
@@ -128,40 +125,40 @@ class KinematicTree:
 
     @property
     def edge_action(self) -> np.ndarray:
-        """``[E, C]`` commands at each edge's joint, C the most that a joint has (or 1); -1 where one has fewer."""
+        """``[E, C]`` commands at each edge's joint, -1 where a joint has fewer than ``C``, the most (or 1)."""
         most = max(1, *map(len, self.commands))
         padded = [[*indices, *[-1] * (most - len(indices))] for indices in self.commands]
         return np.repeat(np.array(padded, dtype=np.int64), 2, axis=0)
 
     @property
     def movable(self) -> np.ndarray:
-        """``[N, 2 + extras]`` bool: all of the bodies, nothing of the base."""
+        """``[N, 2 + extras]`` bool mask of movable components: all but the base's."""
         return np.repeat(np.arange(self.num_nodes)[:, None] > 0, 2 + len(self.extras), axis=1)
 
     @property
     def predicted(self) -> np.ndarray:
-        """``[N]`` bool, all but the base."""
+        """``[N]`` bool: all nodes but the base."""
         return np.any(self.movable, axis=1)
 
     @property
     def translation_invariant(self) -> np.ndarray:
-        """``[3]`` bool, no axis: there are no positions in space."""
+        """``[3]`` bool: no axis, as there are no positions."""
         return np.zeros(3, dtype=bool)
 
     @property
     def joint_anchors(self) -> JointAnchors:
-        """No pins: angles cannot come apart."""
-        itself, child_anchor = np.arange(self.num_nodes), np.zeros((self.num_nodes, 3))
-        return JointAnchors(itself, child_anchor, child_anchor, np.zeros((self.num_nodes, self.num_nodes)), itself)
+        """No joint anchors, as there are no positions."""
+        own, offset = np.arange(self.num_nodes), np.zeros((self.num_nodes, 3))
+        return JointAnchors(own, offset, offset, np.zeros((self.num_nodes, self.num_nodes)), own)
 
     @property
     def static(self) -> StaticGraph:
-        """Which joint each body and edge is of: nothing else is known."""
-        which = np.eye(self.num_nodes)
+        """Static graph: one-hot node and joint, and direction of edges."""
+        one_hot = np.eye(self.num_nodes)
         edges = np.repeat(np.eye(self.num_joints), 2, axis=0)
         direction = np.tile([1.0, -1.0], self.num_joints)[:, None]
         return StaticGraph(
-            nodes=which,
+            nodes=one_hot,
             edges=np.concatenate((direction, edges), 1),
             globals_=np.zeros(0),
             node_names=tuple(f"is_{name}" for name in self.node_names),
@@ -170,7 +167,7 @@ class KinematicTree:
         )
 
     def values(self) -> PhysicalParameters:
-        """Static features; of a body in space nothing."""
+        """Return the physical parameters: static features, and zeros for those of bodies in space."""
         n, e = self.num_nodes, self.num_edges
         static = self.static
         arrays = (static.nodes, static.edges, static.globals_, np.zeros((e, 3)), np.array([1.0, 0, 0, 0]), np.zeros(3))
@@ -178,7 +175,7 @@ class KinematicTree:
         return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     def description(self) -> dict:
-        """Plain values from which :func:`~torchrl_gn.scenes.scene_from_description` makes the chain again."""
+        """Return JSON-able values from which :func:`~torchrl_gn.scenes.scene_from_description` rebuilds it."""
         tree = {
             "name": self.name,
             "joint_names": list(self.joint_names),
@@ -194,7 +191,7 @@ class KinematicTree:
 
     @classmethod
     def from_description(cls, description: dict) -> KinematicTree:
-        """The chain that :meth:`description` described."""
+        """Rebuild from :meth:`description`."""
         tree = description["joint_chain"]
         bounds = {
             which: np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
@@ -211,7 +208,7 @@ class KinematicTree:
         )
 
     def fingerprint(self) -> str:
-        """Hash of all that it is."""
+        """Return a hash of all arguments."""
         text = [
             self.name,
             *self.joint_names,
@@ -224,18 +221,18 @@ class KinematicTree:
         return hashlib.sha256("\n".join(text).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
-        """Readable summary."""
+        """Summarise joints, parents and commands."""
         lines = [
-            f"Arm {self.name}: {self.num_joints} joints, {self.num_actions} commands, step {1e3 * self.timestep:g} ms"
+            f"Robot {self.name}: {self.num_joints} joints, {self.num_actions} commands, step {1e3 * self.timestep:g} ms"
         ]
         for name, indices, before in zip(self.joint_names, self.commands, self.joint_parents, strict=True):
             acting = ", ".join(map(str, indices)) or "none"
-            lines.append(f"  {name}, carried by {self.node_names[before + 1]}: commands {acting}")
+            lines.append(f"  {name}, parent {self.node_names[before + 1]}: commands {acting}")
         return "\n".join(lines)
 
 
 def tree_states(angle: np.ndarray, velocity: np.ndarray, extras: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """States of a chain's nodes.
+    """Return the node states of a kinematic tree.
 
     Args:
         angle: ``[..., J]`` radians.
@@ -243,7 +240,8 @@ def tree_states(angle: np.ndarray, velocity: np.ndarray, extras: Sequence[np.nda
         extras: ``[..., J]`` each, in the order of :attr:`KinematicTree.extras`.
 
     Returns:
-        ``[..., J + 1, 3 + extras]`` float64: cosine and sine of the angle, velocity, extras; of the base 1, 0, 0 ....
+        ``[..., J + 1, 3 + extras]`` float64: cosine and sine of the angle, velocity, extras; the base's are 1, 0, 0,
+        ...
     """
     bodies = np.stack((np.cos(angle), np.sin(angle), velocity, *extras), axis=-1).astype(np.float64)
     base = np.zeros((*bodies.shape[:-2], 1, bodies.shape[-1]))

@@ -1,4 +1,4 @@
-"""Loading scenes by name, from MJCF, or from their description."""
+"""Load scenes by name, from MJCF, or from their description."""
 
 from __future__ import annotations
 
@@ -30,21 +30,19 @@ def load_scene(
     """Load a scene.
 
     Args:
-        source: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``,
-            ``"swimmerN"`` with N of at least 3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), the
-            path of an MJCF file, MJCF text, or an ``MjSpec``.
-        timestep: control step, seconds, a whole multiple of the model's physics step. By
-            default the paper's for its systems (SM "Description of the simulated
-            environments"), one physics step for any other model.
-        name: name of the scene; by default the system's, the file's or the model's.
-        parameters: makes it a variant of a system: some of its :func:`~torchrl_gn.scenes.parameter_ranges`, also
-            beyond them; those left out are as in the standard system.
+        source: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"swimmerN"`` with N of at least
+            3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), the path of an MJCF file, MJCF text, or an ``MjSpec``.
+        timestep: control step, seconds, a multiple of the physics step; default: the paper's for its systems, one
+            physics step for other models.
+        name: name of the scene; default: that of the system, file or model.
+        parameters: parameters of a variant (:func:`~torchrl_gn.scenes.parameter_ranges`), also beyond their ranges; the
+            others are the standard system's.
 
     Raises:
-        ValueError: if the name is unknown, or it has no such parameters.
+        ValueError: if the name or a parameter is unknown.
         FileNotFoundError: if the file does not exist.
-        SceneError: if the MJCF is broken or ``timestep`` does not fit.
-        UnsupportedSceneError: if the graph cannot represent an element, which it names.
+        SceneError: if the MJCF is invalid or ``timestep`` does not fit.
+        UnsupportedSceneError: if the graph cannot represent an element, which the message names.
 
     Example:
         >>> load_scene("swimmer6").timestep
@@ -56,7 +54,7 @@ def load_scene(
         spec: Any = source
         return build_scene(spec, name=name or spec.modelname, timestep=timestep)
     if isinstance(source, mujoco.MjModel):
-        raise TypeError("load_scene needs the MJCF, not a compiled MjModel: give its file, text or MjSpec.")
+        raise TypeError("load_scene needs MJCF, not a compiled MjModel; give its file, text or MjSpec.")
     if not isinstance(source, (str, os.PathLike)):
         raise TypeError(f"load_scene takes a name, a path, MJCF text or an MjSpec, got {type(source).__name__}.")
     if isinstance(source, str) and not is_mjcf_text(source):
@@ -77,14 +75,13 @@ def load_scene(
 
 
 def scene_from_description(description: dict) -> Scene:
-    """Build again the scene that :meth:`Scene.description` described.
+    """Rebuild the scene of a :meth:`Scene.description`.
 
     Warns:
-        SceneChangedWarning: if the rebuilt scene has other physics, as another version of
-            MuJoCo or of the model files can give it.
+        SceneChangedWarning: if its physics differ, as with another version of MuJoCo or of the model files.
     """
     if "joint_chain" in description:
-        # It has all of a scene that models and errors read.
+        # It has every attribute of a scene that models and errors read.
         return cast(Scene, KinematicTree.from_description(description))
     system = find_system(description["system"]) if "system" in description else None
     if system is None and "system" in description:
@@ -103,7 +100,7 @@ def scene_from_description(description: dict) -> Scene:
         )
     if scene.fingerprint() != description["fingerprint"]:
         warnings.warn(
-            f"Scene {scene.name!r} does not have the physics it was described with; results may differ "
+            f"Scene {scene.name!r} has other physics than its description; results may differ "
             f"(MuJoCo {mujoco.__version__} here).",
             SceneChangedWarning,
             stacklevel=2,

@@ -1,4 +1,4 @@
-"""Reading MJCF text so that it can be stored whole: includes inlined, assets beside it."""
+"""Read MJCF with everything that rebuilds it: includes inlined, assets in base64."""
 
 from __future__ import annotations
 
@@ -12,17 +12,14 @@ from torchrl_gn.scenes.errors import SceneError
 
 
 def read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
-    """Parse an MJCF file or string.
-
-    Args:
-        source: path of a file, or MJCF text (its first character is ``<``).
+    """Parse an MJCF file or MJCF text.
 
     Returns:
-        The parsed model and what rebuilds it: ``{"mjcf": text, "assets": {path: base64}}``.
+        The parsed model, and ``{"mjcf": text, "assets": {path: base64}}`` for :func:`rebuild_mjcf`.
 
     Raises:
         FileNotFoundError: if the file does not exist.
-        SceneError: if the text is no valid MJCF, with MuJoCo's message.
+        SceneError: if MuJoCo cannot parse the text.
     """
     path = None if isinstance(source, str) and is_mjcf_text(source) else Path(source)
     if path is not None and not path.is_file():
@@ -41,7 +38,7 @@ def read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
 
 
 def rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
-    """Parse again what :func:`read_mjcf` stored."""
+    """Parse what :func:`read_mjcf` stored."""
     assets = {name: base64.b64decode(content) for name, content in origin["assets"].items()}
     return mujoco.MjSpec.from_string(origin["mjcf"], assets=assets)
 
@@ -75,7 +72,7 @@ def _inline_children(element: ElementTree.Element, folder: Path) -> None:
 
 
 def _assets(spec: mujoco.MjSpec, folder: Path) -> dict[str, str]:
-    """Files that the model reads, in base64, by the path under which MuJoCo asks for them."""
+    """Encode the files that a model reads, by the path under which MuJoCo asks for them."""
     textures = [texture.file for texture in spec.textures]
     textures += [file for texture in spec.textures for file in texture.cubefiles]
     wanted = [(spec.meshdir, mesh.file) for mesh in [*spec.meshes, *spec.hfields, *spec.skins]]

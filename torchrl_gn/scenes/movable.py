@@ -1,4 +1,4 @@
-"""What can move in a scene: movable channels of the state change."""
+"""Movable components: which components of a state change can be non-zero."""
 
 from __future__ import annotations
 
@@ -9,24 +9,11 @@ _TOLERANCE = 1e-9
 
 
 def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray, *, samples: int = 8) -> np.ndarray:
-    """Components of the state change that can ever differ from zero.
+    """Return the mask ``[N, 12]`` of movable components for root bodies ``[N]``; ``data`` is overwritten.
 
-    A component is dead if its row of the body's Jacobian (world frame, at the
-    body frame's origin) is zero in every configuration. The Jacobian is analytic
-    in the configuration, so a row that is zero at a few random ones is zero at
-    all. Constraints (joint limits, equalities) can only remove motion: they are
-    not looked at.
-
-    Args:
-        model: compiled model.
-        data: of that model; what is in it is overwritten.
-        body: ``[N]`` root body of each node.
-        samples: number of random configurations.
-
-    Returns:
-        ``[N, 12]`` bool: position 3, rotation vector 3, linear velocity 3, angular
-        velocity 3. Position shares the rows of linear velocity, rotation those of
-        angular velocity.
+    Components, world frame: position 3, rotation vector 3, linear velocity 3, angular velocity 3. A row of the analytic
+    body Jacobian that vanishes at random configurations vanishes everywhere. Constraints, which only remove motion, are
+    ignored.
     """
     rng = np.random.default_rng(0)
     largest = np.zeros((len(body), 6))  # largest entry of every Jacobian row
@@ -43,7 +30,7 @@ def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndar
 
 
 def _random_configuration(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
-    """Generic configuration: limits are soft in MuJoCo and do not change which rows vanish."""
+    """Draw a configuration, also beyond limits, which do not change the rows that vanish."""
     qpos = rng.uniform(-np.pi, np.pi, model.nq)
     for joint in range(model.njnt):
         kind, start = mujoco.mjtJoint(model.jnt_type[joint]), model.jnt_qposadr[joint]

@@ -1,4 +1,4 @@
-"""Flat observations of a task arranged as a graph, by a declared mapping."""
+"""Observation graphs: a declared mapping of flat task observations to a graph."""
 
 from __future__ import annotations
 
@@ -14,28 +14,26 @@ _ENTRY = re.compile(r"(\w+)(?:\[(\d+)(?::(\d+))?\])?")
 
 @dataclass(frozen=True, eq=False)
 class ObservationGraph:
-    """Where each number of a task's flat observation and action belongs in a graph.
+    """Place in a graph of each number of a task's flat observation and action.
 
     (Paper, SM Figure "Arrangement as a graph of the default 25-feature observation".)
 
-    Nodes are the bodies that observations speak of, an edge pair is a joint between a body and the one that carries it.
-    Entries are named after the task's observation: ``"height"`` is all of that entry, ``"joints[0]"`` one number
-    of it and ``"body_velocities[3:6]"`` several. Every number has exactly one place. Nodes, and joints, with fewer
-    numbers than others get zeros in their place.
+    Nodes are bodies, joints are pairs of edges between parent and child body. ``"height"`` is a whole entry of the
+    observation, ``"joints[0]"`` one number of it, ``"body_velocities[3:6]"`` several. Every number has exactly one
+    place; nodes and joints with fewer numbers than others are padded with zeros.
 
     Args:
         name: name of the task, for messages.
-        observation: size of each entry of the flat observation, in its order.
-        nodes: entries of every node, by the node's name.
-        joints: entries of every joint, by the names of the body that carries it and of the body that it moves.
+        observation: size of each entry of the flat observation, in order.
+        nodes: entries of every node, by its name.
+        joints: entries of every joint, by its (parent, child) bodies.
         globals_: entries of the whole graph.
-        actions: indices of the actions at a joint, by the same names as in ``joints``; joints without are left out.
-        identity: show networks which node is which, one-hot. Bodies that differ need it; a network that shall serve
-            graphs of several sizes must do without.
+        actions: indices of the actions at each joint that has any, by (parent, child).
+        identity: show networks each node's index, one-hot; not for networks that serve graphs of several sizes.
 
     Raises:
-        ValueError: if an entry is not known or is used never or twice, a joint is between nodes that are not there, a
-            body is moved by two joints or by none of a tree, or an action has no place.
+        ValueError: if an entry is unknown or used other than once, a joint names an unknown node, the joints do not
+            form trees, or an action has no place.
 
     Example:
         >>> ObservationGraph.swimmer(6).num_observations
@@ -51,13 +49,12 @@ class ObservationGraph:
     identity: bool = False
 
     def __post_init__(self) -> None:
-        for node in self.node_names:  # a node that is its own ancestor has no root
-            seen, at = [node], self.parent[self.node_names.index(node)]
-            while at >= 0 and len(seen) <= self.num_nodes:
-                seen.append(self.node_names[at])
-                at = self.parent[at]
-            if at >= 0:
-                raise ValueError(f"Joints of {self.name!r} go round in a circle at {node!r}; they must form trees.")
+        for index, node in enumerate(self.node_names):
+            ancestor = index
+            for _ in self.nodes:
+                ancestor = self.parent[ancestor] if ancestor >= 0 else -1
+            if ancestor >= 0:
+                raise ValueError(f"Joints of {self.name!r} form a cycle at {node!r}; they must form trees.")
         used = np.bincount([*self.node_entries[self.node_entries >= 0], *self.global_entries], minlength=1)
         used = np.pad(used, (0, max(0, self.num_observations - len(used))))
         for wrong, what in ((used == 0, "has no place in"), (used > 1, "is used twice in")):
@@ -72,10 +69,7 @@ class ObservationGraph:
 
     @classmethod
     def swimmer(cls, num_links: int) -> ObservationGraph:
-        """The mapping of the paper for the suite's swimmers, of any number of links.
-
-        Nodes hold each link's velocities along its own axes, edges the joint's angle, globals where the target is.
-        """
+        """Return the paper's mapping of the suite's swimmers, with any number of links."""
         links = ["head", *(f"segment_{link}" for link in range(num_links - 1))]
         pairs = list(zip(links[:-1], links[1:], strict=True))
         return cls(
@@ -89,12 +83,7 @@ class ObservationGraph:
 
     @classmethod
     def of_task(cls, domain: str, task: str, declared: dict | None = None) -> ObservationGraph:
-        """The mapping of a task of the DeepMind Control Suite.
-
-        Args:
-            domain: of the suite.
-            task: of the domain.
-            declared: the mapping, as :meth:`description` has it; default: the one that is built in.
+        """Return the mapping of a Control Suite task: the ``declared`` :meth:`description`, or the built-in one.
 
         Raises:
             ValueError: if none is declared or built in.
@@ -118,7 +107,7 @@ class ObservationGraph:
 
     @property
     def num_edges(self) -> int:
-        """Number of directed edges ``E``, two for each joint."""
+        """Number of directed edges ``E``, two a joint."""
         return 2 * len(self.joints)
 
     @property
@@ -133,37 +122,39 @@ class ObservationGraph:
 
     @cached_property
     def parent(self) -> np.ndarray:
-        """``[N]`` node that carries each node, -1 where none does."""
+        """``[N]`` parent of each node, -1 for roots."""
         parent = np.full(self.num_nodes, -1)
         for before, after in self.joints:
             for node in (before, after):
                 if node not in self.nodes:
                     raise ValueError(f"Joint {(before, after)} of {self.name!r}: there is no node {node!r}.")
-            moved = self.node_names.index(after)
-            if parent[moved] >= 0:
-                raise ValueError(f"{after!r} of {self.name!r} is moved by two joints; list their entries under one.")
-            parent[moved] = self.node_names.index(before)
+            child = self.node_names.index(after)
+            if parent[child] >= 0:
+                raise ValueError(
+                    f"{after!r} of {self.name!r} is the child of two joints; list their entries under one."
+                )
+            parent[child] = self.node_names.index(before)
         return parent
 
     @cached_property
     def moved(self) -> np.ndarray:
-        """``[J]`` node that each joint moves."""
+        """``[J]`` child node of each joint."""
         return np.array([self.node_names.index(after) for _, after in self.joints], dtype=np.int64)
 
     @property
     def edge_index(self) -> np.ndarray:
-        """``[2, E]`` senders above receivers; every joint's edge from the carrying body first, then back."""
+        """``[2, E]`` senders and receivers; each joint's edge from the parent, then back."""
         pairs = np.stack((self.parent[self.moved], self.moved))
         return np.stack((pairs, pairs[::-1]), axis=-1).reshape(2, -1)
 
     @cached_property
     def node_entries(self) -> np.ndarray:
-        """``[N, F_n + F_j]`` index in the observation of a node's features, then of its joint's; -1 where none is."""
+        """``[N, F_n + F_j]`` observation index of each node's features, then of its joint's; -1 is padding."""
         own = [self._find(entries) for entries in self.nodes.values()]
         joints: list[list[int]] = [[] for _ in own]
         for node, entries in zip(self.moved, self.joints.values(), strict=True):
             joints[node] = self._find(entries)
-        return np.concatenate((_table(own), _table(joints)), axis=1)
+        return np.concatenate((_padded(own), _padded(joints)), axis=1)
 
     @cached_property
     def num_node_features(self) -> int:
@@ -177,26 +168,26 @@ class ObservationGraph:
 
     @cached_property
     def global_entries(self) -> np.ndarray:
-        """``[F_g]`` index in the observation of the global features."""
+        """``[F_g]`` observation index of the global features."""
         return np.array(self._find(self.globals_), dtype=np.int64)
 
     @cached_property
     def node_actions(self) -> np.ndarray:
-        """``[N, C]`` index of the actions at the joint that moves each node; -1 where none is."""
+        """``[N, C]`` actions at the joint whose child each node is; -1 is padding."""
         acting: list[list[int]] = [[] for _ in self.nodes]
         for node, joint in zip(self.moved, self.joints, strict=True):
             acting[node] = list(self.actions.get(joint, ()))
-        return _table(acting)
+        return _padded(acting)
 
     @cached_property
     def observation_at(self) -> np.ndarray:
-        """``[O]`` where each number of the observation stands in flattened ``node_entries``, globals behind them."""
-        return _listed_at(np.concatenate((self.node_entries.ravel(), self.global_entries)))
+        """``[O]`` position of each observation in flattened ``node_entries`` followed by ``global_entries``."""
+        return _positions(np.concatenate((self.node_entries.ravel(), self.global_entries)))
 
     @cached_property
     def action_at(self) -> np.ndarray:
-        """``[A]`` where each action stands in flattened ``node_actions``."""
-        return _listed_at(self.node_actions.ravel())
+        """``[A]`` position of each action in flattened ``node_actions``."""
+        return _positions(self.node_actions.ravel())
 
     def _find(self, entries: tuple[str, ...]) -> list[int]:
         starts = dict(zip(self.observation, np.cumsum([0, *self.observation.values()]).tolist(), strict=False))
@@ -224,7 +215,7 @@ class ObservationGraph:
         raise IndexError(index)
 
     def description(self) -> dict:
-        """Plain values from which :meth:`from_description` makes the graph again."""
+        """Return JSON-able values from which :meth:`from_description` rebuilds the graph."""
         return {
             "name": self.name,
             "observation": dict(self.observation),
@@ -237,10 +228,10 @@ class ObservationGraph:
 
     @classmethod
     def from_description(cls, description: dict) -> ObservationGraph:
-        """The graph that :meth:`description` described; its ``globals``, ``actions`` and ``identity`` may be left out.
+        """Rebuild from :meth:`description`; ``globals``, ``actions`` and ``identity`` are optional.
 
         Raises:
-            ValueError: if something is missing, unknown or declared twice, or the graph is none.
+            ValueError: if a key is missing, unknown or declared twice, or the values make no graph.
         """
         needed, optional = ["name", "observation", "nodes", "joints"], ["globals", "actions", "identity"]
         for wrong, what in (
@@ -260,7 +251,7 @@ class ObservationGraph:
         )
 
     def __str__(self) -> str:
-        """Readable summary: what is where."""
+        """Summarise the entries and actions of nodes, joints and globals."""
         lines = [
             f"Observation graph {self.name}: {self.num_observations} observations, {self.num_actions} actions,"
             f" {self.num_nodes} nodes, {len(self.joints)} joints"
@@ -273,24 +264,24 @@ class ObservationGraph:
 
 
 def _by_joint(rows: Sequence[Sequence], what: str) -> dict[tuple[str, str], tuple]:
-    """What is declared of each joint, in rows of the bodies that carry and are moved and a list."""
+    """Return the entries of each (parent, child) from rows ``[parent, child, entries]``."""
     found: dict[tuple[str, str], tuple] = {}
     for row in rows:
         if len(row) != 3 or isinstance(row[2], str):
-            raise ValueError(f"Each of {what!r} must be [carrying body, moved body, [...]], got {row!r}.")
+            raise ValueError(f"Each of {what!r} must be [parent body, child body, [...]], got {row!r}.")
         if (row[0], row[1]) in found:
-            raise ValueError(f"{what!r} name {[row[0], row[1]]} twice; list all of it under one.")
+            raise ValueError(f"{what!r} name {[row[0], row[1]]} twice; list their entries under one.")
         found[row[0], row[1]] = tuple(row[2])
     return found
 
 
-def _listed_at(entries: np.ndarray) -> np.ndarray:
-    """Where 0, 1, ... stand among entries, of which those that are -1 are none."""
-    (there,) = np.nonzero(entries >= 0)
-    return there[np.argsort(entries[there])]
+def _positions(entries: np.ndarray) -> np.ndarray:
+    """Return the positions of 0, 1, ... in ``entries``, ignoring -1."""
+    (valid,) = np.nonzero(entries >= 0)
+    return valid[np.argsort(entries[valid])]
 
 
-def _table(rows: list[list[int]]) -> np.ndarray:
-    """Rows of unlike length side by side, -1 where one is shorter."""
+def _padded(rows: list[list[int]]) -> np.ndarray:
+    """Stack rows of unequal length, padded with -1."""
     width = max(map(len, rows), default=0)
     return np.array([[*row, *[-1] * (width - len(row))] for row in rows], dtype=np.int64).reshape(len(rows), width)

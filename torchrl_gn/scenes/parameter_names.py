@@ -1,4 +1,4 @@
-"""Names of static features: what a column means, whatever its place."""
+"""Names of physical parameters: they find a column wherever it stands."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ParameterNames:
-    """Names of static features, column by column: of a scene, of a data set, or those that a model reads.
+    """Names of the physical-parameter columns of a scene, a data set or a model.
 
-    Columns are found by these names alone, so that a version of the library with more static features, or in another
-    order, reads data sets and weights of before.
+    Matching by name lets data sets and weights outlive changes of the columns.
 
     Attributes:
-        nodes: names of the static node features.
-        edges: names of the static edge features.
-        globals_: names of the static global features.
+        nodes: names of the node features.
+        edges: names of the edge features.
+        globals_: names of the global features.
     """
 
     nodes: tuple[str, ...] = ()
@@ -36,24 +35,24 @@ class ParameterNames:
 
     @classmethod
     def of(cls, scene: Scene) -> ParameterNames:
-        """The static features that a scene has."""
+        """Return the names of a scene."""
         static = scene.static
         return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
 
     @classmethod
     def from_names(cls, names: Mapping[str, Sequence[str]]) -> ParameterNames:
-        """From what ``dataclasses.asdict`` gave, perhaps through JSON."""
-        return cls(**{part: tuple(of_part) for part, of_part in names.items()})
+        """Restore from ``dataclasses.asdict``, also after JSON."""
+        return cls(**{part: tuple(columns) for part, columns in names.items()})
 
     def common(self, other: ParameterNames) -> ParameterNames:
-        """Those that another set has too, in the order of this one."""
+        """Return the names that ``other`` has too, in the order of this set."""
         others = asdict(other)
         return ParameterNames(
             **{part: tuple(name for name in names if name in others[part]) for part, names in asdict(self).items()}
         )
 
     def missing_in(self, other: ParameterNames) -> list[str]:
-        """Those that another set lacks, but for types and flags of another version of MuJoCo."""
+        """List the names that ``other`` lacks, ignoring types and flags of another MuJoCo version."""
         others = asdict(other)
         return [
             name
@@ -63,25 +62,25 @@ class ParameterNames:
         ]
 
     def columns_in(self, other: ParameterNames) -> dict[str, list[int]]:
-        """Column in another set of each of these, by part, for :func:`take_columns`; -1 where it is missing."""
-        places = {part: {name: place for place, name in enumerate(names)} for part, names in asdict(other).items()}
-        return {part: [places[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
+        """Return each name's column in ``other``, by part, for :func:`take_columns`; -1 where missing."""
+        columns = {part: {name: column for column, name in enumerate(names)} for part, names in asdict(other).items()}
+        return {part: [columns[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
 
     def select(self, scene: Scene) -> PhysicalParameters:
-        """The numbers of a scene, of its static features only these.
+        """Return a scene's physical parameters with these columns alone.
 
-        A type or flag that this version of MuJoCo does not know is 0: no scene has it here.
+        Types and flags that this MuJoCo version does not know are 0.
 
         Raises:
-            ValueError: if the scene lacks one.
+            ValueError: if the scene lacks another column.
         """
-        values, there = PhysicalParameters.of(scene), ParameterNames.of(scene)
-        if missing := self.missing_in(there):
+        values, available = PhysicalParameters.of(scene), ParameterNames.of(scene)
+        if missing := self.missing_in(available):
             raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")
-        columns = self.columns_in(there)
+        columns = self.columns_in(available)
         return values._replace(**{part: take_columns(getattr(values, part), columns[part]) for part in columns})
 
 
 def take_columns(values: Tensor, columns: Sequence[int] | Tensor) -> Tensor:
-    """Columns of ``[..., F]``; zeros for column -1."""
+    """Select columns of ``[..., F]``; column -1 gives zeros."""
     return pad(values, (0, 1))[..., torch.as_tensor(columns, dtype=torch.long)]

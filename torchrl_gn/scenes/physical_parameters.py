@@ -1,4 +1,4 @@
-"""The numbers of a scene that differ between its variants; what is left is topology."""
+"""Physical parameters, which differ between the variants of a scene, and the topology they share."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 
 
 class PhysicalParameters(NamedTuple):
-    """Numbers that differ between variants of a scene (lengths, masses, ...), float64, each with or without a batch.
+    """Physical parameters of a scene (lengths, masses, ...), float64, with or without a batch.
 
     Attributes:
-        nodes: ``[*B, N, F_n]`` static node features, all or those that a model reads, in SI units; or inferred ones.
+        nodes: ``[*B, N, F_n]`` static node features, true or inferred, all or those that a model reads.
         edges: ``[*B, E, F_e]``.
         globals_: ``[*B, F_g]``.
-        joint_axis: ``[*B, E, 3]`` axis of each edge's joint, in the frame of the node that carries it.
-        rest: ``[*B, 4]`` the root's orientation at yaw_frame 0.
-        pivot: ``[*B, 3]`` where the yaw_frame's axis is, metres.
-        parent_anchor: ``[*B, N, 3]`` where each node is joined to its parent, in the parent's frame, metres.
-        arm: ``[*B, N, 3]`` the same in the node's own frame.
-        contact_offset: ``[*B, N, 4, 3]`` points that can touch the plane, in the node's frame, metres.
-        contact_radius: ``[*B, N, 4]`` radii about them, metres.
+        joint_axis: ``[*B, E, 3]`` joint axis of each edge, in the frame of the node it is fixed to.
+        rest: ``[*B, 4]`` the root's orientation at yaw 0.
+        pivot: ``[*B, 3]`` a point on the yaw axis, metres.
+        parent_anchor: ``[*B, N, 3]`` anchor of each node in the parent's frame, metres.
+        arm: ``[*B, N, 3]`` anchor of each node in its own frame, metres.
+        contact_offset: ``[*B, N, 4, 3]`` contact points in the node's frame, metres.
+        contact_radius: ``[*B, N, 4]`` metres.
     """
 
     nodes: Tensor
@@ -46,7 +46,7 @@ class PhysicalParameters(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene | KinematicTree) -> PhysicalParameters:
-        """All numbers of a scene."""
+        """Return the parameters of a scene."""
         if not isinstance(scene, Scene):
             return scene.values()
         yaw_frame, (offset, radius, _) = scene.yaw_frame, contact_slots(scene)
@@ -66,44 +66,41 @@ class PhysicalParameters(NamedTuple):
 
     @classmethod
     def read(cls, static: TensorDictBase, own: PhysicalParameters) -> PhysicalParameters:
-        """Take the entries that a TensorDict has; the rest are a scene's ``own``.
+        """Return the entries of a TensorDict, completed by a scene's ``own``.
 
         Raises:
-            KeyError: if it has entries that are none of these.
+            KeyError: if an entry is unknown.
             ValueError: if an entry has a wrong shape.
         """
         unknown = sorted(set(map(str, static.keys())) - set(cls._fields))
         if unknown:
-            raise KeyError(f"Static entries {unknown} are not known; use some of {list(cls._fields)}.")
+            raise KeyError(f"Physical parameters {unknown} are not known; use some of {list(cls._fields)}.")
         values = {}
-        for name, usual in own._asdict().items():
-            value = static.get(name, None)
-            if value is None:
-                value = usual
-            elif value.shape[len(static.shape) :] != usual.shape:
-                shape = [*static.shape, *usual.shape]
-                raise ValueError(f"Static entry {name!r} must be {shape}, got {list(value.shape)}.")
+        for name, default in own._asdict().items():
+            value = static.get(name, default)
+            if value is not default and value.shape[len(static.shape) :] != default.shape:
+                shape = [*static.shape, *default.shape]
+                raise ValueError(f"Physical parameter {name!r} must be {shape}, got {list(value.shape)}.")
             values[name] = value
         return cls(**values)
 
     def tensordict(self) -> TensorDict:
-        """As entries of a TensorDict without batch."""
+        """Return a TensorDict without batch."""
         return TensorDict(self._asdict())
 
 
 def topology(scene: Scene) -> dict[str, object]:
-    """What variants of one scene have in common, as comparable values by what it is."""
+    """Return what the variants of a scene have in common, as comparable values by name."""
     yaw_frame, joint_anchors = scene.yaw_frame, scene.joint_anchors
-    turn = None if yaw_frame is None else (yaw_frame.exact, yaw_frame.node, yaw_frame.axis)
     return {
         "number of nodes": scene.num_nodes,
         "edges": (scene.senders.tolist(), scene.receivers.tolist()),
         "motors": (scene.num_actions, scene.edge_action.tolist()),
-        "components that move": scene.movable.tolist(),
+        "movable components": scene.movable.tolist(),
         "invariant axes": scene.translation_invariant.tolist(),
         "control step": round(scene.timestep, 9),
-        "yaw_frame": turn,
-        "pins": (joint_anchors.parent.tolist(), joint_anchors.root.tolist(), joint_anchors.ancestors.tolist()),
+        "yaw frame": None if yaw_frame is None else (yaw_frame.exact, yaw_frame.node, yaw_frame.axis),
+        "joint anchors": (joint_anchors.parent.tolist(), joint_anchors.root.tolist(), joint_anchors.ancestors.tolist()),
         "joint axes": joint_axes(scene)[0].tolist(),
         "contact points": contact_slots(scene)[2].tolist(),
     }

@@ -1,4 +1,4 @@
-"""A physical scene as a graph: bodies are nodes, joints are directed edge pairs."""
+"""Scenes: physical systems as graphs, bodies as nodes, joints as pairs of directed edges."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from torchrl_gn.scenes.yaw_frame import YawFrame
 
 @dataclass(frozen=True)
 class StaticGraph:
-    """Static graph ``G_s`` of a scene (paper, SM "Mujoco variables", float64).
+    """Static graph ``G_s`` of a scene (paper, SM "Mujoco variables"), float64.
 
     Attributes:
-        nodes: ``[N, F_n]`` static features of every node, parent-relative frames.
-        edges: ``[E, F_e]`` static features of every directed edge.
-        globals_: ``[F_g]`` static features of the whole scene.
+        nodes: ``[N, F_n]`` features of every node, in parent-relative frames.
+        edges: ``[E, F_e]`` features of every directed edge.
+        globals_: ``[F_g]`` features of the whole scene.
         node_names: names of the ``F_n`` columns, for example ``"mass"`` or ``"inertia[0]"``.
         edge_names: names of the ``F_e`` columns.
         global_names: names of the ``F_g`` columns.
@@ -38,54 +38,44 @@ class StaticGraph:
 
 @dataclass(frozen=True)
 class Attachment:
-    """A named body welded into a node, at a fixed offset from the node's frame.
-
-    Attributes:
-        node: index of the node that carries the body.
-        pos: ``[3]`` position of the body in the node's frame, metres.
-        quat: ``[4]`` orientation of the body in the node's frame, w-first.
-    """
+    """A named body welded to a node."""
 
     node: int
-    pos: np.ndarray
-    quat: np.ndarray
+    pos: np.ndarray  # [3] position in the node's frame, metres
+    quat: np.ndarray  # [4] orientation in the node's frame, w-first
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """One physical system as a graph, read from a MuJoCo model.
 
-    Node 0 is the world. A node is a group of bodies welded together and its
-    state is the frame of the group's root body. Every joint gives two directed
-    edges, parent to child then child to parent.
+    A node is a group of bodies welded together, its state the frame of the group's root body. Node 0 is the world.
+    Every joint gives two directed edges, parent to child, then child to parent.
 
     Attributes:
-        name: the system's name, for messages and files.
-        model: compiled MuJoCo model; frame sensors of every node are its last
-            sensors, warm starts are off so that a step depends on
-            ``(physics, action)`` alone.
+        name: name of the system, for messages and files.
+        model: compiled model; its last sensors are the frame sensors of the nodes; warm starts are off.
         node_names: ``N`` names, ``"world"`` first.
         joint_names: names of the ``E / 2`` joints, in edge order.
         actuator_names: ``A`` names, in the order of ``mjData.ctrl``.
         body: ``[N]`` MuJoCo id of each node's root body.
-        parent: ``[N]`` parent node of each node; the world's is -1.
+        parent: ``[N]`` parent node; the world's is -1.
         senders: ``[E]`` sending node of each edge.
         receivers: ``[E]`` receiving node of each edge.
-        edge_action: ``[E]`` index of the action applied at the edge's joint, -1 without motor.
-        static: the static graph, float64.
-        movable: ``[N, 12]`` bool, which components of the state change (position 3, rotation
-            3, linear velocity 3, angular velocity 3; world frame) can ever differ from zero.
-        translation_invariant: ``[3]`` bool, world axes along which the dynamics do not
-            depend on where the scene is.
-        joint_anchors: where joints joint anchor the nodes together.
-        yaw_frame: how the whole scene is turned, if the dynamics do not depend on it.
-        contact_points: where bodies can touch a plane that is fixed in the world.
-        action_low: ``[A]`` lower bounds of the controls.
-        action_high: ``[A]`` upper bounds of the controls.
+        edge_action: ``[E]`` action at the edge's joint, -1 without motor.
+        static: static graph.
+        movable: ``[N, 12]`` bool mask of movable components of the state change (position 3, rotation 3, linear velocity
+            3, angular velocity 3; world frame).
+        translation_invariant: ``[3]`` bool, world axes along which the dynamics do not depend on position.
+        yaw_frame: yaw frame, if the dynamics do not depend on the yaw.
+        joint_anchors: joint anchors.
+        contact_points: points that can touch a plane fixed in the world.
+        action_low: ``[A]`` lower bounds of the actions.
+        action_high: ``[A]`` upper bounds of the actions.
         substeps: physics steps in one control step.
-        attachments: named bodies that are not a node's root, by name.
-        settle_steps: physics steps without control after a reset, before an episode starts.
-        origin: where the model came from, see :meth:`description`.
+        attachments: named bodies that are not the root of a node, by name.
+        settle_steps: physics steps without control after a reset.
+        origin: source of the model, see :meth:`description`.
     """
 
     name: str
@@ -138,36 +128,29 @@ class Scene:
 
     @property
     def state_size(self) -> int:
-        """Numbers of a node's state: position 3, quaternion 4, linear and angular velocity 3 each."""
+        """Numbers in a node's state: position 3, quaternion 4, linear velocity 3, angular velocity 3."""
         return 13
 
     @property
     def sensor_slice(self) -> slice:
-        """Where ``mjData.sensordata`` holds the state.
-
-        ``sensordata[..., scene.sensor_slice]`` reshaped to ``[..., N, 13]`` is position 3,
-        quaternion 4, linear velocity 3, angular velocity 3 of every node, world frame.
-        """
+        """Slice of ``mjData.sensordata`` that, reshaped to ``[..., N, 13]``, holds the state."""
         return slice(self.model.nsensordata - 13 * self.num_nodes, self.model.nsensordata)
 
     @property
     def predicted(self) -> np.ndarray:
-        """``[N]`` bool, nodes with at least one movable component; the others never move."""
+        """``[N]`` bool, nodes with a movable component."""
         return np.any(self.movable, axis=1)
 
     def description(self) -> dict:
-        """Plain, JSON-able values from which :func:`scene_from_description` builds the scene again.
-
-        A named system is described by its name, a file or string by its MJCF text
-        (includes inlined) and its asset files in base64.
+        """Return JSON-able values from which :func:`scene_from_description` rebuilds the scene.
 
         Raises:
             SceneError: if the scene was made from an ``MjSpec``, whose XML would round its numbers.
         """
         if not self.origin:
             raise SceneError(
-                f"Scene {self.name!r} was made from an MjSpec and cannot be described exactly; "
-                "write the model as an MJCF file and load that."
+                f"Scene {self.name!r} was made from an MjSpec, which has no exact description;"
+                " load the model from an MJCF file."
             )
         return {
             "name": self.name,
@@ -178,32 +161,29 @@ class Scene:
         }
 
     def fingerprint(self) -> str:
-        """Hash of names, control step, bounds and physical parameters (six digits): equal physics, equal hash.
-
-        Static features have no part in it; :class:`~torchrl_gn.scenes.ParameterNames` has their names.
-        """
+        """Return a hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""
         return fingerprint(self)
 
     def __str__(self) -> str:
-        """Readable summary: time steps, nodes, joints, motors, what moves, where it is invariant."""
-        axes = "".join(axis for axis, free in zip("xyz", self.translation_invariant, strict=True) if free)
-        turns = "no axis" if self.yaw_frame is None else "xyz"[self.yaw_frame.axis]
-        turns += " but for contacts with the world" * (self.yaw_frame is not None and not self.yaw_frame.exact)
+        """Summarise time steps, nodes, joints, motors, movable components and invariances."""
+        rotations = "no axis" if self.yaw_frame is None else "xyz"[self.yaw_frame.axis]
+        rotations += " but for contacts with the world" * (self.yaw_frame is not None and not self.yaw_frame.exact)
         step, physics_step = 1e3 * self.timestep, 1e3 * self.model.opt.timestep
         counts = ((self.num_nodes, "node"), (self.num_edges, "edge"), (self.num_actions, "action"))
         lines = [
             f"Scene {self.name}: " + ", ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts),
             f"  control step {step:g} ms = {self.substeps} x {physics_step:g} ms",
             f"  after a reset, {self.settle_steps} physics steps without control",
-            f"  translation-invariant along {axes or 'no axis'}, rotation-invariant about {turns}",
+            f"  translation-invariant along {_axes(self.translation_invariant, 'no axis')},"
+            f" rotation-invariant about {rotations}",
         ]
         mass = dict(zip(self.static.node_names, self.static.nodes.T, strict=True))["mass"]
         rows = [("node", "parent", "mass [kg]", "movable position", "movable rotation", "welded bodies")]
         for node, name in enumerate(self.node_names):
             parent = self.node_names[self.parent[node]] if node else "-"
             welded = [body for body, attachment in self.attachments.items() if attachment.node == node]
-            movable = [_axes(self.movable[node, :3]), _axes(self.movable[node, 3:6])]
-            rows.append((name, parent, f"{mass[node]:.4g}", movable[0], movable[1], ", ".join(welded) or "-"))
+            free = (_axes(self.movable[node, :3]), _axes(self.movable[node, 3:6]))
+            rows.append((name, parent, f"{mass[node]:.4g}", *free, ", ".join(welded) or "-"))
         lines += _table(rows)
         rows = [("joint", "type", "between", "action", "bounds")]
         for joint, name in enumerate(self.joint_names):
@@ -216,8 +196,8 @@ class Scene:
         return "\n".join(lines + _table(rows))
 
 
-def _axes(flags: np.ndarray) -> str:
-    return "".join(axis for axis, movable in zip("xyz", flags, strict=True) if movable) or "-"
+def _axes(flags: np.ndarray, none: str = "-") -> str:
+    return "".join(axis for axis, flag in zip("xyz", flags, strict=True) if flag) or none
 
 
 def _table(rows: list[tuple[str, ...]]) -> list[str]:

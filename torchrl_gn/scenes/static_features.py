@@ -1,21 +1,14 @@
-"""Static graph of a scene (paper, SM "Mujoco variables included in the graph conversion").
+"""Static features of a scene (paper, SM "Mujoco variables included in the graph conversion").
 
-Every scene has the same columns, so that one set of weights binds to any scene.
-Differences from the paper's list:
+Every scene has the same columns. Paper: differences from its list are
 
-* ``opt.collision`` no longer exists in MuJoCo: left out.
-* ``actuator_invweight0`` no longer exists: ``actuator_acc0`` (acceleration of the
-  joint under unit force in the initial pose) replaces it.
-* ``timestep`` is the control step, what the model predicts, not the physics step.
-* Bodies welded together are one node: mass, inertia, ipos and iquat are the
-  group's composite, expressed in its root body's frame; pos and quat are relative
-  to the parent group's root frame.
-* ``dof_damping``, ``dof_armature`` and ``dof_frictionloss`` of the joint are added:
-  the paper's list omits them, yet damping and armature set the motion of the
-  cheetah, the walker and the arm. A joint with several degrees of freedom shows
-  the first one's (MJCF gives all of them the same).
-* The bits of ``enableflags`` and ``disableflags``, and the one-hot types, are those
-  of the installed MuJoCo, named after its enumerations.
+* no ``opt.collision``, which MuJoCo dropped;
+* ``actuator_acc0`` for ``actuator_invweight0``, which MuJoCo dropped;
+* ``timestep`` is the control step;
+* ``dof_damping``, ``dof_armature`` and ``dof_frictionloss`` of the joint's first degree of freedom are added;
+* a node's mass, inertia, ipos and iquat are composites of its bodies, in the root body's frame; pos and quat are
+  relative to the parent node's root;
+* one-hot types and option bits are named after the enumerations of the installed MuJoCo.
 """
 
 from __future__ import annotations
@@ -32,11 +25,11 @@ Columns = list[tuple[str, np.ndarray]]
 
 
 def static_graph(model: mujoco.MjModel, graph: Topology, actuator_of_joint: np.ndarray, timestep: float) -> StaticGraph:
-    """Read the static features of every node, edge and of the scene.
+    """Read the static features of every node and edge and of the scene.
 
     Args:
         model: compiled model.
-        graph: its topology.
+        graph: topology of the model.
         actuator_of_joint: ``[J]`` actuator of each joint, -1 without motor.
         timestep: control step, seconds.
     """
@@ -55,7 +48,7 @@ def static_graph(model: mujoco.MjModel, graph: Topology, actuator_of_joint: np.n
 
 
 def _join(columns: Columns, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Put ``[rows]`` and ``[rows, k]`` columns side by side, naming the latter ``name[i]``."""
+    """Concatenate ``[rows]`` and ``[rows, k]`` columns; the latter are named ``name[i]``."""
     arrays, names = [], []
     for name, values in columns:
         values = np.asarray(values, dtype=np.float64)
@@ -69,7 +62,7 @@ def _members(enum: type, prefix: str) -> list[tuple[str, int]]:
 
 
 def is_member(name: str) -> bool:
-    """Whether a feature is one type of several or one flag, for example ``"actuator_biastype[SO3]"``."""
+    """Whether a feature is one type of several or one flag, such as ``"actuator_biastype[SO3]"``."""
     return re.fullmatch(r"(\w+type|enableflags|disableflags)\[[A-Z]\w*\]", name) is not None
 
 
@@ -105,20 +98,13 @@ def _node_columns(model: mujoco.MjModel, graph: Topology) -> Columns:
         bodies = np.flatnonzero(graph.node_of_body == node)
         rows.append((*offset(model, int(root), parent), *_composite(model, bodies, int(root))))
     pos, quat, mass, inertia, ipos, iquat = (np.array(column) for column in zip(*rows, strict=True))
-    return [
-        ("mass", mass),
-        ("pos", pos),
-        ("quat", quat),
-        ("inertia", inertia),
-        ("ipos", ipos),
-        ("iquat", iquat),
-    ]
+    return [("mass", mass), ("pos", pos), ("quat", quat), ("inertia", inertia), ("ipos", ipos), ("iquat", iquat)]
 
 
 def _composite(
     model: mujoco.MjModel, bodies: np.ndarray, root: int
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Mass, principal inertia ``[3]``, its origin ``[3]`` and frame ``[4]`` of welded bodies."""
+    """Return mass, principal inertia ``[3]``, its origin ``[3]`` and frame ``[4]`` of welded bodies."""
     heavy = [int(body) for body in bodies if model.body_mass[body] > 0]
     if len(heavy) <= 1 and (not heavy or heavy[0] == root):
         return model.body_mass[root], model.body_inertia[root], model.body_ipos[root], model.body_iquat[root]
@@ -137,8 +123,8 @@ def _composite(
     center = np.average(centers, axis=0, weights=model.body_mass[heavy])
     total = np.zeros((3, 3))
     for body, point, tensor in zip(heavy, centers, tensors, strict=True):
-        arm = point - center
-        total += tensor + model.body_mass[body] * (arm @ arm * np.eye(3) - np.outer(arm, arm))  # Steiner
+        shift = point - center
+        total += tensor + model.body_mass[body] * (shift @ shift * np.eye(3) - np.outer(shift, shift))  # Steiner
     inertia, vectors, iquat = np.empty(3), np.empty(9), np.empty(4)
     mujoco.mju_eig3(inertia, vectors, iquat, total.reshape(-1))
     return mass, inertia, center, iquat

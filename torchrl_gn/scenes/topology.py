@@ -10,30 +10,20 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Topology:
-    """Graph structure of a model, without any parameter.
+    """Graph structure of a model, without any parameter."""
 
-    Attributes:
-        body: ``[N]`` body id of each node's root body, ascending, world first.
-        node_of_body: ``[nbody]`` node that carries each body.
-        parent: ``[N]`` parent node, -1 for the world.
-        senders: ``[E]`` edges ``2 j`` and ``2 j + 1`` belong to joint ``j``: parent to child,
-            then child to parent.
-        receivers: ``[E]``.
-    """
-
-    body: np.ndarray
-    node_of_body: np.ndarray
-    parent: np.ndarray
-    senders: np.ndarray
-    receivers: np.ndarray
+    body: np.ndarray  # [N] root body of each node, ascending, world first
+    node_of_body: np.ndarray  # [nbody] node of each body
+    parent: np.ndarray  # [N] parent node, -1 for the world
+    senders: np.ndarray  # [E] edges 2 j and 2 j + 1 are joint j's: parent to child, then child to parent
+    receivers: np.ndarray  # [E]
 
 
 def topology(model: mujoco.MjModel) -> Topology:
     """Read the graph structure of a compiled model.
 
-    A node is a group of bodies welded together (``body_weldid``); the bodies of
-    a group need not be contiguous. Bodies without a joint up to the world,
-    mocap bodies too, belong to node 0.
+    A node is a group of bodies welded together (``body_weldid``). Bodies fixed to the world, mocap bodies too, belong
+    to node 0.
     """
     body = np.unique(model.body_weldid)
     node_of_body = np.searchsorted(body, model.body_weldid)
@@ -51,15 +41,9 @@ def topology(model: mujoco.MjModel) -> Topology:
 
 
 def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a body in an ancestor's frame with every joint between them at its reference.
+    """Return a body's position ``[3]`` and quaternion ``[4]`` in an ancestor's frame, joints at their reference.
 
-    Args:
-        model: compiled model.
-        body: body id.
-        ancestor: body id on the path from ``body`` to the world, or ``body`` itself.
-
-    Returns:
-        Position ``[3]`` and quaternion ``[4]``, w-first.
+    The ancestor is on the path from the body to the world, or the body itself.
     """
     pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     while body != ancestor:

@@ -16,41 +16,30 @@ _TEXTURE = 16  # pixels
 
 
 def parameter_ranges(system: str) -> dict[str, ParameterRange]:
-    """What random variants of a system differ in, and by how much (the SM's table).
+    """Return the parameters in which random variants of a system differ, and their ranges (the SM's table).
 
-    Lengths, thicknesses, masses and gears are factors of the standard system's, angles are radians. What
-    each parameter changes is told in the system's file in ``torchrl_gn/scenes/systems``. Bodies keep
-    their density where their size changes.
-
-    Args:
-        system: name of a system: ``"pendulum"``, ``"cartpole"``, ``"swimmerN"``, ``"cheetah"`` or ``"jaco"``.
+    Lengths, thicknesses, masses and gears are factors of the standard system's; angles are radians.
 
     Raises:
-        ValueError: if it has no parameters.
+        ValueError: if the system has no parameters.
 
     Example:
         >>> parameter_ranges("pendulum")["length"]
         ParameterRange(low=0.2, high=1.0, standard=1.0)
     """
-    return dict(_varied(system).ranges)
+    return dict(_system_with_variants(system).ranges)
 
 
 def has_variants(scene: Scene) -> bool:
-    """Whether a scene is a standard system of which random variants can be made."""
+    """Whether a scene is a standard system that has variants."""
     system = find_system(scene.origin.get("system", ""))
     return system is not None and system.vary is not None and "parameters" not in scene.origin
 
 
 def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -> np.ndarray:
-    """Draw parameters uniformly in their ranges, each on its own.
+    """Draw independent uniform parameters ``[count, P]``, float64, columns in the order of :func:`parameter_ranges`.
 
-    Args:
-        system: name of a system that has parameters.
-        count: number of variants.
-        rng: generator or seed; equal seeds give equal parameters, more of them the same ones first.
-
-    Returns:
-        ``[count, P]`` float64, columns in the order of :func:`parameter_ranges`.
+    ``rng`` is a generator or a seed, whose first draws are equal for every ``count``.
 
     Raises:
         ValueError: if the system has no parameters or ``count`` is negative.
@@ -65,7 +54,7 @@ def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -
 def sample_variants(
     system: str, count: int, rng: int | np.random.Generator, *, timestep: float | None = None
 ) -> list[Scene]:
-    """Random variants of a system: :func:`make_variants` of :func:`sample_parameters`.
+    """Build random variants of a system: :func:`make_variants` of :func:`sample_parameters`.
 
     Example:
         >>> variants = sample_variants("swimmer6", 3, rng=0)
@@ -78,34 +67,30 @@ def sample_variants(
 def make_variants(
     system: str, parameters: np.ndarray, *, timestep: float | None = None, name: str | None = None
 ) -> list[Scene]:
-    """Build variants of a system, some milliseconds each.
+    """Build variants of a system from parameters ``[count, P]``, which may lie outside of their ranges.
 
-    Args:
-        system: name of a system that has parameters.
-        parameters: ``[count, P]`` as :func:`sample_parameters` gives them; they may lie outside of the ranges.
-        timestep: control step, seconds; by default the system's.
-        name: name of the scenes; by default the system's.
+    Name and control step (seconds) are the system's by default.
 
     Raises:
-        ValueError: if the system has no parameters, or values are no such parameters.
+        ValueError: if the system has no parameters, or the given ones do not fit.
     """
     ranges = parameter_ranges(system)
     parameters = np.asarray(parameters, dtype=np.float64)
     if parameters.ndim != 2 or parameters.shape[1] != len(ranges):
         raise ValueError(f"parameters of {system!r} must be [count, {len(ranges)}], got {list(parameters.shape)}")
     rows = (dict(zip(ranges, row, strict=True)) for row in parameters.tolist())
-    return list(_build(_varied(system), rows, timestep=timestep, name=name))
+    return list(_build(_system_with_variants(system), rows, timestep=timestep, name=name))
 
 
 def make_variant(
     system: object, parameters: Mapping[str, float], *, timestep: float | None = None, name: str | None = None
 ) -> Scene:
-    """One variant; parameters that are left out are those of the standard system.
+    """Build one variant; parameters that are not given are the standard system's.
 
     Raises:
-        ValueError: if it is no system that has these parameters, or a value cannot be one.
+        ValueError: if the system does not have the parameters, or a value is invalid.
     """
-    found = _varied(system)
+    found = _system_with_variants(system)
     standard = {key: one.standard for key, one in found.ranges.items()}
     if unknown := [key for key in parameters if key not in standard]:
         raise ValueError(f"{found.name!r} has no parameters {unknown}; use some of {list(standard)}.")
@@ -118,12 +103,12 @@ def _build(
 ) -> Iterator[Scene]:
     assert system.vary is not None
     standard = system.build()
-    standard.compiler.usethread = False  # threads take longer to start than such a model to compile
+    standard.compiler.usethread = False  # threads would take longer to start than the model to compile
     for texture in standard.textures:
-        # Drawn anew and kept by every model: 12 MB and most of the time, for nothing that moves.
+        # Every model would render and keep full textures: 12 MB and most of the time.
         texture.width = texture.height = _TEXTURE
     for values in rows:
-        _check(system, values)
+        _check_values(system, values)
         spec: mujoco.MjSpec = standard.copy()
         system.vary(spec, values)
         yield build_scene(
@@ -135,18 +120,18 @@ def _build(
         )
 
 
-def _check(system: System, values: Mapping[str, float]) -> None:
+def _check_values(system: System, values: Mapping[str, float]) -> None:
     for key, value in values.items():
         if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
             wanted = "a finite angle" if system.ranges[key].is_angle else "a finite factor above 0"
             raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
 
 
-def _varied(source: object) -> System:
+def _system_with_variants(source: object) -> System:
     system = find_system(source) if isinstance(source, str) else None
     if system is None or system.vary is None:
-        having = [known for known in SYSTEMS if (found := find_system(known)) and found.vary]
-        names = ["swimmerN" if known == "swimmer6" else known for known in having]
+        varying = [known for known in SYSTEMS if (found := find_system(known)) and found.vary]
+        names = ["swimmerN" if known == "swimmer6" else known for known in varying]
         what = repr(source) if isinstance(source, str) and "<" not in source else "An MJCF model"
         raise ValueError(f"{what} has no parameters to vary; these systems have: {', '.join(names)}.")
     return system

@@ -1,12 +1,13 @@
-"""The systems of the paper, one file each."""
+"""The paper's seven systems: one file for each that has variants; those without stand here."""
 
 from __future__ import annotations
 
 import re
+from functools import partial
 
-from torchrl_gn.scenes.systems import acrobot, cartpole, cheetah, jaco, pendulum, walker2d
+from torchrl_gn.scenes.systems import cartpole, cheetah, jaco, pendulum
 from torchrl_gn.scenes.systems.swimmer import swimmer
-from torchrl_gn.scenes.systems.system import ParameterRange, System
+from torchrl_gn.scenes.systems.system import ParameterRange, System, suite_model
 
 __all__ = ["SYSTEMS", "ParameterRange", "System", "find_system", "swimmer"]
 
@@ -15,10 +16,12 @@ _BY_NAME: dict[str, System] = {
     for system in (
         pendulum.SYSTEM,
         cartpole.SYSTEM,
-        acrobot.SYSTEM,
+        # Two links with a motor between them, one suite physics step (RK4).
+        System("acrobot", partial(suite_model, "acrobot"), timestep=0.01),
         swimmer(6),
         cheetah.SYSTEM,
-        walker2d.SYSTEM,
+        # Planar, one suite physics step; the suite itself acts every 25 ms.
+        System("walker2d", partial(suite_model, "walker"), timestep=0.0025),
         jaco.SYSTEM,
     )
 }
@@ -28,7 +31,7 @@ SYSTEMS: tuple[str, ...] = tuple(_BY_NAME)
 
 
 def find_system(name: str) -> System | None:
-    """The system of that name, or None.
+    """Return the system of that name, or None.
 
     Raises:
         ValueError: for ``swimmerN`` with ``N < 3``.

@@ -1,7 +1,6 @@
 """Cartpole: a cart on a rail, limited to 1.8 m either side, with a pole. 10 ms, one suite physics step (RK4).
 
-Variants: the mass of the cart, which keeps its size, and length and thickness of the pole, whose mass
-follows its volume.
+Variants: mass of the cart, at its size; length and thickness of the pole, whose mass follows its volume.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""Cheetah: the planar half-cheetah of the suite. 10 ms, one suite physics step.
+"""Cheetah: the suite's planar half-cheetah. 10 ms, one suite physics step.
 
-The suite lets it fall for 200 physics steps after a reset, before an episode starts.
+As in the suite, it falls for 200 physics steps after a reset.
 
-Variants: the angle at which thighs, shins and feet hang on their parents where their joint is at zero,
-the length of every body (the torso's with its head), and one thickness of all of them. Masses follow
-the volume, joints move with the lengths. Motors, springs and joint limits stay. At its reference a
-variant's lowest point is as high above the ground as the standard cheetah's.
+Variants: reference angle of thighs, shins and feet to their parents, length of every body (the torso's with its
+head), and one thickness of all. Masses follow the volume, joints move with the lengths; motors, springs and limits
+stay. The lowest point of the reference is as high above the ground as the standard cheetah's.
 """
 
 from __future__ import annotations
@@ -28,11 +27,7 @@ _RANGES = {
 
 
 def _build() -> mujoco.MjSpec:
-    """The suite's model with its total mass written as a density.
-
-    ``settotalmass`` would rescale every variant of the model to the same mass, and is
-    deprecated: the density that it amounts to takes its place.
-    """
+    """Return the suite's model with densities for ``settotalmass``, which would give every variant the same mass."""
     spec = suite_model("cheetah")
     total = spec.compiler.settotalmass
     spec.compiler.settotalmass = -1.0
@@ -58,12 +53,12 @@ def _vary(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
 
 @cache
 def _clearance() -> float:
-    """Height of the standard cheetah's lowest point, metres."""
+    """Return the height of the standard cheetah's lowest point, metres."""
     return _lowest(_build())
 
 
 def _lowest(spec: mujoco.MjSpec) -> float:
-    """Height of the lowest point of the capsules, all joints at zero, metres."""
+    """Return the height of the capsules' lowest point, all joints at zero, metres."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

@@ -1,14 +1,11 @@
-"""JACO: Kinova's arm with its three-finger hand, on nothing. 100 ms, 50 physics steps of 2 ms.
+"""JACO: Kinova's arm with its three-finger hand. 100 ms, 50 physics steps of 2 ms.
 
-Arm and hand are the model files of ``dm_control.entities.manipulators.kinova``; the
-velocity actuators are those of its ``JacoArm`` and ``JacoHand``. MuJoCo's default
-physics step of 2 ms is what dm_control's manipulation tasks use. Base, wrist and
-hand, and the two halves of each finger, are welded: 16 bodies are 10 nodes. The
-hand's elements are named ``jaco_hand/...``.
+Model files and velocity actuators are those of ``dm_control.entities.manipulators.kinova``; 2 ms is the step of
+dm_control's manipulation tasks. Base, wrist and hand, and the halves of each finger, are welded: 16 bodies are 10
+nodes. The hand's elements are named ``jaco_hand/...``.
 
-Variants: the mass of every moving body, welded ones together (wrist and hand, the halves of a finger),
-at their size, so that inertias follow the mass; and the gear of every motor, by which a servo's torque
-is multiplied and its target velocity divided. The base, fixed to the world, stays as it is.
+Variants: mass of every moving node at its size, inertias included; gear of every motor, which multiplies a servo's
+torque and divides its target velocity.
 """
 
 from __future__ import annotations
@@ -23,7 +20,7 @@ from torchrl_gn.scenes.systems.system import ParameterRange, System, model_file
 _LARGE = ("joint_1", "joint_2", "joint_3")
 _SMALL = ("joint_4", "joint_5", "joint_6")
 _FINGERS = ("finger_1", "finger_2", "finger_3")
-_BODIES = {  # bodies of each node, by the name of its parameter
+_BODIES = {  # bodies of each mass parameter's node
     **{f"mass_b_{i}": (f"b_{i}",) for i in range(1, 6)},
     "mass_hand": ("b_6", "jaco_hand/hand"),
     **{f"mass_finger_{i}": (f"jaco_hand/b_finger_{i}", f"jaco_hand/b_finger_tip_{i}") for i in (1, 2, 3)},
@@ -49,7 +46,7 @@ def _build() -> mujoco.MjSpec:
 
 
 def _add_velocity_actuator(spec: mujoco.MjSpec, joint: str, *, gain: float, velocity: float, force: float) -> None:
-    """Servo that follows a velocity target [rad/s] with limited torque [N m]."""
+    """Add a servo that follows a velocity target [rad/s] with limited torque [N m]."""
     actuator = spec.add_actuator(
         name=joint,
         target=joint,

@@ -1,7 +1,6 @@
-"""Pendulum: one hinge with a torque motor. 20 ms, one suite physics step of 20 ms.
+"""Pendulum: one hinge with a torque motor. 20 ms, one suite physics step.
 
-Variants: the length of the pole, at whose end the mass is, and the mass. The pole itself weighs
-nothing. The ball keeps its radius whatever its mass: it is not the size that varies.
+Variants: length of the massless pole, and mass at its end, whose radius stays.
 """
 
 from __future__ import annotations

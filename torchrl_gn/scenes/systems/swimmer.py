@@ -1,10 +1,9 @@
 """Swimmer: a chain of links in a viscous plane. 20 ms, ten suite physics steps of 2 ms.
 
-The suite's file holds the head; the other links are added here as
-``dm_control.suite.swimmer`` adds them (the suite itself acts every 30 ms).
+The suite's file holds the head; the other links are added as ``dm_control.suite.swimmer`` does.
 
-Variants: the length of every link, and one thickness of all of them, width and height alike. Masses
-follow the volume, joints stay at the ends of the links. Motors, armatures and joint limits stay.
+Variants: length of every link, and one thickness of all. Masses follow the volume, joints stay at the ends of the
+links; motors, armatures and joint limits stay.
 """
 
 from __future__ import annotations
@@ -19,10 +18,7 @@ from torchrl_gn.scenes.systems.system import ParameterRange, System, suite_model
 
 
 def swimmer(links: int) -> System:
-    """Swimmer with any number of links.
-
-    Args:
-        links: number of links, head included, at least 3.
+    """Return the swimmer with ``links`` links, head included.
 
     Raises:
         ValueError: if there are fewer than 3 links.
@@ -35,7 +31,7 @@ def swimmer(links: int) -> System:
 
 
 def _links(links: int) -> list[str]:
-    """Names of the bodies, head first."""
+    """Return the names of the bodies, head first."""
     return ["head", *(f"segment_{i}" for i in range(links - 1))]
 
 
@@ -60,7 +56,7 @@ def _build(links: int) -> mujoco.MjSpec:
 
 
 def _vary(links: int, spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
-    thickness, above = parameters["thickness"], 0.0  # half length of the link before, metres
+    thickness, previous = parameters["thickness"], 0.0  # half length of the link before, metres
     for name in _links(links):
         body, length = spec.body(name), parameters[f"length_{name}"]
         for geom in body.geoms:
@@ -72,5 +68,5 @@ def _vary(links: int, spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> N
         for joint in body.joints:
             joint.pos = [0.0, -half, 0.0]
         if name != "head":
-            body.pos = [0.0, above + half, 0.0]
-        above = half
+            body.pos = [0.0, previous + half, 0.0]
+        previous = half

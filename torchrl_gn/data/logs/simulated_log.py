@@ -1,4 +1,4 @@
-"""Logs of a simulated robot with the faults of a real one."""
+"""Simulate the log of a robot with the faults of a real one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.errors import UnstableSimulationError
-from torchrl_gn.data.robot_log import RobotLog
+from torchrl_gn.data.logs.robot_log import RobotLog
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import sample_start_states
 from torchrl_gn.scenes.scene import Scene
@@ -28,46 +28,41 @@ def simulate_log(
     quantum: float = 1e-3,
     noise: float = 5e-4,
 ) -> RobotLog:
-    """What the encoders of a robot would log whose motors lag behind their commands.
+    """Simulate a robot's encoder log under random commands (:func:`spline_controls`), one row a control step.
 
-    Commands are splines, as in :func:`spline_controls`. What a motor does is its command ``delay`` steps before,
-    passed through a play (hysteresis: it follows only once the command is half of ``play`` ahead of it) and a
-    first-order lag. Angles are measured with noise and quantised; velocities are backward differences of what was
-    measured.
+    Motors follow commands after ``delay`` steps, a play (hysteresis) and a first-order lag. Angles are noisy and
+    quantised; velocities are their backward differences.
 
     Args:
         scene: a robot whose joints are all hinges.
         episodes: number of episodes.
         steps: control steps of each.
         seed: seed of commands, starts and noise.
-        delay: control steps until a command begins to act.
-        time_constant: of the lag, seconds; 0: none.
-        play: width of the play, as a share of the range of the command.
+        delay: control steps until a command acts.
+        time_constant: of the lag, seconds; 0: no lag.
+        play: width of the play, as a fraction of the command's range.
         quantum: resolution of the encoders, radians.
-        noise: standard deviation of the noise of the encoders, radians.
-
-    Returns:
-        The log: one row a control step, joints in the order of MuJoCo.
+        noise: standard deviation of the encoders, radians.
 
     Raises:
-        ValueError: if the scene has other joints than hinges, or no motors.
+        ValueError: if the scene has joints other than hinges, or no motors.
         UnstableSimulationError: if a simulation becomes unstable.
     """
     model = scene.model
     if (model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE).any() or not scene.num_actions:
-        raise ValueError(f"Scene {scene.name!r} must have hinges alone, and motors, to be logged by joint encoders.")
+        raise ValueError(f"Scene {scene.name!r} must have motors and no joints but hinges.")
     rng = np.random.default_rng(seed)
     command = spline_controls(scene, episodes, steps, rng)
-    acting = _motors(command, scene, delay, time_constant, play)
-    found = Simulator(scene).rollout(sample_start_states(scene, episodes, rng), acting)
-    if unstable := int((~found["stable"]).sum()):
+    action = _motors(command, scene, delay, time_constant, play)
+    rollout = Simulator(scene).rollout(sample_start_states(scene, episodes, rng), action)
+    if unstable := int((~rollout["stable"]).sum()):
         raise UnstableSimulationError(f"{unstable} of {episodes} episodes became unstable; try another seed.")
-    physics: np.ndarray = cast(torch.Tensor, found.get("physics")).numpy()
+    physics: np.ndarray = cast(torch.Tensor, rollout.get("physics")).numpy()
     angle = physics[:, :, 1 : 1 + model.nq]  # after the time
     measured = angle + noise * rng.normal(size=angle.shape)
     measured = np.round(measured / quantum) * quantum if quantum > 0 else measured
     velocity = np.diff(measured, axis=1) / scene.timestep
-    # The first row has no velocity yet; the last no command that was carried out.
+    # The first row has no velocity, the last no executed command.
     rows = episodes * (steps - 1)
     return RobotLog(
         angle=measured[:, 1:-1].reshape(rows, -1),
@@ -79,15 +74,15 @@ def simulate_log(
 
 
 def _motors(command: np.ndarray, scene: Scene, delay: int, time_constant: float, play: float) -> np.ndarray:
-    """What motors do ``[n, T, A]`` under commands ``[n, T, A]``."""
+    """Return the actions ``[n, T, A]`` of motors under commands ``[n, T, A]``."""
     width = play * (scene.action_high - scene.action_low) / 2
     share = 1.0 if time_constant <= 0 else 1 - np.exp(-scene.timestep / time_constant)
     rest = np.clip(np.zeros(scene.num_actions), scene.action_low, scene.action_high)
     held = np.broadcast_to(rest, command[:, 0].shape).copy()
-    moved, acting = held.copy(), np.empty_like(command)
+    lagged, action = held.copy(), np.empty_like(command)
     for step in range(command.shape[1]):
-        wanted = command[:, step - delay] if step >= delay else held
-        held = np.clip(held, wanted - width, wanted + width)
-        moved = moved + share * (held - moved)
-        acting[:, step] = moved
-    return acting
+        target = command[:, step - delay] if step >= delay else held
+        held = np.clip(held, target - width, target + width)
+        lagged = lagged + share * (held - lagged)
+        action[:, step] = lagged
+    return action

@@ -1,4 +1,4 @@
-"""Reading robot logs from .npz and .csv files."""
+"""Read robot logs from .npz and .csv files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from torchrl_gn.data.errors import DatasetError
-from torchrl_gn.data.robot_log import RobotLog
+from torchrl_gn.data.logs.robot_log import RobotLog
 
 _Arrays = dict[str, np.ndarray]
 
@@ -21,29 +21,24 @@ def load_robot_log(
 ) -> RobotLog:
     """Read a log of joint angles, velocities and commands.
 
-    ``.npz`` with arrays ``angle`` ``[R, J]``, ``velocity`` ``[R, J]``, ``command`` ``[R, A]`` (of one joint or command
-    also ``[R]``), and possibly
+    ``.npz`` with arrays ``angle`` ``[R, J]``, ``velocity`` ``[R, J]``, ``command`` ``[R, A]``, and optionally
 
-    - ``length`` ``[episodes]`` (rows of each), or ``episode`` ``[R]`` (a new one begins where it changes); by default
-      all rows are one episode,
-    - ``time`` ``[R]`` (time stamps, seconds), or ``timestep`` (seconds between rows),
-    - extra channels ``[R, J]`` under any other name (of one joint also ``[R]``), or ``[R, k J]``, which become
-      ``name0``, ``name1``, ... with the ``k`` numbers of a joint side by side.
+    - ``length`` ``[episodes]`` (rows of each) or ``episode`` ``[R]`` (a new one starts where it changes); default: one,
+    - ``time`` ``[R]`` (time stamps, seconds) or ``timestep`` (seconds between rows),
+    - extra channels: any other name ``[R, J]``, or ``[R, k J]`` with the ``k`` numbers of a joint side by side, which
+      become ``name0``, ``name1``, ...
 
-    ``.csv`` with a header: columns ``angle0``, ``angle1``, ..., ``velocity0``, ..., ``command0``, ..., extra channels
-    likewise, and possibly ``episode`` and ``time``.
-
-    Other arrays are not read, and listed in :attr:`RobotLog.unread`.
+    A single column may be ``[R]``. ``.csv`` has the same as columns ``angle0``, ``angle1``, ... under a header. Other
+    arrays are listed in :attr:`RobotLog.unread`.
 
     Args:
         path: the file.
-        timestep: time between rows, seconds, where the file does not say it.
-        names: what the file calls things, by what they are called here: ``{"angle": "q", "velocity": "dq"}``; map
-            what is to be left out to ``""``. ``{"command": ""}``: a robot without motors.
+        timestep: time between rows, seconds, if the file does not have it.
+        names: name in the file of each array, as ``{"angle": "q", "velocity": "dq"}``; ``""`` leaves an array out, and
+            ``{"command": ""}`` means a robot without motors.
 
     Raises:
-        DatasetError: if the file is missing, of another kind, lacks something, contradicts itself or ``timestep``, or
-            shapes do not fit.
+        DatasetError: if the file is missing, invalid, incomplete, or contradicts itself or ``timestep``.
     """
     path = Path(path)
     if not path.is_file():
@@ -61,8 +56,8 @@ def load_robot_log(
     missing = [name for name in needed if name not in arrays]
     if missing:
         raise DatasetError(
-            f"{path} lacks {missing}; it has {sorted(arrays)}. Say what they are called with names={{...}}; of a robot"
-            ' without motors, names={command: ""}.'
+            f"{path} lacks {missing}; it has {sorted(arrays)}. Give their names in the file with names={{...}}; for a"
+            ' robot without motors, names={command: ""}.'
         )
     if passive:
         arrays["command"] = np.zeros((len(arrays["angle"]), 0))
@@ -96,14 +91,14 @@ def _read_csv(path: Path) -> _Arrays:
 
 
 def _renamed(arrays: _Arrays, names: Mapping[str, str], path: Path) -> tuple[_Arrays, dict[str, str]]:
-    """Arrays as they are called here, and those that another one took the name of."""
-    for here, there in names.items():
-        if there and there not in arrays:
-            raise DatasetError(f"{path} has no {there!r} (for {here!r}); it has {sorted(arrays)}.")
-    taken = {here: arrays[there] for here, there in names.items() if there}
+    """Apply ``names``, and return why arrays that lost their name are not read."""
+    for name, source in names.items():
+        if source and source not in arrays:
+            raise DatasetError(f"{path} has no {source!r} (for {name!r}); it has {sorted(arrays)}.")
+    renamed = {name: arrays[source] for name, source in names.items() if source}
     rest = {name: values for name, values in arrays.items() if name not in names.values()}
     unread = {name: f"{names[name]!r} was named for it" for name in rest if names.get(name)}
-    return {name: values for name, values in rest.items() if name not in names} | taken, unread
+    return {name: values for name, values in rest.items() if name not in names} | renamed, unread
 
 
 def _columns(values: np.ndarray) -> np.ndarray:
@@ -111,7 +106,7 @@ def _columns(values: np.ndarray) -> np.ndarray:
 
 
 def _of_every_row(arrays: _Arrays, name: str, rows: int, *, number: bool) -> np.ndarray | None:
-    """Take out an array ``[R]``; one that is something else stays, to be listed as not read."""
+    """Remove and return an array ``[R]``; leave anything else, to be listed as not read."""
     values = arrays.get(name, np.zeros(0))
     if values.shape not in ((rows,), (rows, 1)) or (number and not np.issubdtype(values.dtype, np.number)):
         return None
@@ -120,7 +115,7 @@ def _of_every_row(arrays: _Arrays, name: str, rows: int, *, number: bool) -> np.
 
 
 def _length(arrays: _Arrays, rows: int, path: Path) -> np.ndarray:
-    """Rows of each episode."""
+    """Return the rows of each episode."""
     episode = _of_every_row(arrays, "episode", rows, number=False)
     begins = [0] if episode is None else np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
     length = np.atleast_1d(arrays.pop("length", np.diff(np.r_[begins, rows]))).astype(np.int64)
@@ -132,7 +127,7 @@ def _length(arrays: _Arrays, rows: int, path: Path) -> np.ndarray:
 def _timestep(
     own: np.ndarray | None, time: np.ndarray | None, length: np.ndarray, given: float | None, path: Path
 ) -> float:
-    """Seconds between rows, which file, time stamps and caller must agree about."""
+    """Return the seconds between rows, on which file, time stamps and caller must agree."""
     steps = np.zeros(0)
     if time is not None:
         steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)  # within episodes
@@ -148,14 +143,14 @@ def _timestep(
     if max(said.values()) > 1.01 * min(said.values()):
         raise DatasetError(
             f"{path}: seconds between rows are {' but '.join(f'{step:g} ({who})' for who, step in said.items())}; leave"
-            ' what is wrong out, with names={time: ""} or names={timestep: ""}. For other steps than the log\'s own,'
-            " resample= its trajectories."
+            ' out what is wrong, with names={time: ""} or names={timestep: ""}. To change the time step,'
+            " resample= the trajectories."
         )
     return next(iter(said.values()))
 
 
 def _extras(arrays: _Arrays, shape: tuple[int, int], path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Further channels of every joint, and why other arrays are none."""
+    """Return further channels of every joint, and why other arrays are not read."""
     extra, unread, (rows, joints) = {}, {}, shape
     for name, values in arrays.items():
         if joints == 1 and values.shape == (rows,):
@@ -169,7 +164,7 @@ def _extras(arrays: _Arrays, shape: tuple[int, int], path: Path) -> tuple[dict[s
         count, rest = divmod(values.shape[1], joints)
         if rest:
             raise DatasetError(
-                f"{path}: {name!r} has {values.shape[1]} columns, which is no multiple of the {joints} joints;"
+                f"{path}: {name!r} has {values.shape[1]} columns, not a multiple of the {joints} joints;"
                 f' leave it out with names={{{name!r}: ""}}.'
             )
         for index in range(count):
