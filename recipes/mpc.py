@@ -48,7 +48,7 @@ from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.pretrained import load_model, pretrained_names
-from torchrl_gn.rewards import FixTask, Reward, make_reward
+from torchrl_gn.rewards import FreezeGoal, Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
 from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.run_folder import CONFIG_FILE
@@ -362,7 +362,7 @@ def main(cfg: DictConfig) -> None:
         if not torch.allclose(played.records["state"][0], start["state"]):
             raise ValueError(f"{played.path} began in other states than the other planners do; name a new run_dir.")
         planner = make_planner(name, cfg, env, imagined, len(played))
-        policy = planner if target is None else TensorDictSequential([FixTask(reward), planner])
+        policy = planner if target is None else TensorDictSequential([FreezeGoal(reward), planner])
         play(cfg, name, policy, env, imagined, played)
         of = summarize(cfg, played, target if reward.target_shape == (3,) else None)
         metrics |= {f"{name}/{key}": value for key, value in of.items()}

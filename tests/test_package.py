@@ -29,7 +29,7 @@ ALLOWED["rewards"] -= {"data", "networks", "dynamics", "identification", "polici
 ALLOWED["objectives"] -= {"data"}
 ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders
 LATER = (ast.FunctionDef, ast.AsyncFunctionDef)  # what is imported in there is not when the package is
-WITH_PILLOW = {"drawing.py", "gl_frames.py"}  # imported to draw a video, once Pillow was found
+WITH_PILLOW = {"drawing.py"}  # imported to draw a video, once Pillow was found
 
 
 def imports(tree: ast.AST) -> list[str]:

@@ -30,7 +30,7 @@ _GAIN = 1.3  # of more threads, to be worth their cores
 
 
 def diagnose() -> str:
-    """Describe processor, libraries, speeds and rendering of this machine, with advice at the end.
+    """Describe processor, libraries and speeds of this machine, with advice at the end.
 
     Takes a few seconds. Bug reports begin with it.
 
@@ -39,12 +39,11 @@ def diagnose() -> str:
     """
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     seconds = _thread_seconds(threads)
-    compiler, renderer, gpus = _compiler(), _renderer(), _gpus()
+    compiler, gpus = _compiler(), _gpus()
     sections = {
-        "System": _system(threads),
+        "System": [*_system(threads), ("GPU", ", ".join(gpus) or "none")],
         "Versions": [("python", sys.version.split()[0]), *package_versions().items()],
         "Libraries": [*_libraries(), ("C++ compiler", compiler or "none")],
-        "GPU and rendering": [("GPU", ", ".join(gpus) or "none"), ("OpenGL", renderer or "none: skeletons are drawn")],
         "Matrix products on one thread, GFLOP/s": _products(),
         f"{_MODEL}, ms on 1 and {threads} threads": [
             (name, f"{1e3 * one:.1f} and {1e3 * all_:.1f}") for name, (one, all_) in seconds.items()
@@ -135,27 +134,6 @@ def _compiler() -> str | None:
     except OSError:
         return None
     return done.stdout.splitlines()[0] if done.returncode == 0 and done.stdout else None
-
-
-def _renderer() -> str | None:
-    """OpenGL backend with which MuJoCo renders, tried in processes of their own: one that fails may crash."""
-    code = (
-        "import mujoco\nmodel = mujoco.MjModel.from_xml_string('<mujoco/>')\ndata = mujoco.MjData(model)\n"
-        "with mujoco.Renderer(model, 16, 16) as renderer:\n    renderer.update_scene(data)\n    renderer.render()\n"
-        "print('rendered')"
-    )
-    chosen = os.environ.get("MUJOCO_GL")
-    for backend in (chosen,) if chosen else ("egl", "osmesa", "glfw"):
-        environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
-        try:
-            done = subprocess.run(
-                [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
-            )
-        except subprocess.TimeoutExpired:
-            continue
-        if "rendered" in done.stdout:
-            return backend
-    return None
 
 
 def _gpus() -> list[str]:

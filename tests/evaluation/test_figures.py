@@ -24,7 +24,7 @@ from torchrl_gn.evaluation import (
     plot_training_curve,
     summary,
 )
-from torchrl_gn.evaluation.motion_figures import _align_signs, _node_index, _turned
+from torchrl_gn.evaluation.motion_figures import _align_signs, _node_index, _rotated
 
 from .conftest import moving_states
 
@@ -150,7 +150,7 @@ def test_rewards_over_planning_time(tmp_path, monkeypatch):
 def test_motions_count_whole_turns(scenes, tmp_path):
     angle = torch.linspace(0, 9, 40, dtype=torch.float64)
     turned = torch.stack((torch.cos(angle / 2), 0 * angle, torch.sin(angle / 2), 0 * angle), 1)
-    np.testing.assert_allclose(_turned(turned, turned[:1], 1), angle)
+    np.testing.assert_allclose(_rotated(turned, turned[:1], 1), angle)
     states = moving_states(scenes["swimmer6"], 40).expand(3, -1, -1, -1)
     panels = {"with control": (states, states[:, 20:])}
     path = plot_motions(panels, scenes["swimmer6"], tmp_path / "motions.png", labels=("a", "b", "c"))

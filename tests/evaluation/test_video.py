@@ -1,16 +1,14 @@
 from __future__ import annotations
 
 import math
-import subprocess
 import warnings
 
 import mujoco
 import numpy as np
 import pytest
-import torch
 from PIL import Image, ImageColor
 
-from torchrl_gn.evaluation import palette, rollout_frames, rollout_video
+from torchrl_gn.evaluation import canvas, rollout_frames, rollout_video
 from torchrl_gn.evaluation.camera import choose_view
 from torchrl_gn.evaluation.drawing import _nice, _outline
 from torchrl_gn.evaluation.geometry import SceneGeometry
@@ -123,7 +121,7 @@ def test_camera_follows_the_truth_only_where_place_does_not_matter(scenes, silen
     truth = moving_states(scene, 1)[:1].repeat(2, 1, 1)
     truth[1, 1:, 0] += 5.0
     frames = [np.asarray(frame) for frame in rollout_frames(scene, truth, size=128)]
-    blue = np.array(ImageColor.getrgb(palette.TRUTH))
+    blue = np.array(ImageColor.getrgb(canvas.TRUTH))
     places = [np.argwhere(np.abs(frame[60:].astype(int) - blue).sum(-1) < 80).mean(0) for frame in frames]
     np.testing.assert_allclose(places[0], places[1], atol=0.5)
 
@@ -137,7 +135,6 @@ def test_bad_input_is_named(scenes, tmp_path):
         (dict(truth=truth * math.nan), "not finite"),
         (dict(speed=0.0), "speed"),
         (dict(size=33), "even"),
-        (dict(engine="opengl"), "opengl"),
     ]
     for change, message in cases:
         options = dict(scene=scene, truth=truth, prediction=truth, path="v.gif") | change
@@ -145,31 +142,3 @@ def test_bad_input_is_named(scenes, tmp_path):
         with pytest.raises(ValueError, match=message):
             rollout_video(**options)
     assert not list(tmp_path.iterdir())
-
-
-def test_gl_renders_or_says_why_not(scenes, silent, monkeypatch):
-    truth = moving_states(scenes["swimmer6"], 1)
-    try:
-        frames = list(rollout_frames(scenes["swimmer6"], truth, truth, size=64, engine="gl"))
-    except RuntimeError as error:
-        assert 'engine="drawn"' in str(error)
-    else:
-        assert len(frames) == 2 and np.asarray(frames[0])[60:].std() > 5
-    monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    with pytest.raises(RuntimeError, match="nonsense"):
-        list(rollout_frames(scenes["swimmer6"], truth, size=64, engine="gl"))
-    assert torch.isfinite(truth).all()
-
-
-def test_a_gl_backend_that_hangs_is_given_up(scenes, silent, monkeypatch):
-    tried = []
-
-    def hang(command, *, env, timeout, **_):
-        tried.append(env["MUJOCO_GL"])
-        raise subprocess.TimeoutExpired(command, timeout)
-
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(subprocess, "run", hang)
-    with pytest.raises(RuntimeError, match="egl: nothing within 600 s; osmesa: .*; glfw: nothing within 600 s"):
-        list(rollout_frames(scenes["swimmer6"], moving_states(scenes["swimmer6"], 1), size=64, engine="gl"))
-    assert tried == ["egl", "osmesa", "glfw"]

@@ -18,7 +18,7 @@ from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.planners import GradientPlanner
-from torchrl_gn.rewards import FixTask, make_reward
+from torchrl_gn.rewards import FreezeGoal, make_reward
 from torchrl_gn.scenes import ParameterNames, load_scene
 
 STEP, SPEED_WEIGHT, CONTROL_COST, HORIZON = 0.1, 0.1, 0.02, 12
@@ -272,7 +272,7 @@ def test_a_task_is_fixed_when_planning_starts():
     start = env.reset(TensorDict(batch_size=[2]))
     start["target"] = start["state"][:, 1, :3] + torch.tensor([[2.0, 0, 0], [0, 2, 0]])
     with torch.no_grad():
-        played = env.rollout(3, TensorDictSequential(FixTask(reward), planner), tensordict=start, auto_reset=False)
+        played = env.rollout(3, TensorDictSequential(FreezeGoal(reward), planner), tensordict=start, auto_reset=False)
     assert played["action"].shape == (2, 3, scene.num_actions)
     assert (played["next", "reward"] != 0).any()
 

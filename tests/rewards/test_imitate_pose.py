@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.maths import quaternion
-from torchrl_gn.rewards import FixTask, ImitatePose, arm_reach, make_reward
+from torchrl_gn.rewards import FreezeGoal, ImitatePose, arm_reach, make_reward
 from torchrl_gn.scenes import load_scene
 
 # Two links of 0.3 m and 0.4 m on a post 1 m high; the tip is welded 0.1 m beyond the end.
@@ -163,8 +163,8 @@ def test_bad_targets_and_tasks_are_named(arm):
         reward(arm.state, None, arm.next_state, torch.zeros(4, 7))
 
 
-def test_fix_task_passes_the_target_on(arm):
-    fixed = FixTask(make_reward("palm_pose", arm.scene))(
+def test_freeze_goal_passes_the_target_on(arm):
+    fixed = FreezeGoal(make_reward("palm_pose", arm.scene))(
         TensorDict({"state": arm.state, "target": arm.path[:, 2]}, batch_size=[4])
     )
     assert torch.equal(fixed["task"], arm.path[:, 2])

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from torchrl_gn.envs import SceneEnv
-from torchrl_gn.rewards import FixTask, Reach, make_reward
+from torchrl_gn.rewards import FreezeGoal, Reach, make_reward
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_task_is_in_the_dtype_of_the_state(swimming, reward):
 
 def test_missing_or_misshapen_tasks_are_named(swimming, reward):
     state = swimming.state
-    with pytest.raises(ValueError, match=r"Reach needs a task: .*'target' \[3\].*FixTask"):
+    with pytest.raises(ValueError, match=r"Reach needs a task: .*'target' \[3\].*FreezeGoal"):
         reward(state, None, state)
     for bad in (torch.ones(4, 2), torch.ones(()), torch.ones(2, 3), torch.ones(2, 4, 3)):
         with pytest.raises(ValueError, match=r"task of Reach must be \[4, 3\]"):
@@ -109,14 +109,14 @@ def test_one_task_serves_a_whole_batch(swimming, reward):
     assert torch.equal(one, many) and one.shape == (4, 30, 1)
 
 
-def test_fix_task_writes_the_task_of_every_step(swimming, reward):
+def test_freeze_goal_writes_the_task_of_every_step(swimming, reward):
     """In front of a policy, in the true environment: the target travels with the episode."""
     env = SceneEnv(swimming.scene, reward, num_threads=1, seed=0)
     actions = iter(swimming.actions[0].float())
     policy = TensorDictModule(lambda state: next(actions), in_keys=["state"], out_keys=["action"])
     start = env.reset()
     start["target"] = torch.tensor([3.0, 4.0, 0.0], dtype=torch.float64)
-    played = env.rollout(10, TensorDictSequential(FixTask(reward), policy), tensordict=start, auto_reset=False)
+    played = env.rollout(10, TensorDictSequential(FreezeGoal(reward), policy), tensordict=start, auto_reset=False)
     assert torch.equal(played["target"], start["target"].expand(10, 3))
     head, after = played["state"][:, 1, :2], played["next", "state"][:, 1, :2]
     way = start["target"][:2] - head
@@ -135,19 +135,19 @@ def test_without_a_task_the_environment_says_what_is_missing(swimming, reward):
         SceneEnv(swimming.scene, reward, num_threads=1, seed=0).rollout(2)
 
 
-def test_fix_task_needs_a_reward_with_target_and_its_entries(swimming, steps, reward):
+def test_freeze_goal_needs_a_reward_with_target_and_its_entries(swimming, steps, reward):
     with pytest.raises(TypeError, match="takes a Reward, .* got function"):
-        FixTask(lambda *args: None)
-    with pytest.raises(ValueError, match=r"Balance\(.*\) needs no target: leave FixTask out"):
-        FixTask(make_reward("balance", steps("pendulum").scene))
-    fix = FixTask(reward)
-    assert (fix.in_keys, fix.out_keys) == (["state", "target"], ["task"])
+        FreezeGoal(lambda *args: None)
+    with pytest.raises(ValueError, match=r"Balance\(.*\) needs no target: leave FreezeGoal out"):
+        FreezeGoal(make_reward("balance", steps("pendulum").scene))
+    freeze = FreezeGoal(reward)
+    assert (freeze.in_keys, freeze.out_keys) == (["state", "target"], ["task"])
     with pytest.raises(KeyError, match=r"needs an entry 'target' \[4, 3\]"):
-        fix(TensorDict({"state": swimming.state}, batch_size=[4]))
+        freeze(TensorDict({"state": swimming.state}, batch_size=[4]))
     with pytest.raises(KeyError, match="needs an entry 'state'"):
-        fix(TensorDict({"target": torch.ones(4, 3)}, batch_size=[4]))
+        freeze(TensorDict({"target": torch.ones(4, 3)}, batch_size=[4]))
     with pytest.raises(ValueError, match="target of Reach"):
-        fix(TensorDict({"state": swimming.state, "target": torch.ones(4, 2)}, batch_size=[4]))
+        freeze(TensorDict({"state": swimming.state, "target": torch.ones(4, 2)}, batch_size=[4]))
     torch.testing.assert_close(
-        fix(state=swimming.state, target=torch.ones(4, 3)), reward.task_of(swimming.state, torch.ones(4, 3))
+        freeze(state=swimming.state, target=torch.ones(4, 3)), reward.task_of(swimming.state, torch.ones(4, 3))
     )

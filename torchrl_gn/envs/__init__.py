@@ -1,4 +1,4 @@
-"""Scenes as TorchRL environments: the true physics and the learned model, with the same specs."""
+"""TorchRL environments of scenes: true physics and learned model, with the same specs."""
 
 from torchrl_gn.envs.batched import batched as batched
 from torchrl_gn.envs.model_env import ModelEnv as ModelEnv

@@ -1,4 +1,4 @@
-"""A fixed number of environments, as collectors want them."""
+"""A fixed number of environments, for collectors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torchrl.envs import BatchSizeTransform, EnvBase, TransformedEnv
 
 
 class _Starts:
-    """Gives every sample of a batch a start of its own; the transform alone repeats one."""
+    """Reset every sample of a batch to its own start state."""
 
     def __init__(self, env: EnvBase, batch_size: torch.Size) -> None:
         self.env, self.batch_size = env, batch_size
@@ -20,16 +20,16 @@ class _Starts:
 
 
 def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
-    """A fixed number of environments out of one that takes any batch, each with its own starts.
+    """Fix the batch size of an environment that takes any batch; every sample gets its own start states.
 
-    TorchRL's ``BatchSizeTransform`` alone gives the whole batch one start, repeated, at its first reset.
+    TorchRL's ``BatchSizeTransform`` alone repeats one start state over the batch at the first reset.
 
     Args:
         env: a :class:`~torchrl_gn.envs.SceneEnv` or :class:`~torchrl_gn.envs.ModelEnv`.
-        *batch_size: how many.
+        *batch_size: number of environments.
 
     Returns:
-        The environment with this batch size, to which further transforms can be appended.
+        The environment with this batch size; append further transforms to it.
 
     Raises:
         ValueError: if a number is below 1.

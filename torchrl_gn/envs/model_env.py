@@ -22,30 +22,24 @@ from torchrl_gn.scenes.scene import Scene
 
 
 class ModelEnv(ModelBasedEnvBase):
-    """Imagined steps of a learned model, with the specs of :class:`~torchrl_gn.envs.SceneEnv`.
+    """Steps predicted by a learned model, with the specs of :class:`~torchrl_gn.envs.SceneEnv`.
 
-    Stateless and batched over any leading batch, as ``SceneEnv``, but without its
-    ``physics`` entry: TensorDicts of the true environment can be stepped here, and so a
-    planner on the model acts in the true environment. A step is differentiable in
-    ``state``, ``action`` and the model's weights; nothing is detached and whoever wants
-    gradients keeps autograd on (freeze the weights to plan).
+    Stateless and batched over any leading batch, as ``SceneEnv``, but without its ``physics`` entry: TensorDicts of the
+    true environment can be stepped here, so a planner on the model acts in the true environment. A step is
+    differentiable in ``state``, ``action`` and the model's weights; nothing is detached (freeze the weights to plan).
 
-    A prediction that is not finite does not raise: the step keeps the last good
-    state, sets ``done`` and ``terminated`` and gives ``unstable_reward``. (Gradients through
-    such a step may be NaN.) It is not looked for between steps, so that a GPU never waits:
-    imagined rollouts run their full length and do not reset themselves
-    (:meth:`any_done` is False); ``TransformedEnv`` around it does both.
+    A prediction that is not finite does not raise: the step keeps the last good state, sets ``done`` and ``terminated``
+    and gives ``unstable_reward``. Gradients through such a step may be NaN. To avoid waiting for a GPU, rollouts do not
+    check ``done``: they run their full length without resets (:meth:`any_done` is False). ``TransformedEnv`` around the
+    environment checks and resets.
 
-    The model is the submodule ``world_model``: it follows ``to()`` and its weights are among
-    the environment's parameters. A loss that must not train them keeps the environment
-    out of its submodules.
+    The model is the submodule ``world_model``: it follows ``to()``, and its weights are among the environment's
+    parameters. A loss that must not train them keeps the environment out of its submodules.
 
-    ``reset()`` draws true start states and observes them; ``reset(tensordict,
-    set_state=True)`` starts from the TensorDict's ``state``. A model that reads physical parameters of
-    every sample (``parameters_key``) gets those of the TensorDict, or else its scene's (of an inferred
-    graph zeros: nothing is known); where an episode ends and another begins within a rollout, TorchRL hands none on. A
-    recurrent model's ``hidden_state`` is carried along, from the
-    TensorDict's or from nothing.
+    ``reset()`` draws true start states; ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state``. A
+    model with physical parameters per sample (``parameters_key``) reads them from the TensorDict; without them it gets its
+    scene's, or zeros for an inferred graph. TorchRL does not carry them across auto-resets. The hidden state of a
+    recurrent model is the entry ``hidden_state``; without one it starts at its initial value.
 
     Args:
         model: module with ``in_keys`` holding ``"state"`` and ``"action"``, ``out_keys`` holding
@@ -53,17 +47,17 @@ class ModelEnv(ModelBasedEnvBase):
             :class:`~torchrl_gn.dynamics.Predictor`.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
         start_states: ``[M, S]`` full MuJoCo states to start from, or a function
-            ``(n, generator) -> [n, S]``. Default: the system's reset distribution. Of a robot that is known by its
-            joints alone (:class:`~torchrl_gn.scenes.KinematicTree`): its states ``[M, N, C]``, those of a log, say.
+            ``(n, generator) -> [n, S]``. Default: the system's reset distribution. For a robot known by its joints
+            alone (:class:`~torchrl_gn.scenes.KinematicTree`): its states ``[M, N, C]``, for example of a log.
         unstable_reward: reward of a step whose prediction is not finite.
         seed: seed of the start states. Default: drawn from torch's global generator.
         device: where everything lives. Default: the model's device.
 
     Raises:
         TypeError: the model lacks these keys or the scene.
-        ValueError: start states, or when stepping ``state`` or ``action``, of a wrong shape; no start states of a
-            robot without a model; a reward of another scene; an ``unstable_reward``, or when resetting a ``state`` or
-            physical parameters, that are not finite.
+        ValueError: start states, ``state`` or ``action`` have a wrong shape; a robot of joints has no start states; the
+            reward is of another scene; ``unstable_reward``, or when resetting ``state`` or physical parameters, are not
+            finite.
         KeyError: when stepping, no ``state`` or ``action``.
     """
 
@@ -151,7 +145,7 @@ class ModelEnv(ModelBasedEnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
-        # The model writes into its input: give it a shallow copy. Of all that samples bring, for it may refuse some.
+        # The model writes into its input: give it a shallow copy, with all entries, some of which it may refuse.
         predicted = self.world_model(tensordict.exclude("next"))["next"]
         prediction = predicted["state"]
         stable = prediction.isfinite().flatten(-2).all(-1, keepdim=True)
@@ -168,20 +162,20 @@ class ModelEnv(ModelBasedEnvBase):
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def imagine(self, tensordict: TensorDictBase, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """States and rewards of whole sequences of actions, in one call of the model and one of the reward.
+        """States and rewards of action sequences, in one call of the model and one of the reward.
 
-        What as many steps give, much faster: for planners. (Only that nothing is held back here when a prediction is
-        not finite: it and its rewards show as they are.) Differentiable as steps are.
+        Same results as step by step, but much faster, for planners. Predictions that are not finite, and their
+        rewards, are returned as they are. Differentiable as :meth:`step` is.
 
         Args:
             tensordict: ``[*B]``, as for a step, without its ``action``.
             actions: ``[*B, H, A]``.
 
         Returns:
-            States ``[*B, H + 1, N, 13]``, the first being the TensorDict's, and rewards ``[*B, H, 1]``.
+            States ``[*B, H + 1, N, 13]``, beginning with the TensorDict's, and rewards ``[*B, H, 1]``.
 
         Raises:
-            ValueError: a wrong shape, or no action.
+            ValueError: ``actions`` or ``state`` have a wrong shape, or H is 0.
             KeyError: no ``state``.
         """
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
@@ -211,11 +205,11 @@ class ModelEnv(ModelBasedEnvBase):
         return states, step_reward(self.reward, before, actions, after, task)
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
-        """False: imagined rollouts run their full length (no wait for the GPU)."""
+        """False: rollouts run their full length, without waiting for a GPU."""
         return False
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The input: imagined rollouts do not reset themselves."""
+        """The input: rollouts do not reset."""
         return tensordict
 
     def _set_seed(self, seed: int | None) -> None:
@@ -225,5 +219,5 @@ class ModelEnv(ModelBasedEnvBase):
         return f"ModelEnv({self.scene.name!r})"
 
     def __getstate__(self) -> dict:
-        # Copies and worker processes start threads and MuJoCo data of their own.
+        # Copies and worker processes start their own threads and MuJoCo data.
         return {**super().__getstate__(), "_simulator": None}

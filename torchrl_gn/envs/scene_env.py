@@ -19,51 +19,45 @@ from torchrl_gn.scenes.scene import Scene
 class SceneEnv(EnvBase):
     """MuJoCo simulation of a scene, stateless and batched over any leading batch.
 
-    Everything that a step depends on is in the TensorDict: a step is a function of
-    (``physics``, ``action``) alone, so the same environment steps one state or many,
-    TorchRL's planners branch from any TensorDict, and a recorded step replays bit
-    for bit. Whole batches go to MuJoCo's threads in one call. Not differentiable:
-    gradients stop here (see :class:`~torchrl_gn.envs.ModelEnv`).
+    A step is a function of the TensorDict's ``physics`` and ``action`` alone: the same environment steps one state or
+    many, TorchRL's planners branch from any TensorDict, and recorded steps replay bit for bit. A batch is simulated by
+    MuJoCo's threads in one call. Not differentiable (:class:`~torchrl_gn.envs.ModelEnv` is).
 
     Entries:
         - ``state`` ``[*B, N, 13]`` float64: position 3, w-first quaternion 4, linear velocity 3,
           angular velocity 3 of each node; SI, world frame.
-        - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which body
-          states cannot give back.
+        - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which cannot be recovered
+          from ``state``.
         - ``action`` ``[*B, A]``: float32 in the spec, float64 accepted. MuJoCo clamps limited controls.
-        - ``variant`` ``[*B, 1]`` int64, only if there are several scenes: which of them a sample is of.
+        - ``variant`` ``[*B, 1]`` int64, with several scenes only: index of the sample's scene.
         - ``reward`` ``[*B, 1]`` float32; zero without ``reward``.
-        - ``done``, ``terminated`` ``[*B, 1]``: true only where the simulation became unstable.
-          Add TorchRL's ``StepCounter`` for a time limit.
+        - ``done``, ``terminated`` ``[*B, 1]``: true where the simulation became unstable. Add TorchRL's
+          ``StepCounter`` for a time limit.
 
-    Unstable simulations do not raise, so that one bad candidate cannot end a
-    planner's search: the step keeps the last good state, sets ``terminated`` and
-    gives ``unstable_reward``.
+    An unstable simulation does not raise, so that one bad candidate cannot end a planner's search: the step keeps the
+    last good state, sets ``terminated`` and gives ``unstable_reward``.
 
-    ``reset()`` draws start states for the batch of the TensorDict it gets. To start from
-    given ones pass ``physics`` and ask for it: ``reset(tensordict, set_state=True)``
-    (``set_state=False`` ignores the entry; TorchRL 0.14 warns when neither is said).
+    ``reset()`` draws start states for the TensorDict's batch; ``reset(tensordict, set_state=True)`` starts from its
+    ``physics``, or with several scenes from its ``variant`` alone. (``set_state=False`` ignores the entry; TorchRL 0.14
+    warns if ``set_state`` is not given.)
 
-    For a fixed number of environments in a collector: :func:`~torchrl_gn.envs.batched`.
-
-    Of several scenes, ``reset`` with ``set_state=True`` and an entry ``variant`` alone starts those variants.
+    Collectors need a fixed number of environments: :func:`~torchrl_gn.envs.batched`.
 
     Args:
-        scene: the scene, or variants of one (:func:`~torchrl_gn.scenes.sample_variants`). A batch starts with them in
-            turn, or with those that the TensorDict's ``variant`` says; ``env.scene`` is the first.
-        reward: function ``(state, action, next_state, task) -> [*B, 1]``, for example
-            from :func:`~torchrl_gn.rewards.make_reward`; ``task`` is the TensorDict's ``task``
-            entry or None.
+        scene: the scene, or variants of one (:func:`~torchrl_gn.scenes.sample_variants`). A batch cycles through them,
+            or follows the TensorDict's ``variant``; ``env.scene`` is the first.
+        reward: function ``(state, action, next_state, task) -> [*B, 1]``, for example from
+            :func:`~torchrl_gn.rewards.make_reward`; ``task`` is the TensorDict's entry or None.
         start_states: ``[M, S]`` full MuJoCo states to start from, or a function
             ``(n, generator) -> [n, S]``. Default: the system's reset distribution.
         num_threads: threads of the simulation. Default: all cores.
-        unstable_reward: reward of a step whose simulation became unstable.
+        unstable_reward: reward of an unstable step.
         seed: seed of the start states. Default: drawn from torch's global generator.
         device: where TensorDicts movable; the simulation runs on the CPU.
 
     Raises:
-        ValueError: start states of a wrong shape, a reward of another scene, or an ``unstable_reward`` that is not
-            finite; when stepping or resetting, an action or physics that is not finite or of a wrong shape.
+        ValueError: start states have a wrong shape, the reward is of another scene, or ``unstable_reward`` is not
+            finite; when stepping or resetting, ``action`` or ``physics`` is not finite or has a wrong shape.
         KeyError: when stepping, no ``physics`` or ``action``.
 
     Example:
@@ -106,7 +100,7 @@ class SceneEnv(EnvBase):
 
     @property
     def simulator(self) -> Simulator:
-        """The batched simulation, started when it is first needed."""
+        """The batched simulation, started at first use."""
         if self._simulator is None:
             self._simulator = Simulator(self.scenes, num_threads=self.num_threads)
         return self._simulator
@@ -131,7 +125,7 @@ class SceneEnv(EnvBase):
         return TensorDict(entries, batch_size=shape).to(self.device)
 
     def variant_of(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Which variant each sample is of ``[*B, 1]``, on the CPU; None where there is one scene."""
+        """Index ``[*B, 1]`` of each sample's variant, on the CPU; None for a single scene."""
         if len(self.scenes) == 1:
             return None
         variant = read(tensordict, "variant", (1,), self).cpu()
@@ -171,7 +165,7 @@ class SceneEnv(EnvBase):
         return f"SceneEnv({self.scene.name!r})"
 
     def __getstate__(self) -> dict:
-        # Copies and worker processes start threads and MuJoCo data of their own.
+        # Copies and worker processes start their own threads and MuJoCo data.
         return {**super().__getstate__(), "_simulator": None}
 
 

@@ -1,4 +1,4 @@
-"""What the two environments of a scene have in common: specs and the reward entry."""
+"""Specs and rewards shared by the two environments of a scene."""
 
 from __future__ import annotations
 
@@ -21,17 +21,16 @@ RewardFunction = Callable[..., Tensor]
 
 
 def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -> None:
-    """Give an environment the specs of a scene.
+    """Set an environment's specs for a scene.
 
-    Observations are float64, as simulated. Actions and rewards are float32, the
-    dtype of TorchRL's policies, value networks and planners; environments also
-    take float64 actions.
+    Observations are float64, as simulated. Actions and rewards are float32, the dtype of TorchRL's policies, value
+    networks and planners; environments also accept float64 actions.
 
     Args:
-        env: environment to set up, with its device already known.
+        env: environment to set up; its device is set already.
         scene: the scene.
-        physics: whether the full MuJoCo state is an entry of its own.
-        variants: how many variants of the scene there are; if several, an entry says which a sample is of.
+        physics: whether the full MuJoCo state is an entry.
+        variants: number of variants of the scene; if several, ``variant`` is an entry.
     """
     device = env.device
 
@@ -44,24 +43,24 @@ def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -
     if variants > 1:
         observation["variant"] = Bounded(0, variants - 1, shape=torch.Size((1,)), dtype=torch.int64, device=device)
     env.observation_spec = Composite(observation, device=device)
-    # What a step reads besides the action: the physics, or the state where that is all there is.
+    # A step reads these besides the action.
     carried = {"physics" if physics else "state", "variant"} & observation.keys()
     env.state_spec = Composite({key: observation[key].clone() for key in carried}, device=device)
     actions: dict[str, Any] = {"shape": torch.Size((scene.num_actions,)), "dtype": torch.float32, "device": device}
     low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (scene.action_low, scene.action_high))
-    # Of a robot that is known by its logs bounds may not be.
+    # The bounds of a robot known by its logs may be unknown.
     bounded = bool(low.isfinite().all() & high.isfinite().all())
     env.action_spec = Bounded(low=low, high=high, **actions) if bounded else Unbounded(**actions)
     env.reward_spec = Unbounded(shape=torch.Size((1,)), dtype=torch.float32, device=device)
 
 
 def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvBase) -> Tensor:
-    """Entry of a step's input, checked.
+    """Read and check an entry of a step's input.
 
     Args:
         tensordict: the step's input, batch ``[*B]``.
         key: name of the entry.
-        shape: its shape behind the batch.
+        shape: its shape without the batch.
         env: the environment, named in errors.
 
     Returns:
@@ -81,10 +80,10 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
 
 
 def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
-    """The reward function of an environment, on its device: a copy where it is elsewhere, for another environment.
+    """Reward function on the environment's device; a copy if it is on another device.
 
     Raises:
-        ValueError: it reads the bodies of another scene.
+        ValueError: the reward reads the bodies of another scene.
     """
     if not isinstance(reward, nn.Module):
         return reward
@@ -97,10 +96,10 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
 
 
 def finite_reward(value: float) -> float:
-    """Reward of an unstable step, checked.
+    """Check the reward of an unstable step.
 
     Raises:
-        ValueError: it is not finite: returns and averages would not be either.
+        ValueError: ``value`` is not finite, which would spoil returns and averages.
     """
     if not math.isfinite(value):
         raise ValueError(f"unstable_reward must be finite, got {value}; give a large negative number")

@@ -1,4 +1,4 @@
-"""Where episodes start."""
+"""Start states of episodes."""
 
 from __future__ import annotations
 
@@ -22,15 +22,13 @@ class StartSampler:
     """Draw start states of a scene, reproducibly.
 
     Args:
-        scene: the scene, or the first of its variants; or a robot that is known by its joints alone.
-        start_states: ``[M, S]`` full MuJoCo states to choose from, each equally likely,
-            or a function ``(n, generator) -> [n, S]``. Default: the system's own
-            reset distribution. Of a robot of joints: node states, ``[N, C]`` in place of ``[S]``; it has no default.
-        seed: seed of the draws. Default: one drawn from torch's global generator, so
-            that ``torch.manual_seed`` makes runs repeat.
+        scene: the scene, or the first of its variants; or a robot known by its joints alone.
+        start_states: ``[M, S]`` full MuJoCo states, drawn uniformly, or a function ``(n, generator) -> [n, S]``.
+            Default: the system's reset distribution. A robot of joints needs node states, ``[M, N, C]``.
+        seed: seed of the draws. Default: drawn from torch's global generator.
 
     Raises:
-        ValueError: the start states are not ``[M, S]`` of finite numbers, or there are none of a robot of joints.
+        ValueError: the start states are not ``[M, S]`` finite numbers, or a robot of joints has none.
     """
 
     def __init__(
@@ -53,7 +51,7 @@ class StartSampler:
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
-        """Start the draws afresh."""
+        """Restart the draws."""
         self._rng = numpy_generator(seed)
 
     def draw(
@@ -68,10 +66,10 @@ class StartSampler:
 
         Args:
             shape: the batch ``*B``.
-            reset: ``[*B]`` or ``[*B, 1]`` bool, which of them start anew (default all). The
-                others get a copy of one that does, to be overwritten by TorchRL.
-            variant: ``[*B, 1]`` which of several variants each of them is of.
-            simulator: of the scene, or its variants; None of a robot of joints.
+            reset: ``[*B]`` or ``[*B, 1]`` bool, samples to reset (default all). The others get a copy of one of
+                these, which TorchRL overwrites.
+            variant: ``[*B, 1]`` index of each sample's variant, if there are several.
+            simulator: simulator of the scene or its variants; None for a robot of joints.
 
         Returns:
             ``[*B, S]`` float64 full MuJoCo states, or ``[*B, N, C]``, on the CPU.

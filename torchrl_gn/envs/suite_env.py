@@ -35,21 +35,21 @@ def suite_env(
 ) -> EnvBase:
     """A suite task with its observation in one entry ``observation`` ``[num_envs, O]`` float32.
 
-    Physics, observation, reward and ends of episodes are the suite's own (by TorchRL's ``DMControlWrapper``, one after
-    the other in this process).
+    Physics, observation, reward and termination are the suite's, through TorchRL's ``DMControlWrapper``; environments
+    are stepped in turn in this process.
 
     Args:
-        domain: of the suite, for example ``"swimmer"``.
-        task: of the domain, for example ``"swimmer6"``; of the swimmer also any other number of links from 3 on.
-        num_envs: how many.
-        timestep: control step, seconds, a whole multiple of the physics step; by default the suite's.
-        steps: control steps in an episode; None: the suite's time limit.
-        keys: the suite's entries in the order that they are put together in, by default the suite's own.
-        seed: of start states and targets; every environment has its own.
+        domain: domain of the suite, for example ``"swimmer"``.
+        task: task of the domain, for example ``"swimmer6"``; swimmers may have any number of links from 3.
+        num_envs: number of environments.
+        timestep: control step, seconds, a multiple of the physics step; default: the suite's.
+        steps: control steps of an episode; None: the suite's time limit.
+        keys: the suite's entries to concatenate, in order; default: all, in the suite's order.
+        seed: seed of start states and targets; each environment derives its own.
 
     Raises:
-        ValueError: if there is no such task, the control step does not fit, or a number is not positive.
-        ImportError: if dm_control is not installed.
+        ValueError: there is no such task, the control step does not fit, or a number is not positive.
+        ImportError: dm_control is not installed.
 
     Example:
         >>> suite_env("swimmer", "swimmer6", num_envs=2, timestep=0.02).reset()["observation"].shape
@@ -63,7 +63,7 @@ def suite_env(
     env = SerialEnv(num_envs, [partial(make, seed=int(each)) for each in seeds])
     env = TransformedEnv(env, DoubleToFloat())
     for key in order:
-        axes = env.observation_spec[key].ndim - 1  # beside the environments'
+        axes = env.observation_spec[key].ndim - 1  # without the batch of environments
         if axes > 1:
             env.append_transform(FlattenObservation(-axes, -1, in_keys=[key]))
     env.append_transform(CatTensors(in_keys=list(order), out_key="observation", sort=False))
@@ -71,11 +71,11 @@ def suite_env(
 
 
 def observation_env(graph: ObservationGraph, domain: str, task: str, **options) -> EnvBase:
-    """The task whose observations a graph arranges, see :func:`suite_env`.
+    """The task that an observation graph describes, with the options of :func:`suite_env`.
 
     Raises:
-        ValueError: if the task's observation or action is another than the graph's, or actions do not lie in -1 to 1
-            (quadrupeds' and lqr's).
+        ValueError: the task's observation or action differs from the graph's, or actions are not bounded by -1 and 1
+            (as those of quadruped and lqr).
     """
     loaded = _load(domain, task, 0)
     low, high = loaded.action_spec().minimum, loaded.action_spec().maximum
@@ -93,7 +93,7 @@ def observation_env(graph: ObservationGraph, domain: str, task: str, **options) 
 
 @cache
 def _suite() -> tuple[Any, Any, Any]:
-    """The suite, its swimmers, and environments; imported when needed, and kept from looking for a display."""
+    """The suite, its swimmers and its environments, imported on demand without looking for a display."""
     before = os.environ.get("MUJOCO_GL")
     os.environ.setdefault("MUJOCO_GL", "off")
     try:
@@ -125,7 +125,7 @@ def _make(domain: str, task: str, timestep: float | None, steps: int | None, *, 
     physics_step = loaded.physics.timestep()
     if not 0 < step < np.inf or abs(step / physics_step - round(step / physics_step)) > 1e-6:
         raise ValueError(f"timestep={timestep} must be a positive multiple of the physics step, {physics_step} s.")
-    # Half a step less: an episode ends at the first step that reaches the limit, whatever its last digit is.
+    # Half a step less, so that rounding errors cannot add a step.
     limit = loaded._step_limit * loaded.control_timestep() if steps is None else (steps - 0.5) * step
     *_, control = _suite()
     env = control.Environment(loaded.physics, loaded.task, time_limit=limit, control_timestep=step)

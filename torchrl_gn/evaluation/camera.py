@@ -1,4 +1,4 @@
-"""From where a scene is looked at: the plane it moves in, or an oblique view of three dimensions."""
+"""Camera of a scene: straight at the plane of motion, or oblique for spatial motion."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class View:
 
 
 def choose_view(scene: Scene) -> View:
-    """Look straight at the plane that the scene moves in, or from the side and above.
+    """View straight at the plane of motion; oblique from above if the motion is spatial.
 
-    A scene is planar if no node moves along an axis or turns about the other two.
+    A scene is planar if no node moves along some axis or rotates about the other two.
     """
     movable = np.asarray(scene.movable.any(axis=0))
     x, y, z = np.eye(3)
-    # Looking from above for z; from the front, with z up, for the others.
+    # From above for z; from the front, with z up, for the others.
     for normal, (right, up) in ((1, (x, z)), (2, (x, y)), (0, (y, z))):
         others = [axis for axis in range(3) if axis != normal]
         if not movable[normal] and not movable[[3 + axis for axis in others]].any():
@@ -53,7 +53,7 @@ def choose_view(scene: Scene) -> View:
 
 
 def follow(scene: Scene, states: np.ndarray) -> np.ndarray:
-    """Point ``[T, 3]`` that the camera follows: the moving nodes' mean, along axes of translation invariance.
+    """Point ``[T, 3]`` that the camera follows: mean of the moving nodes, along translation-invariant axes only.
 
     Args:
         scene: the scene.

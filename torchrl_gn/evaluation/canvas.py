@@ -1,4 +1,4 @@
-"""What all figures share: drawn without a display or global pyplot state, and written atomically."""
+"""What figures and videos share: colours, and figures without a display or global pyplot state."""
 
 from __future__ import annotations
 
@@ -7,11 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.evaluation import palette
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+TRUTH = "#3b6ea5"
+PREDICTION = "#e0752d"
+AXES = ("#c23b4b", "#2e8b57", "#3b6ea5", "#8a5fbf")  # x, y, z and one more for quaternions
+SERIES = (TRUTH, PREDICTION, "#c23b4b", "#2e8b57", "#8a5fbf", "#b0892a", "#3fa3a3")  # lines or bars side by side
+INK = "#2b2f36"
+MUTED = "#8b929c"
+GRID = "#dfe3e8"
+PAPER = "#fbfbfc"
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
@@ -29,19 +37,24 @@ def new_figure(size: tuple[float, float]) -> Figure:
     return Figure(figsize=size, layout="constrained", facecolor="white")
 
 
+def series_color(number: int) -> str:
+    """Colour of a line or bar; repeats after the last one of ``SERIES``."""
+    return SERIES[number % len(SERIES)]
+
+
 def clean(axes: Axes) -> None:
     """Quiet grid and frame."""
-    axes.grid(color=palette.GRID, linewidth=0.7)
+    axes.grid(color=GRID, linewidth=0.7)
     axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8, color=palette.MUTED)
+    axes.tick_params(labelsize=8, color=MUTED)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
-        axes.spines[side].set_color(palette.MUTED)
+        axes.spines[side].set_color(MUTED)
 
 
 def save(figure: Figure, path: str | os.PathLike) -> Path:
-    """Write a figure, atomically; its path."""
+    """Write a figure atomically and return its path."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150)
     return Path(path)

@@ -1,4 +1,4 @@
-"""Draw a scene's shapes as flat outlines, without OpenGL: quick, and works on any machine."""
+"""Draw a scene's shapes as flat outlines; needs Pillow alone, no display."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from torchrl_gn.evaluation import palette
 from torchrl_gn.evaluation.camera import View, choose_view, follow
+from torchrl_gn.evaluation.canvas import GRID, INK, MUTED, PAPER, TRUTH
 from torchrl_gn.evaluation.geometry import SceneGeometry
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _OUTLINE = np.linspace(0, 2 * np.pi, 56, endpoint=False)
 _FAN = np.stack((np.cos(_OUTLINE), np.sin(_OUTLINE)), axis=-1)  # [K, 2] directions of the outline's corners
-_SMOOTH = 2  # pictures are drawn this much larger and reduced
+_SMOOTH = 2  # antialiasing: panels are drawn this much larger, then reduced
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,7 @@ class SceneDrawing:
 
     Args:
         scene: the scene.
-        truth: ``[T, N, 13]`` true states; they set the camera's place and scale, so
-            that predictions that drift away are seen to do so.
+        truth: ``[T, N, 13]`` true states. They alone set the camera, so that a drifting prediction is seen to drift.
         size: width and height of a panel, pixels.
     """
 
@@ -59,7 +58,7 @@ class SceneDrawing:
         self._follow = self.view.project(follow(scene, truth))
         self.truth = self.motion(truth)
         parts = [o for o, moves in zip(self.truth.outlines, self._moving, strict=True) if moves]
-        if not parts:  # a scene without visible moving geoms still has its frames
+        if not parts:  # no visible moving geoms: frame the nodes
             parts = [self.view.project(truth[:, :, :3])]
         seen = np.concatenate(parts, axis=1) - self._follow[:, None]
         low, high = seen.min(axis=(0, 1)), seen.max(axis=(0, 1))
@@ -69,7 +68,7 @@ class SceneDrawing:
             self._middle[1] = low[1] + 0.42 * self.extent  # little room below the lowest point
 
     def _find_floor(self, truth: np.ndarray) -> float | None:
-        """Height of the floor: its plane, or where a fixed base of a spatial scene stands."""
+        """Height of the floor plane, or of the lowest fixed point of a spatial scene."""
         if self.geometry.floor is not None or self.view.planar:
             return self.geometry.floor
         positions, rotations = self.geometry.poses(truth[:1])
@@ -81,7 +80,7 @@ class SceneDrawing:
         return float(min(lowest)) if lowest else None
 
     def motion(self, states: np.ndarray) -> Motion:
-        """Outlines of states ``[T, N, 13]``; states that are not finite are marked and not drawn."""
+        """Outlines of states ``[T, N, 13]``; non-finite states are marked invalid."""
         valid = np.asarray(np.isfinite(states).all(axis=(1, 2)))
         states = np.where(valid[:, None, None], states, 0.0)
         positions, rotations = self.geometry.poses(states)
@@ -98,30 +97,25 @@ class SceneDrawing:
         return Motion(outlines, order.astype(int), shadows, self.view.project(self.geometry.anchors(states)), valid)
 
     def panel(self, step: int, motion: Motion, color: str, *, ghost: bool = False) -> Image.Image:
-        """One panel at ``_SMOOTH`` times its size; with ``ghost`` the truth stands pale behind the motion."""
-        image = Image.new("RGB", (self.size * _SMOOTH, self.size * _SMOOTH), palette.PAPER)
+        """One panel at ``_SMOOTH`` times its size; ``ghost`` draws the truth pale behind the motion."""
+        image = Image.new("RGB", (self.size * _SMOOTH, self.size * _SMOOTH), PAPER)
         draw = ImageDraw.Draw(image)
         self._ground(draw, step)
         if motion.valid[step]:
             for shadow, moves in zip(motion.shadows, self._moving, strict=False):
                 if moves:
-                    self._polygon(draw, step, shadow[step], _mix(palette.MUTED, palette.PAPER, 0.62), None)
+                    self._polygon(draw, step, shadow[step], _mix(MUTED, PAPER, 0.62), None)
         self._shapes(draw, step, self.truth, None)
         if ghost:
-            pale = _mix(palette.TRUTH, palette.PAPER, 0.72)
-            self._shapes(draw, step, self.truth, pale, edge=_mix(palette.TRUTH, palette.PAPER, 0.5))
+            pale = _mix(TRUTH, PAPER, 0.72)
+            self._shapes(draw, step, self.truth, pale, edge=_mix(TRUTH, PAPER, 0.5))
         if motion.valid[step]:
             self._shapes(draw, step, motion, color)
             self._joint_dots(draw, step, motion)
         else:
             middle = self.size * _SMOOTH / 2
-            draw.text(
-                (middle, middle),
-                "prediction diverged",
-                palette.INK,
-                ImageFont.load_default(18 * _SMOOTH),
-                "mm",
-            )
+            font = ImageFont.load_default(18 * _SMOOTH)
+            draw.text((middle, middle), "prediction diverged", INK, font, "mm")
         return image
 
     def _pixels(self, step: int, points: np.ndarray) -> np.ndarray:
@@ -130,7 +124,7 @@ class SceneDrawing:
 
     def _polygon(self, draw: ImageDraw.ImageDraw, step: int, points: np.ndarray, fill, edge, width: int = 0) -> None:
         pixels = self._pixels(step, points)
-        # Far outside the panel; huge coordinates of a bad prediction would overflow the drawing library.
+        # Skip what lies far outside: huge coordinates would overflow Pillow.
         if np.abs(pixels).max() > 20 * self.size * _SMOOTH:
             return
         corners = list(map(tuple, pixels.tolist()))
@@ -139,17 +133,17 @@ class SceneDrawing:
             draw.line([*corners, *corners[:2]], fill=edge, width=width, joint="curve")
 
     def _shapes(self, draw: ImageDraw.ImageDraw, step: int, motion: Motion, color, edge=None) -> None:
-        """Moving shapes in ``color``; the fixed ones, grey, where ``color`` is None."""
+        """Moving shapes in ``color``; without ``color`` the fixed ones, grey."""
         for index in motion.order[step]:
             if self._moving[index] == (color is None):
                 continue
             node = int(self.geometry.geom_node[self.geometry.shapes[index].geom])
             if color is None:
-                fill, rim = _mix(palette.MUTED, palette.PAPER, 0.6), _mix(palette.MUTED, palette.PAPER, 0.2)
+                fill, rim = _mix(MUTED, PAPER, 0.6), _mix(MUTED, PAPER, 0.2)
             elif edge is not None:
                 fill, rim = color, edge
             else:
-                # Neighbouring bodies in two tints, so that the joints between them can be seen.
+                # Two tints tell neighbouring bodies apart.
                 fill, rim = _mix(color, "#ffffff", 0.12 + 0.2 * (node % 2)), _mix(color, "#000000", 0.35)
             self._polygon(draw, step, motion.outlines[index][step], fill, rim, width=round(1.2 * _SMOOTH))
 
@@ -159,14 +153,14 @@ class SceneDrawing:
         radius = self.size * _SMOOTH / 180
         for x, y in self._pixels(step, motion.joints[step]).tolist():
             if abs(x) + abs(y) < 20 * self.size * _SMOOTH:
-                draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="white", outline=palette.INK)
+                draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="white", outline=INK)
 
     def _ground(self, draw: ImageDraw.ImageDraw, step: int) -> None:
         spacing = _nice(self.extent / 4)
         center = self._follow[step] + self._middle
         low, high = center - self.extent / 2, center + self.extent / 2
         side, line = self.size * _SMOOTH, _SMOOTH
-        grid = palette.GRID
+        grid = GRID
         if self.view.planar and self.view.up[2] == 0:  # from above: a grid that stays where it is
             for axis in range(2):
                 for value in _ticks(low[axis], high[axis], spacing):
@@ -179,8 +173,8 @@ class SceneDrawing:
             if self._floor is not None:
                 at = self._pixels(step, np.array([0.0, self._floor]))[1]
                 if at < side:
-                    draw.rectangle((0, at, side, side), fill=_mix(palette.MUTED, palette.PAPER, 0.75))
-                    draw.line((0, at, side, at), fill=palette.MUTED, width=2 * line)
+                    draw.rectangle((0, at, side, side), fill=_mix(MUTED, PAPER, 0.75))
+                    draw.line((0, at, side, at), fill=MUTED, width=2 * line)
         elif self._floor is not None:
             # The floor point behind the picture's centre, from which a patch of grid spreads.
             view, height = self.view, self._floor
@@ -207,12 +201,12 @@ def _ticks(low: float, high: float, spacing: float) -> np.ndarray:
 
 
 def _nice(value: float) -> float:
-    """The number of the form 1, 2 or 5 times a power of ten nearest below ``value``."""
+    """Largest number up to ``value`` of the form 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return power * max(factor for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))
 
 
 def _mix(color: str | tuple[int, int, int], other: str, part: float) -> tuple[int, int, int]:
-    """``part`` of ``other`` in ``color``."""
+    """Blend of two colours, with a share ``part`` of ``other``."""
     a, b = (ImageColor.getrgb(c) if isinstance(c, str) else c for c in (color, other))
     return tuple(round((1 - part) * x + part * y) for x, y in zip(a, b, strict=True))  # type: ignore[return-value]

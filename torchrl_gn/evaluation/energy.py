@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def kinetic_energy(state: Tensor, scene: Scene) -> Tensor:
-    """Kinetic energy of all moving bodies, joints' armature left out.
+    """Kinetic energy of all moving bodies, without joint armature.
 
     Args:
         state: ``[..., N, 13]``.
@@ -33,8 +33,8 @@ def kinetic_energy(state: Tensor, scene: Scene) -> Tensor:
 
     mass, moves = columns["mass"].to(state), torch.as_tensor(scene.predicted).to(state)
     orientation, linear, angular = state[..., 3:7], state[..., 7:10], state[..., 10:13]
-    arm = quaternion.rotate(orientation, feature("ipos", 3))
-    velocity = linear + torch.linalg.cross(angular, arm)
+    offset = quaternion.rotate(orientation, feature("ipos", 3))
+    velocity = linear + torch.linalg.cross(angular, offset)
     principal = quaternion.product(orientation, feature("iquat", 4))
     spin = quaternion.rotate(quaternion.conjugate(principal), angular)
     energy = mass * velocity.square().sum(-1) + (feature("inertia", 3) * spin.square()).sum(-1)

@@ -1,21 +1,28 @@
-"""Figures of numbers: errors, training, run time."""
+"""Figures of numbers: errors, training, run time.
+
+Each writes one file, in the format of the path's suffix, and returns the written path.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from torch import Tensor
 
-from torchrl_gn.evaluation import palette
-from torchrl_gn.evaluation.canvas import clean, new_figure, save
+from torchrl_gn.evaluation.canvas import INK, MUTED, SERIES, TRUTH, clean, new_figure, save, series_color
 from torchrl_gn.evaluation.error_table import ErrorTable
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _WIDEST = 12.0  # inches of panels side by side
+_CURVES = (6.4, 3.8)  # inches of a figure of curves
 
 
 def plot_loglog(
@@ -24,24 +31,20 @@ def plot_loglog(
     *,
     ylabel: str,
 ) -> Path:
-    """Lines on logarithmic axes, one panel beside the other.
+    """Lines on logarithmic axes, panels side by side.
 
     Args:
         panels: ``(x, y)`` by label, by the name of the panel's horizontal axis.
-        path: file to write; its suffix is the format.
+        path: file to write.
         ylabel: name of the vertical axis.
-
-    Returns:
-        The written path.
     """
     figure = new_figure((4.2 * len(panels) + 0.6, 3.8))
-    colors = palette.SERIES
     for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for number, (label, (x, y)) in enumerate(lines.items()):
-            axes.loglog(x, y, color=colors[number % len(colors)], label=label, linewidth=1.6, marker="o", markersize=4)
+            axes.loglog(x, y, color=series_color(number), label=label, linewidth=1.6, marker="o", markersize=4)
         counts = sorted({value for x, _ in lines.values() for value in x})
         if all(float(value).is_integer() for value in counts) and len(counts) < 10:
-            axes.set_xticks(counts, [f"{value:,.0f}" for value in counts])  # of powers of ten labels may overlap
+            axes.set_xticks(counts, [f"{value:,.0f}" for value in counts])  # labels of powers of ten may overlap
             axes.set_xticks([], minor=True)
         axes.set_xlabel(xlabel)
         axes.set_ylabel(ylabel)
@@ -53,92 +56,69 @@ def plot_loglog(
 def plot_rewards(
     rewards: Mapping[str, Tensor], path: str | os.PathLike, *, timestep: float, ylabel: str = "reward"
 ) -> Path:
-    """Reward over time, a line for every planner or policy: the mean of its episodes, and pale from worst to best.
+    """Reward over time for planners or policies: mean of the episodes, in a pale band from worst to best.
 
     Args:
-        rewards: ``[B, T]`` by label; NaN where an episode was over.
-        path: file to write; its suffix is the format.
+        rewards: ``[B, T]`` by label; NaN after the end of an episode.
+        path: file to write.
         timestep: seconds of a control step.
         ylabel: name of the vertical axis.
-
-    Returns:
-        The written path.
     """
-    figure = new_figure((6.4, 3.8))
+    figure = new_figure(_CURVES)
     axes = figure.subplots()
-    colors = palette.SERIES
     for number, (label, values) in enumerate(rewards.items()):
         values = values.detach().double().cpu().numpy()
-        time, color = timestep * np.arange(1, values.shape[1] + 1), colors[number % len(colors)]
-        going = np.isfinite(values).any(0)  # while there is one to draw
-        time, values = time[going], values[:, going]
-        low, high, middle = np.nanmin(values, 0), np.nanmax(values, 0), np.nanmean(values, 0)
-        axes.fill_between(time, low, high, color=color, alpha=0.15, linewidth=0)
-        axes.plot(time, middle, color=color, label=label, linewidth=1.6)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel(ylabel)
-    axes.legend(frameon=False, fontsize=9)
-    clean(axes)
+        time = timestep * np.arange(1, values.shape[1] + 1)
+        running = np.isfinite(values).any(0)  # steps that some episode reaches
+        time, values = time[running], values[:, running]
+        band = np.nanmin(values, 0), np.nanmean(values, 0), np.nanmax(values, 0)
+        _band(axes, time, *band, series_color(number), label)
+    _label(axes, "time [s]", ylabel)
     return save(figure, path)
 
 
 def plot_planning_curves(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[float]]], path: str | os.PathLike
 ) -> Path:
-    """Rewards over planning time, on a logarithmic axis, with their spread as bars.
+    """Rewards over planning time, on a logarithmic axis, with error bars.
 
     Args:
-        curves: milliseconds of planning a control step, mean rewards and their spread, ``[N]`` each, by label.
-        path: file to write; its suffix is the format.
-
-    Returns:
-        The written path.
+        curves: milliseconds of planning per control step, mean rewards and half-lengths of their error bars,
+            ``[N]`` each, by label.
+        path: file to write.
     """
-    figure = new_figure((6.4, 3.8))
+    figure = new_figure(_CURVES)
     axes = figure.subplots()
     style = {"linewidth": 1.6, "marker": "o", "markersize": 4, "elinewidth": 0.8, "capsize": 2}
-    for number, (label, (times, rewards, spreads)) in enumerate(curves.items()):
-        color = palette.SERIES[number % len(palette.SERIES)]
-        axes.errorbar(times, rewards, yerr=spreads, color=color, label=label, **style)
+    for number, (label, (times, rewards, deviations)) in enumerate(curves.items()):
+        axes.errorbar(times, rewards, yerr=deviations, color=series_color(number), label=label, **style)
     axes.set_xscale("log")
-    axes.set_xlabel("planning a control step [ms]")
-    axes.set_ylabel("mean reward of a step")
-    axes.legend(frameon=False, fontsize=9)
-    clean(axes)
+    _label(axes, "planning a control step [ms]", "mean reward of a step")
     return save(figure, path)
 
 
 def plot_learning_curves(
     curves: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float]]]], path: str | os.PathLike
 ) -> Path:
-    """Returns over environment steps: the median of the seeds, and pale their quartiles (paper, "Learning curves").
+    """Returns over environment steps: median of the seeds, band of their quartiles (paper, "Learning curves").
 
     Args:
         curves: environment steps ``[T]`` and returns ``[S, T]`` of ``S`` seeds by label.
-        path: file to write; its suffix is the format.
-
-    Returns:
-        The written path.
+        path: file to write.
 
     Raises:
-        ValueError: if a seed has not as many returns as there are steps.
+        ValueError: if a seed does not have one return per entry of the steps.
     """
-    figure = new_figure((6.4, 3.8))
+    figure = new_figure(_CURVES)
     axes = figure.subplots()
-    colors = palette.SERIES
     for number, (label, (frames, returns)) in enumerate(curves.items()):
         if any(len(of) != len(frames) for of in returns):
             raise ValueError(
                 f"Every seed of {label!r} must have {len(frames)} returns, got {[len(of) for of in returns]}."
             )
         low, median, high = np.quantile(np.asarray(returns, float), (0.25, 0.5, 0.75), axis=0)
-        color = colors[number % len(colors)]
-        axes.fill_between(frames, low, high, color=color, alpha=0.15, linewidth=0)
-        axes.plot(frames, median, color=color, label=label, linewidth=1.6)
-    axes.set_xlabel("environment steps")
-    axes.set_ylabel("return of an episode")
-    axes.legend(frameon=False, fontsize=9)
-    clean(axes)
+        _band(axes, frames, low, median, high, series_color(number), label)
+    _label(axes, "environment steps", "return of an episode")
     return save(figure, path)
 
 
@@ -152,14 +132,11 @@ def plot_training_curve(
 
     Args:
         curves: ``(seconds, values)`` by label; values that are not positive and finite are skipped.
-        path: file to write; its suffix is the format.
+        path: file to write.
         ylabel: name of the vertical axis.
 
-    Returns:
-        The written path.
-
     Raises:
-        ValueError: if a curve has not as many values as times, or nothing can be drawn.
+        ValueError: if a curve's times and values differ in number, or nothing can be drawn.
     """
     kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for label, (seconds, values) in curves.items():
@@ -176,23 +153,12 @@ def plot_training_curve(
 
     figure = new_figure((7.0, 4.2))
     axes = figure.subplots()
-    colors = palette.SERIES
     for number, (label, (x, y)) in enumerate(kept.items()):
         marker = "o" if len(x) <= 60 else None
-        axes.plot(
-            x / scale,
-            y,
-            color=colors[number % len(colors)],
-            label=label,
-            linewidth=1.6,
-            marker=marker,
-            markersize=3,
-        )
+        color = series_color(number)
+        axes.plot(x / scale, y, color=color, label=label, linewidth=1.6, marker=marker, markersize=3)
     axes.set_yscale("log")
-    axes.set_xlabel(f"training time [{unit}]")
-    axes.set_ylabel(ylabel)
-    axes.legend(frameon=False, fontsize=9)
-    clean(axes)
+    _label(axes, f"training time [{unit}]", ylabel)
     return save(figure, path)
 
 
@@ -202,18 +168,15 @@ def plot_errors(
     *,
     errors: Sequence[str] | None = None,
 ) -> Path:
-    """Bars of errors relative to the constant prediction (paper, figure "One-step and rollout errors").
+    """Bars of errors relative to the persistence baseline (paper, figure "One-step and rollout errors").
 
-    One panel an error, one bar a model or system, small marks for its components,
-    a dashed line for the constant prediction. A diverged error reaches the top and says so.
+    One panel per error, one bar per table, small marks for its components and a dashed line for the
+    persistence baseline. A diverged error is drawn to the top and labelled.
 
     Args:
         tables: by label, for example the system's name.
-        path: file to write; its suffix is the format.
+        path: file to write.
         errors: names of the errors to show; default all of the first table.
-
-    Returns:
-        The written path.
 
     Raises:
         ValueError: if there is no table, or a table lacks a named error.
@@ -228,47 +191,28 @@ def plot_errors(
     figure = new_figure((max(6.0, 1.5 + len(names) * (1.2 + 0.75 * len(tables))), 4.2))
     panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     shown = [t[name] for t in tables.values() for name in names]
-    finite = [v for e in shown for v in (e.total, *e.components.values()) if math.isfinite(v) and v > 0] + [1.0]
-    bottom, top = 10.0 ** math.floor(math.log10(0.8 * min(finite))), 3 * max(finite)
+    bottom, top = _log_range(v for e in shown for v in (e.total, *e.components.values()))
     components = dict.fromkeys(component for error in shown for component in error.components)
     markers = dict(zip(components, itertools.cycle("osD^v<>"), strict=False))
     for axes, name in zip(panels, names, strict=True):
         for place, table in enumerate(tables.values()):
             error = table[name]
             diverged = not math.isfinite(error.total)
-            color = palette.MUTED if diverged else palette.TRUTH
+            color = MUTED if diverged else TRUTH
             axes.bar(place, top if diverged else max(error.total, bottom), width=0.62, color=color, alpha=0.85)
             if diverged:
-                axes.text(
-                    place,
-                    math.sqrt(bottom * top),
-                    "diverged",
-                    rotation=90,
-                    ha="center",
-                    va="center",
-                    color="w",
-                )
+                middle = math.sqrt(bottom * top)
+                axes.text(place, middle, "diverged", rotation=90, ha="center", va="center", color="w")
             for component, value in error.components.items():
                 if bottom < value < top:
-                    axes.plot(place, value, markers[component], color=palette.INK, markersize=4, markerfacecolor="w")
-        axes.axhline(1.0, color=palette.INK, linestyle="--", linewidth=1)
-        axes.set_xticks(range(len(tables)), tables.keys(), rotation=30 if len(tables) > 3 else 0, fontsize=9)
-        axes.set_xlim(-0.6, len(tables) - 0.4)
-        axes.set_title(name.replace("_error", "").replace("_", " "), fontsize=10)
-        axes.set_yscale("log")
-        axes.set_ylim(bottom, top)
-        clean(axes)
-    panels[0].set_ylabel("squared error / constant prediction's")
+                    axes.plot(place, value, markers[component], color=INK, markersize=4, markerfacecolor="w")
+        _frame_bars(axes, name.replace("_error", "").replace("_", " "), tables, (bottom, top), horizontal=3)
+    panels[0].set_ylabel("squared error / persistence baseline's")
     for component, marker in markers.items():
-        panels[-1].plot([], [], marker, color=palette.INK, markerfacecolor="w", label=component.replace("_", " "))
-    panels[-1].plot([], [], "--", color=palette.INK, label="constant prediction")
-    figure.legend(
-        *panels[-1].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=5,
-        fontsize=8,
-        frameon=False,
-    )
+        panels[-1].plot([], [], marker, color=INK, markerfacecolor="w", label=component.replace("_", " "))
+    panels[-1].plot([], [], "--", color=INK, label="persistence baseline")
+    handles, labels = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     return save(figure, path)
 
 
@@ -276,22 +220,18 @@ def plot_bars(
     panels: Mapping[str, Mapping[str, Mapping[str, tuple[float, float]]]],
     path: str | os.PathLike,
     *,
-    ylabel: str = "squared error / constant prediction's",
+    ylabel: str = "squared error / persistence baseline's",
 ) -> Path:
     """Groups of bars on a logarithmic axis (paper, figure "One-step and rollout errors for different models").
 
-    Panels side by side while they fit, else one below the other, in each a group for every system, in each group
-    a bar for every model, with a dashed line at 1, the constant prediction. What is not finite reaches the top,
-    hatched.
+    Each panel has a group per system, each group a bar per model, and a dashed line at 1, the persistence
+    baseline. Panels stand side by side while they fit, else one below the other. Heights that are not
+    finite are drawn to the top, hatched.
 
     Args:
-        panels: ``(height, half-range)`` by system, by model, by the panel's title; a system that a model lacks
-            leaves a gap.
-        path: file to write; its suffix is the format.
+        panels: ``(height, half-range)`` by system, by model, by the panel's title; a missing system leaves a gap.
+        path: file to write.
         ylabel: name of the vertical axis.
-
-    Returns:
-        The written path.
 
     Raises:
         ValueError: if there is nothing to draw.
@@ -301,34 +241,56 @@ def plot_bars(
     heights = [height for panel in panels.values() for bars in panel.values() for height, _ in bars.values()]
     if not heights:
         raise ValueError("plot_bars needs at least one bar.")
-    finite = [height for height in heights if math.isfinite(height) and height > 0] + [1.0]
-    bottom, top = 10.0 ** math.floor(math.log10(0.8 * min(finite))), 3 * max(finite)
+    bottom, top = _log_range(heights)
     wide = max(3.2, 1.2 + 0.22 * len(groups) * (len(models) + 1))
     beside = wide * len(panels) <= _WIDEST
     rows, columns = (1, len(panels)) if beside else (len(panels), 1)
     figure = new_figure((max(6.0, wide * columns), 2.6 * rows + 0.1 * len(models) + 0.4))
-    colors = palette.SERIES
     width = 0.84 / len(models)
     for axes, (title, panel) in zip(figure.subplots(rows, columns, squeeze=False).flat, panels.items(), strict=True):
         for number, model in enumerate(models):
-            # Colours repeat after a while, then lighter.
-            look = {"color": colors[number % len(colors)], "alpha": 0.9 if number < len(colors) else 0.45}
+            # Lighter where the colours repeat.
+            look = {"color": series_color(number), "alpha": 0.9 if number < len(SERIES) else 0.45}
             axes.bar(0, 0, label=model, **look)
-            for group, (height, spread) in panel.get(model, {}).items():
+            for group, (height, half_range) in panel.get(model, {}).items():
                 place = groups.index(group) + (number - (len(models) - 1) / 2) * width
                 known = math.isfinite(height)
                 axes.bar(place, max(height, bottom) if known else top, width, hatch=None if known else "//", **look)
-                if known and spread > 0:
-                    axes.errorbar(place, height, min(spread, 0.999 * height), color=palette.INK, linewidth=1)
-        axes.axhline(1.0, color=palette.INK, linestyle="--", linewidth=1)
-        axes.set_xticks(range(len(groups)), groups, rotation=30 if len(groups) > 6 else 0, fontsize=9)
-        axes.set_xlim(-0.6, len(groups) - 0.4)
-        axes.set_yscale("log")
-        axes.set_ylim(bottom, top)
+                if known and half_range > 0:
+                    axes.errorbar(place, height, min(half_range, 0.999 * height), color=INK, linewidth=1)
+        _frame_bars(axes, title, groups, (bottom, top), horizontal=6)
         if not beside or axes is figure.axes[0]:
             axes.set_ylabel(ylabel, fontsize=8)
-        axes.set_title(title, fontsize=10)
-        clean(axes)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(models)), fontsize=8, frameon=False)
     return save(figure, path)
+
+
+def _band(axes: Axes, x, low: np.ndarray, middle: np.ndarray, high: np.ndarray, color: str, label: str) -> None:
+    """A line in a pale band."""
+    axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+    axes.plot(x, middle, color=color, label=label, linewidth=1.6)
+
+
+def _label(axes: Axes, xlabel: str, ylabel: str) -> None:
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+    axes.legend(frameon=False, fontsize=9)
+    clean(axes)
+
+
+def _log_range(heights: Iterable[float]) -> tuple[float, float]:
+    """Bottom and top of a logarithmic axis of bars; 1 lies within."""
+    finite = [height for height in heights if math.isfinite(height) and height > 0] + [1.0]
+    return 10.0 ** math.floor(math.log10(0.8 * min(finite))), 3 * max(finite)
+
+
+def _frame_bars(axes: Axes, title: str, groups: Collection[str], limits: tuple[float, float], horizontal: int) -> None:
+    """Axes of bars with a dashed line at 1; more than ``horizontal`` group names are slanted."""
+    axes.axhline(1.0, color=INK, linestyle="--", linewidth=1)
+    axes.set_xticks(range(len(groups)), list(groups), rotation=30 if len(groups) > horizontal else 0, fontsize=9)
+    axes.set_xlim(-0.6, len(groups) - 0.4)
+    axes.set_title(title, fontsize=10)
+    axes.set_yscale("log")
+    axes.set_ylim(*limits)
+    clean(axes)

@@ -1,4 +1,4 @@
-"""Where a scene's geometric shapes are when its nodes are in given states."""
+"""Poses of a scene's geometric shapes for given node states."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ _Geom = mujoco.mjtGeom
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One visible geom: the convex hull of some points, thickened by a radius.
+    """One visible geom: the convex hull of points, thickened by a radius.
 
-    A sphere is one point, a capsule two; boxes, cylinders, ellipsoids and meshes
-    (their convex hull) have points only.
+    A sphere is one point, a capsule two; boxes, cylinders, ellipsoids and convex hulls of meshes have radius 0.
 
     Attributes:
         geom: MuJoCo id.
@@ -39,17 +38,17 @@ class Shape:
 class SceneGeometry:
     """Shapes of a scene, fixed to its nodes.
 
-    Bodies welded into a node hang off the node's frame by fixed offsets, so a
-    predicted state is drawn as it is, joints that came apart included.
+    Welded bodies are placed by fixed offsets in their node's frame, so predicted states are drawn as they are, even
+    with joints apart.
 
     Args:
         scene: the scene.
 
     Attributes:
         geom_node: ``[G]`` node that carries each geom.
-        shapes: the visible geoms; planes, height fields and transparent or hidden ones are not.
-        joints: ``(node, [3] anchor in the node's frame)`` of hinge and ball joints between bodies;
-            not of those that only turn a body that also slides, such as Cheetah's torso.
+        shapes: the visible geoms, without planes and height fields.
+        joints: ``(node, [3] anchor in the node's frame)`` of hinges and balls of bodies that do not slide too (as
+            Cheetah's torso does).
         floor: height of a horizontal floor plane, metres, or None.
         fixed: which shapes belong to the world.
     """
@@ -61,7 +60,7 @@ class SceneGeometry:
         node_of_root = {int(body): node for node, body in enumerate(scene.body)}
         self._body_node = np.array([node_of_root[int(root)] for root in model.body_weldid])
         self.geom_node = self._body_node[model.geom_bodyid]
-        # Welded bodies keep their place in the node's frame, so any configuration gives the offsets.
+        # The offsets are the same in any configuration.
         roots = scene.body[self.geom_node]
         root_mat = data.xmat.reshape(-1, 3, 3)[roots]
         self._pos = np.einsum("gji,gj->gi", root_mat, data.geom_xpos - data.xpos[roots])
@@ -98,7 +97,7 @@ class SceneGeometry:
         return position + np.einsum("tgij,gj->tgi", rotation, self._pos), rotation @ self._mat
 
     def anchors(self, states: np.ndarray) -> np.ndarray:
-        """World positions ``[T, J, 3]`` of the joints' anchors, as the child nodes carry them."""
+        """World positions ``[T, J, 3]`` of the joint anchors, fixed to the child nodes."""
         position, rotation = node_frames(states)
         if not self.joints:
             return np.zeros((len(states), 0, 3))
@@ -115,7 +114,7 @@ def node_frames(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_visible(model: mujoco.MjModel, geom: int) -> bool:
-    # MuJoCo's viewers show groups 0 to 2; collision shapes and the like movable in higher ones.
+    # MuJoCo's viewers show groups 0 to 2; higher ones hold collision shapes.
     material = model.geom_matid[geom]
     alpha = model.geom_rgba[geom][3] if material < 0 else model.mat_rgba[material][3]
     return model.geom_group[geom] <= 2 and alpha > 0 and model.geom_rgba[geom][3] > 0

@@ -1,18 +1,17 @@
-"""Figures of motions: predictions beside the truth, over time."""
+"""Figures of motions: predictions beside the truth, over time; each writes one file and returns its path."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.evaluation import palette
-from torchrl_gn.evaluation.canvas import clean, new_figure, save
+from torchrl_gn.evaluation.canvas import AXES, INK, MUTED, PREDICTION, TRUTH, clean, new_figure, save
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 
@@ -21,6 +20,9 @@ if TYPE_CHECKING:
 
     from torchrl_gn.scenes import KinematicTree, Scene
 
+_TRUE: dict[str, Any] = {"linewidth": 3.2, "alpha": 0.35}
+_PREDICTED: dict[str, Any] = {"linewidth": 1.2, "linestyle": (0, (4, 1.5))}
+_MEASURED: dict[str, Any] = {"color": TRUTH, "linewidth": 3.2, "alpha": 0.4}
 _PANELS = (
     ("position", "position [m]", "xyz"),
     ("orientation", "orientation quaternion", "wxyz"),
@@ -39,18 +41,15 @@ def plot_body_trajectory(
 ) -> Path:
     """Predicted against true state of one body (paper, figure "Evaluation rollout in a Swimmer6").
 
-    Four panels: position, quaternion, linear and angular velocity. Quaternion signs
-    are chosen so that the true one runs without jumps and the predicted one follows it.
+    Four panels: position, quaternion, linear and angular velocity. Quaternion signs are chosen so that the true
+    one is continuous and the predicted one close to it.
 
     Args:
         truth: ``[T + 1, N, 13]`` true states.
         prediction: ``[T + 1, N, 13]`` predicted states; values that are not finite leave gaps.
         scene: whose states they are.
-        path: file to write; its suffix (``.png``, ``.pdf``, ``.svg``) is the format.
+        path: file to write; its suffix (``.png``, ``.pdf``, ``.svg``) sets the format.
         node: index or name of the body; default the middle moving one (link 3 of Swimmer6, as in the paper).
-
-    Returns:
-        The written path.
 
     Raises:
         ValueError: if the shapes differ or do not fit the scene, or it has no such node.
@@ -72,12 +71,12 @@ def plot_body_trajectory(
         values = BODY_STATE.slices[name]
         for channel, letter in enumerate(channels):
             # The scalar part takes the fourth colour, so that x, y and z keep theirs.
-            color = palette.AXES["xyzw".index(letter)]
-            axes.plot(time, true[:, values][:, channel], color=color, linewidth=3.2, alpha=0.35)
-            axes.plot(time, predicted[:, values][:, channel], color=color, linewidth=1.2, linestyle=(0, (4, 1.5)))
+            color = AXES["xyzw".index(letter)]
+            axes.plot(time, true[:, values][:, channel], color=color, **_TRUE)
+            axes.plot(time, predicted[:, values][:, channel], color=color, **_PREDICTED)
             axes.plot([], [], color=color, label=letter)
         _widen(axes, np.concatenate((true[:, values], predicted[:, values])))
-        axes.set_title(label, loc="left", fontsize=10, color=palette.INK)
+        axes.set_title(label, loc="left", fontsize=10, color=INK)
         axes.legend(ncols=len(channels), fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1.01, 0.98))
         axes.margins(x=0.01)
         clean(axes)
@@ -95,18 +94,15 @@ def plot_motions(
     labels: Sequence[str],
     node: int | str | None = None,
 ) -> Path:
-    """How a body of several systems turns, in truth and prediction (paper, figure "System identification analysis").
+    """True and predicted rotation of one body in several systems (paper, figure "System identification analysis").
 
     Args:
         panels: true states ``[S, T + 1, N, 13]`` and predicted states ``[S, H + 1, N, 13]`` of their last ``H + 1``
             steps, by title.
         scene: the scene of the states, or one of its variants.
-        path: file to write; its suffix is the format.
+        path: file to write.
         labels: names of the ``S`` systems.
         node: index or name of the body; default the middle moving one.
-
-    Returns:
-        The written path.
     """
     index, where = _node_index(scene, node), BODY_STATE.slices["orientation"]
     figure = new_figure((4.6 * len(panels) + 0.4, 3.6))
@@ -115,31 +111,28 @@ def plot_motions(
     ):
         first = truth.shape[1] - prediction.shape[1]
         for system, label in enumerate(labels):
-            color = palette.AXES[system % len(palette.AXES)]
+            color = AXES[system % len(AXES)]
             start = truth[system, :1, index, where]
             relative = quaternion.product(quaternion.conjugate(start), truth[system, :, index, where])
             main, true = int(relative[:, 1:].square().sum(0).argmax()), np.zeros(0)
-            for states, offset, look in (
-                (truth, 0, {"linewidth": 3.2, "alpha": 0.35}),
-                (prediction, first, {"linewidth": 1.2, "linestyle": (0, (4, 1.5)), "label": label}),
-            ):
-                turned = _turned(states[system, :, index, where], start, main)
-                if offset:  # the same turns as the truth where the prediction begins
-                    turned = turned + 2 * np.pi * round((true[offset] - turned[0]) / (2 * np.pi))
+            for states, offset, look in ((truth, 0, _TRUE), (prediction, first, {**_PREDICTED, "label": label})):
+                rotated = _rotated(states[system, :, index, where], start, main)
+                if offset:  # count whole turns as the truth does where the prediction begins
+                    rotated = rotated + 2 * np.pi * round((true[offset] - rotated[0]) / (2 * np.pi))
                 else:
-                    true = turned
-                axes.plot((offset + np.arange(len(turned))) * scene.timestep, turned, color=color, **look)
-        axes.axvline(first * scene.timestep, color=palette.MUTED, linewidth=1)
+                    true = rotated
+                axes.plot((offset + np.arange(len(rotated))) * scene.timestep, rotated, color=color, **look)
+        axes.axvline(first * scene.timestep, color=MUTED, linewidth=1)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("time [s]", fontsize=9)
         axes.legend(frameon=False, fontsize=8)
         clean(axes)
-    figure.axes[0].set_ylabel(f"{scene.node_names[index]} has turned [rad]", fontsize=9)
+    figure.axes[0].set_ylabel(f"{scene.node_names[index]} has rotated [rad]", fontsize=9)
     return save(figure, path)
 
 
-def _turned(orientation: Tensor, start: Tensor, axis: int) -> np.ndarray:
-    """Angle ``[T]`` that a body has turned about an axis of its frame since the start, over any number of turns."""
+def _rotated(orientation: Tensor, start: Tensor, axis: int) -> np.ndarray:
+    """Angle ``[T]`` rotated about an axis of the body's frame since the start, whole turns counted."""
     relative = quaternion.product(quaternion.conjugate(start), orientation)
     return np.unwrap(2 * torch.atan2(relative[:, 1 + axis], relative[:, 0]).detach().cpu().numpy())
 
@@ -155,35 +148,32 @@ def plot_joints(
     """Predicted against measured joint angles and velocities (paper, figure "Real and predicted test trajectories").
 
     Args:
-        truth: ``[T + 1, N, 3 + extras]`` states of a robot known by its joints.
+        truth: ``[T + 1, N, 3 + extras]`` states of a robot of joints.
         predictions: states of the last ``H + 1`` steps by the model's name.
         scene: the robot.
-        path: file to write; its suffix is the format.
-        joints: which joints to show; default: at most the first four.
-
-    Returns:
-        The written path.
+        path: file to write.
+        joints: joints to show; default: the first four.
     """
     joints = list(range(min(4, scene.num_joints))) if joints is None else list(joints)
     figure = new_figure((2.9 * len(joints) + 0.8, 4.8))
     grid = figure.subplots(2, len(joints), squeeze=False, sharex=True)
-    colors = (palette.PREDICTION, *palette.AXES)
+    colors = (PREDICTION, *AXES)
     for column, joint in enumerate(joints):
         for row, read in enumerate((_angles, _velocities)):
             axes = grid[row, column]
             true = read(truth[:, joint + 1])
-            axes.plot(np.arange(len(true)) * scene.timestep, true, color=palette.TRUTH, linewidth=3.2, alpha=0.4)
+            axes.plot(np.arange(len(true)) * scene.timestep, true, **_MEASURED)
             for number, (name, states) in enumerate(predictions.items()):
                 values, first = read(states[:, joint + 1]), len(truth) - len(states)
                 time = (first + np.arange(len(values))) * scene.timestep
                 axes.plot(time, values, color=colors[number % len(colors)], linewidth=1.3, label=name)
-                axes.axvline(first * scene.timestep, color=palette.MUTED, linewidth=0.8)
+                axes.axvline(first * scene.timestep, color=MUTED, linewidth=0.8)
             clean(axes)
         grid[0, column].set_title(scene.joint_names[joint], fontsize=10)
         grid[1, column].set_xlabel("time [s]", fontsize=9)
     grid[0, 0].set_ylabel("angle [rad]", fontsize=9)
     grid[1, 0].set_ylabel("velocity [rad/s]", fontsize=9)
-    grid[0, 0].plot([], [], color=palette.TRUTH, linewidth=3.2, alpha=0.4, label="measured")
+    grid[0, 0].plot([], [], label="measured", **_MEASURED)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return save(figure, path)
@@ -222,7 +212,7 @@ def _align_signs(true: np.ndarray, predicted: np.ndarray, where: slice) -> tuple
 
 
 def _widen(axes: Axes, values: np.ndarray) -> None:
-    """Keep a panel in which nothing moves from zooming into rounding errors."""
+    """Keep a panel without motion from zooming into rounding errors."""
     finite = values[np.isfinite(values)]
     if finite.size and np.ptp(finite) < 1e-6:
         axes.set_ylim(finite.mean() - 0.1, finite.mean() + 0.1)

@@ -1,19 +1,24 @@
-"""Everything a person wants to see of a trained forward model, in one call."""
+"""Evaluate a trained model in one call: errors and pictures, or errors on newly collected trajectories."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 from tensordict import TensorDictBase
 
-from torchrl_gn.dynamics import Predictor
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.evaluation.figures import plot_errors
+from torchrl_gn.evaluation.identification import identification_errors
 from torchrl_gn.evaluation.motion_figures import plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
-from torchrl_gn.scenes import Scene
+from torchrl_gn.identification import IdentifyingModel
+from torchrl_gn.scenes import Scene, sample_variants
 
 
 def report(
@@ -24,7 +29,7 @@ def report(
     horizons: tuple[int, ...] = HORIZONS,
     scene: Scene | None = None,
 ) -> tuple[ErrorTable, list[Path]]:
-    """Evaluate a model on test trajectories and draw what it does.
+    """Evaluate a model on test trajectories and draw the first of them.
 
     Args:
         model: the model, bound to the scene of the trajectories.
@@ -32,12 +37,11 @@ def report(
             physical parameters at the model's ``parameters_key`` if it has one.
         folder: where the files go.
         horizons: steps of the rollout errors.
-        scene: scene of the first trajectory, which is drawn, if that is a variant of the model's.
+        scene: scene of the first trajectory, if that is a variant of the model's.
 
     Returns:
-        The error table, and the written files: the paper's figure of one body
-        (``prediction.png``), the errors as bars (``errors.png``) and truth beside
-        prediction of the first trajectory (``rollout.gif``).
+        The error table, and the written files: ``prediction.png`` (the paper's figure of one body),
+        ``errors.png`` (bars) and ``rollout.gif`` (truth beside prediction).
     """
     folder, scene = Path(folder), scene or model.scene
     table = evaluate_errors(model, trajectories, horizons=horizons, keep=1)
@@ -51,3 +55,35 @@ def report(
         rollout_video(scene, truth, prediction, folder / "rollout.gif", speed=min(1.0, scene.timestep / 0.01)),
     ]
     return table, files
+
+
+def fresh_errors(
+    model: ForwardModel | IdentifyingModel, scene: Scene, *, sequences: int, length: int, seed: int, phase: int = 20
+) -> ErrorTable:
+    """Evaluate a model on new random trajectories of a scene, the same ones for the same seed.
+
+    A model that identifies is evaluated on random variants of the scene: each is identified from one
+    trajectory and predicted on another.
+
+    Args:
+        model: the model.
+        scene: the scene.
+        sequences: number of trajectories, or of variants.
+        length: control steps of each trajectory.
+        seed: seed of the trajectories and variants.
+        phase: steps to identify from.
+
+    Raises:
+        ValueError: if trajectories are shorter than the longest rollouts, 100 steps, or the model identifies and
+            the scene is no system of the paper with variants.
+    """
+    if length < max(HORIZONS):
+        raise ValueError(f"length={length} is too short: errors are measured over rollouts of {max(HORIZONS)} steps.")
+    if isinstance(model, ForwardModel):
+        trajectories = collect_trajectories(scene, sequences, length, seed, split=3)
+        return evaluate_errors(model.bind(scene), trajectories)
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
+    variants = sample_variants(scene.origin.get("system", scene.name), sequences, rng)
+    both = collect_trajectories(variants, 2 * sequences, length, seed, split=4)
+    observed, predicted = (cast(TensorDictBase, half) for half in (both[:sequences], both[sequences:]))
+    return identification_errors(*model.bind(scene), observed, predicted, steps=phase)

@@ -1,4 +1,4 @@
-"""Videos of rollouts: the truth beside the prediction."""
+"""Videos of rollouts: truth beside prediction."""
 
 from __future__ import annotations
 
@@ -6,20 +6,18 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.evaluation import palette
+from torchrl_gn.evaluation.canvas import GRID, INK, PREDICTION, TRUTH
 
 if TYPE_CHECKING:
     from PIL import Image
 
     from torchrl_gn.scenes import Scene
-
-Engine = Literal["drawn", "gl"]
 
 _SHORTEST_FRAME = 0.02  # seconds; viewers slow down GIFs with shorter frames
 _HEADER = 58  # pixels above the panels
@@ -34,35 +32,30 @@ def rollout_video(
     *,
     speed: float = 1.0,
     size: int = 360,
-    engine: Engine = "drawn",
     labels: tuple[str, str] = ("truth", "prediction"),
 ) -> Path:
     """Write a rollout as a video, the truth on the left and the prediction on the right.
 
-    Behind the prediction the truth stands pale. The camera looks at the plane that the
-    scene moves in (or from the side and above), follows the truth where the scene is
-    translation invariant, and never follows the prediction. Bodies are drawn where the
-    states put them, also where the prediction has torn a joint apart.
+    The truth is repeated, pale, behind the prediction. The camera looks at the plane of motion (or from the side and
+    above) and follows the truth along translation-invariant axes, never the prediction. Bodies are drawn where the
+    states put them, even with joints apart.
 
     Args:
         scene: whose states they are.
         truth: ``[T + 1, N, 13]`` true states.
-        prediction: ``[T + 1, N, 13]`` predicted states, or None to show the truth alone;
-            frames of states that are not finite say so.
+        prediction: ``[T + 1, N, 13]`` predicted states, or None to show the truth alone; frames of non-finite
+            states say so.
         path: file to write: ``.gif``, or ``.mp4`` (needs imageio-ffmpeg).
-        speed: 1 is real time. States are skipped where frames would be shorter than
-            20 ms (walker at 2.5 ms: every eighth state is shown).
+        speed: 1 is real time. States are skipped to keep frames at least 20 ms long (at 2.5 ms a step every eighth
+            state is shown).
         size: width and height of a panel, pixels.
-        engine: ``"drawn"`` flat shapes, on any machine; ``"gl"`` MuJoCo's own renderer,
-            which needs a working EGL, OSMesa or display.
         labels: captions of the two panels.
 
     Returns:
         The written path.
 
     Raises:
-        ValueError: if shapes do not fit the scene, the truth is not finite, or an option is unknown.
-        RuntimeError: if ``engine="gl"`` cannot render here.
+        ValueError: if shapes do not fit the scene, the truth is not finite, or an option is out of range.
         ImportError: if Pillow is not installed, or imageio-ffmpeg for an ``.mp4``.
     """
     path = Path(path)
@@ -71,7 +64,7 @@ def rollout_video(
     if not 0 < speed < math.inf:
         raise ValueError(f"speed must be positive and finite, got {speed}.")
     every = frame_stride(scene.timestep / speed)
-    frames = rollout_frames(scene, truth, prediction, every=every, size=size, engine=engine, labels=labels)
+    frames = rollout_frames(scene, truth, prediction, every=every, size=size, labels=labels)
     seconds = every * scene.timestep / speed
     with atomic_path(path) as temporary:
         (_write_gif if path.suffix == ".gif" else _write_mp4)(temporary, frames, seconds)
@@ -79,7 +72,7 @@ def rollout_video(
 
 
 def frame_stride(interval: float) -> int:
-    """How many states, ``interval`` seconds of video apart, one frame must stand for to last 20 ms."""
+    """Number of states per frame that keeps frames at least 20 ms long, for states ``interval`` seconds apart."""
     return max(1, math.ceil(_SHORTEST_FRAME / interval - 1e-6))
 
 
@@ -90,18 +83,16 @@ def rollout_frames(
     *,
     every: int = 1,
     size: int = 360,
-    engine: Engine = "drawn",
     labels: tuple[str, str] = ("truth", "prediction"),
 ) -> Iterator[Image.Image]:
-    """The pictures of :func:`rollout_video`, one by one; arguments and errors are the same.
+    """Pictures of :func:`rollout_video`, one by one, with the same errors.
 
     Args:
         scene: whose states they are.
         truth: ``[T + 1, N, 13]``.
         prediction: ``[T + 1, N, 13]`` or None.
-        every: show every so many-th state.
+        every: number of states per picture.
         size: width and height of a panel, pixels.
-        engine: ``"drawn"`` or ``"gl"``.
         labels: captions of the two panels.
 
     Returns:
@@ -118,14 +109,7 @@ def rollout_frames(
         raise ValueError(f"every must be at least 1 and size an even number from 32, got {every} and {size}.")
     _require_pillow()
     sequences = [states[::every] for states in sequences]
-    if engine == "drawn":
-        panels = _drawn_panels(scene, sequences, size)
-    elif engine == "gl":
-        from torchrl_gn.evaluation.gl_frames import render
-
-        panels = render(scene, sequences, size)
-    else:
-        raise ValueError(f'engine must be "drawn" or "gl", got {engine!r}.')
+    panels = _drawn_panels(scene, sequences, size)
     return (_compose(scene.name, step * every * scene.timestep, row, size, labels) for step, row in enumerate(panels))
 
 
@@ -141,7 +125,7 @@ def _drawn_panels(scene: Scene, sequences: list[np.ndarray], size: int) -> Itera
 
     drawing = SceneDrawing(scene, sequences[0], size)
     motions = [drawing.truth, *map(drawing.motion, sequences[1:])]
-    colors = (palette.TRUTH, palette.PREDICTION)
+    colors = (TRUTH, PREDICTION)
     for step in range(len(sequences[0])):
         yield [
             drawing.panel(step, motion, color, ghost=number > 0)
@@ -154,16 +138,16 @@ def _compose(name: str, time: float, row: list[Image.Image], size: int, labels: 
 
     image = Image.new("RGB", (_GAP + len(row) * (size + _GAP), _HEADER + size + _GAP), "white")
     draw = ImageDraw.Draw(image)
-    draw.text((_GAP + 2, 16), name, palette.INK, ImageFont.load_default(17), "lm")
-    draw.text((image.width - _GAP - 2, 16), f"t = {time:.2f} s", palette.INK, ImageFont.load_default(17), "rm")
+    draw.text((_GAP + 2, 16), name, INK, ImageFont.load_default(17), "lm")
+    draw.text((image.width - _GAP - 2, 16), f"t = {time:.2f} s", INK, ImageFont.load_default(17), "rm")
     for number, (panel, label) in enumerate(zip(row, labels, strict=False)):
         left = _GAP + number * (size + _GAP)
-        color = (palette.TRUTH, palette.PREDICTION)[number]
+        color = (TRUTH, PREDICTION)[number]
         draw.text((left + size // 2, 44), label, color, ImageFont.load_default(15), "mm")
         if panel.width != size:
             panel = panel.reduce(panel.width // size)
         image.paste(panel, (left, _HEADER))
-        draw.rectangle((left, _HEADER, left + size - 1, _HEADER + size - 1), outline=palette.GRID)
+        draw.rectangle((left, _HEADER, left + size - 1, _HEADER + size - 1), outline=GRID)
     return image
 
 
@@ -171,14 +155,14 @@ def _write_gif(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
     from PIL import Image
 
     pictures = list(frames)
-    # One palette for all frames, from a few of them side by side, keeps colours from flickering.
+    # One palette for all frames, from a sample of them, keeps colours from flickering.
     sample = pictures[:: max(1, len(pictures) // 6)]
     strip = Image.new("RGB", (sample[0].width, sample[0].height * len(sample)))
     for number, picture in enumerate(sample):
         strip.paste(picture, (0, number * picture.height))
     colors = strip.quantize(128)
     pictures = [picture.quantize(palette=colors, dither=Image.Dither.NONE) for picture in pictures]
-    # GIF counts in hundredths of a second: rounding the running time keeps the whole in real time.
+    # GIF counts in hundredths of a second: round the running time, not each frame, to stay in real time.
     ends = [round(100 * seconds * (number + 1)) for number in range(len(pictures))]
     durations = [10 * max(2, end - start) for start, end in zip([0, *ends], ends, strict=False)]
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=False)
@@ -190,7 +174,7 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
     except ImportError:
         raise ImportError("Writing .mp4 needs ffmpeg: pip install imageio-ffmpeg, or write a .gif.") from None
     first = next(frames)
-    # Rates need not be whole numbers, whatever the annotation says.
+    # Rates need not be whole numbers, despite the annotation.
     rate: Any = 1 / seconds
     writer = imageio_ffmpeg.write_frames(
         str(path), first.size, fps=rate, quality=8, macro_block_size=2, ffmpeg_log_level="error"

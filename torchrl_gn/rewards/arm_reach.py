@@ -1,4 +1,4 @@
-"""How far a chain of joints can carry a body."""
+"""Ball that a body fixed to the world by joints cannot leave."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from torchrl_gn.scenes.scene import Scene
 
 
 def arm_reach(scene: Scene, body: str) -> tuple[np.ndarray, float]:
-    """Ball that a body can never leave.
+    """Centre and radius of a ball that a body cannot leave, whatever its joint limits.
 
-    The bodies between joints that only turn (hinges, balls) are rigid links, so a body is at most
-    the sum of their lengths away from the first joint. Joint limits are not looked at.
+    Bodies between hinges and ball joints are rigid links: the radius is the sum of their lengths.
 
     Args:
         scene: the scene.
         body: name of the body.
 
     Returns:
-        Where the first joint of its chain is fixed to the world, ``[3]`` metres (or the body itself, if it
-        is fixed), and how far the body gets from there, metres. Infinitely far if a joint on the way slides or is
-        free, and for joints of one body that do not turn about one point.
+        Anchor of the first joint in the world, ``[3]`` metres (of a fixed body its own position), and the radius in
+        metres. The radius is infinite if a joint on the way slides or is free, or if the joints of one body do not
+        share one anchor.
 
     Raises:
         ValueError: the scene has no such body.

@@ -19,22 +19,20 @@ class Balance(Reward):
 
     .. math:: r = -\sum_i \angle(q_i', \hat q_i)
 
-    with :math:`q_i'` the orientation of body :math:`i` after the step and
-    :math:`\hat q_i` the balanced one: 0 when every body is balanced, :math:`-\pi` a
-    body hanging upside down (paper, SM "Planning configuration", Pendulum Balance).
-    The gradient is finite everywhere and zero exactly at both ends.
+    with :math:`q_i'` the orientation of body :math:`i` after the step and :math:`\hat q_i` the balanced one: 0 when
+    every body is balanced, :math:`-\pi` for each body upside down (paper, SM "Planning configuration", Pendulum
+    Balance). The gradient is finite everywhere and exactly zero at both ends.
 
     Args:
         scene: scene whose states are judged.
         bodies: names of the bodies, summed over.
-        target: ``[4]`` or ``[len(bodies), 4]`` balanced orientation, w-first, world
-            frame; any non-zero norm. Default: the identity, which is upright for bodies
-            that the model file draws standing, as the suite's poles, acrobot and walker.
-            Upside down in the plane of those is ``[0, 0, 1, 0]``, half a turn about y.
+        target: ``[4]`` or ``[len(bodies), 4]`` balanced orientation, w-first, world frame, of any non-zero norm.
+            Default: the identity, upright for the suite's poles, acrobot and walker. Upside down for these is
+            ``[0, 0, 1, 0]``, half a rotation about y.
 
     Raises:
-        ValueError: the scene has no such body, ``bodies`` is no list of different ones, or ``target``
-            has another shape or a quaternion that is not finite or of norm zero.
+        ValueError: the scene has no such body, ``bodies`` is no list of different names, or ``target`` has a wrong
+            shape or a quaternion that is not finite or of norm zero.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -58,7 +56,7 @@ class Balance(Reward):
         norm = wanted.norm(dim=-1, keepdim=True)
         if not bool((norm > 0).all() and wanted.isfinite().all()):
             raise ValueError(f"target must hold finite quaternions of non-zero norm, got {wanted.tolist()}")
-        # A float64 buffer is cast to the states' dtype in `forward`: exact for either.
+        # `forward` casts the float64 buffer to the states' dtype.
         self.register_buffer("target", (wanted / norm).expand(len(bodies), 4).clone())
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:

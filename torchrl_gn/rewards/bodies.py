@@ -1,4 +1,4 @@
-"""Named bodies of a scene, as a reward reads them."""
+"""Poses and velocities of named bodies, for rewards."""
 
 from __future__ import annotations
 
@@ -17,28 +17,27 @@ _LINEAR, _ANGULAR = BODY_STATE.slices["linear_velocity"], BODY_STATE.slices["ang
 
 
 def require_bodies(scene: Scene) -> None:
-    """Refuse a robot that is known by its joints alone.
+    """Check that a scene has bodies.
 
     Raises:
-        TypeError: it is no :class:`~torchrl_gn.scenes.Scene`.
+        TypeError: ``scene`` is no :class:`~torchrl_gn.scenes.Scene` but a robot known by its joints alone.
     """
     if not isinstance(scene, Scene):
         raise TypeError(f"rewards read the states of a Scene's bodies, which {type(scene).__name__} has not got")
 
 
 def find_body(scene: Scene, name: str) -> Attachment:
-    """Node that carries a named body, and the body's fixed offset from the node's frame.
+    """Node of a named body, and the body's fixed offset in the node's frame.
 
     Args:
-        scene: where to look.
-        name: a node's own name, or the name of a body welded into a node.
+        scene: the scene.
+        name: name of a node, or of a body welded into one.
 
     Returns:
-        The node and the offset, the identity for a node's own name.
+        The node and the offset; the identity for a node's own name.
 
     Raises:
-        TypeError: it is no :class:`~torchrl_gn.scenes.Scene` but a robot known by its joints alone: there are
-            no body states to read.
+        TypeError: ``scene`` is a robot known by its joints alone.
         ValueError: the scene has no body of this name.
     """
     require_bodies(scene)
@@ -51,21 +50,20 @@ def find_body(scene: Scene, name: str) -> Attachment:
 
 
 class Bodies(Float64Buffers):
-    r"""Reads where named bodies are, and how they move, out of states ``[*B, N, 13]``.
+    r"""Read poses and velocities of named bodies from states ``[*B, N, 13]``.
 
-    A body welded into a node at a fixed offset :math:`(p, q)` moves with the node's frame
-    :math:`(x, R, v, \omega)`: it is at :math:`x + R p`, turned by :math:`R q`, and moves at
-    :math:`v + \omega \times R p` and :math:`\omega`. All in the world frame, of the body's own
-    frame (MuJoCo's ``xpos`` and ``xquat``), not of its centre of mass. Differentiable in the
-    states; a cast of the module leaves the offsets in float64, states give the dtype.
+    A body welded at offset :math:`(p, q)` into a node with pose and velocity :math:`(x, R, v, \omega)` has position
+    :math:`x + R p`, orientation :math:`R q`, velocity :math:`v + \omega \times R p` and angular velocity
+    :math:`\omega`: world frame, of the body's frame (MuJoCo's ``xpos`` and ``xquat``), not of its centre of mass.
+    Differentiable in the states. Results have the states' dtype; casting the module leaves the offsets in float64.
 
     Args:
         scene: the scene.
-        names: ``K`` names of bodies, as :func:`find_body` takes them.
+        names: ``K`` names of bodies, as for :func:`find_body`.
 
     Raises:
-        ValueError: ``names`` is no list of names or has one twice, or the scene has no such body; when
-            reading, states of another scene's size.
+        ValueError: ``names`` is no list of different names, or the scene has no such body; when reading, states
+            of a wrong shape.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -76,7 +74,7 @@ class Bodies(Float64Buffers):
 
     node: Tensor
     offset: Tensor
-    turn: Tensor
+    rotation: Tensor
 
     def __init__(self, scene: Scene, names: Sequence[str]):
         super().__init__()
@@ -86,16 +84,16 @@ class Bodies(Float64Buffers):
             raise ValueError(f"bodies must be different ones, got {list(names)}")
         found = [find_body(scene, name) for name in names]
         self.names, self.scene_name, self.node_names = tuple(names), scene.name, tuple(scene.node_names)
-        offset, turn = np.stack([body.pos for body in found]), np.stack([body.quat for body in found])
-        self.constants({"node": [body.node for body in found], "offset": offset, "turn": turn})
-        # Nearly always there is nothing to add: no operations, no lost digits.
-        self._is_shifted, self._is_turned = bool(np.any(offset != 0)), bool(np.any(turn[:, 1:] != 0))
+        offset, rotation = np.stack([body.pos for body in found]), np.stack([body.quat for body in found])
+        self.constants({"node": [body.node for body in found], "offset": offset, "rotation": rotation})
+        # Most offsets are the identity: skip them, exactly.
+        self._is_shifted, self._is_rotated = bool(np.any(offset != 0)), bool(np.any(rotation[:, 1:] != 0))
 
     def require_same(self, scene: Scene) -> None:
-        """Refuse a scene of other bodies: the same number of them would be read without a word.
+        """Check that a scene has the same nodes.
 
         Raises:
-            ValueError: its nodes have other names.
+            ValueError: the nodes have other names.
         """
         if tuple(scene.node_names) != self.node_names:
             raise ValueError(
@@ -107,32 +105,32 @@ class Bodies(Float64Buffers):
         """``[*B, K, 3]`` positions in metres of states ``[*B, N, 13]``."""
         nodes = self._nodes(state)
         position = nodes[..., _POSITION]
-        return position + self._arm(nodes) if self._is_shifted else position
+        return position + self._shift(nodes) if self._is_shifted else position
 
     def orientation(self, state: Tensor) -> Tensor:
         """``[*B, K, 4]`` unit quaternions, w-first and of either sign, of states ``[*B, N, 13]``."""
         orientation = self._nodes(state)[..., _ORIENTATION]
-        return quaternion.product(orientation, self.turn.to(state.dtype)) if self._is_turned else orientation
+        return quaternion.product(orientation, self.rotation.to(state.dtype)) if self._is_rotated else orientation
 
     def linear_velocity(self, state: Tensor) -> Tensor:
         """``[*B, K, 3]`` velocities of the frames' origins in m/s of states ``[*B, N, 13]``."""
         nodes = self._nodes(state)
         velocity = nodes[..., _LINEAR]
-        return velocity + torch.linalg.cross(nodes[..., _ANGULAR], self._arm(nodes)) if self._is_shifted else velocity
+        return velocity + torch.linalg.cross(nodes[..., _ANGULAR], self._shift(nodes)) if self._is_shifted else velocity
 
     def angular_velocity(self, state: Tensor) -> Tensor:
         """``[*B, K, 3]`` angular velocities in rad/s of states ``[*B, N, 13]``."""
         return self._nodes(state)[..., _ANGULAR]
 
     def _nodes(self, state: Tensor) -> Tensor:
-        """States ``[*B, K, 13]`` of the nodes that carry the bodies."""
+        """States ``[*B, K, 13]`` of the bodies' nodes."""
         if state.shape[-2:] != (len(self.node_names), BODY_STATE.size):
             wanted = f"[*B, {len(self.node_names)}, {BODY_STATE.size}]"
             raise ValueError(f"states of scene {self.scene_name!r} must be {wanted}, got {list(state.shape)}")
         return state.index_select(-2, self.node)
 
-    def _arm(self, nodes: Tensor) -> Tensor:
-        """``[*B, K, 3]`` from the nodes' origins to the bodies', world frame."""
+    def _shift(self, nodes: Tensor) -> Tensor:
+        """Offsets ``[*B, K, 3]`` in the world frame."""
         return quaternion.rotate(nodes[..., _ORIENTATION], self.offset.to(nodes.dtype))
 
     def extra_repr(self) -> str:

@@ -1,4 +1,4 @@
-"""Bring bodies where they are in a target state."""
+"""Bring bodies to their poses in a target state."""
 
 from __future__ import annotations
 
@@ -17,31 +17,29 @@ _SLACK = 1e-3  # of the longest reach: targets are rounded, measured or predicte
 
 
 class ImitatePose(Reward):
-    r"""Negative distance of bodies from where and how they are in a target state.
+    r"""Negative squared distance of bodies from their poses in a target state.
 
     .. math:: r = -\sum_i |x_i' - \hat x_i|^2 + 1 - (q_i' \cdot \hat q_i)^2
 
-    with positions :math:`x'` in metres and orientations :math:`q'` after the step: 0 when every body is there.
-    The second part is the squared sine of half the angle between the two orientations, 1 for half a turn, blind to
-    the signs of quaternions; it is computed as the squared vector part of :math:`\bar q' \hat q`, which loses
-    no digits where the two are close. Gradients are finite everywhere. (Paper, SM "Planning configuration",
-    Jaco "Imitate Palm Pose" and "Imitate Full Pose", and SM "Loss" for the dynamic-state loss.)
+    with positions :math:`x'` in metres and orientations :math:`q'` after the step: 0 when every body is there. The
+    second part is :math:`\sin^2` of half the angle between the orientations, whatever the signs of the quaternions;
+    it is computed as the squared vector part of :math:`\bar q' \hat q`, exact for close orientations. Gradients are
+    finite everywhere. (Paper, SM "Planning configuration", Jaco "Imitate Palm Pose" and "Imitate Full Pose", and SM
+    "Loss" for the dynamic-state loss.)
 
-    Paper: its loss is of normalised changes. Here a metre and half a turn count alike, without a normaliser, so
-    that the reward knows no model. Positions and orientations are compared, as the table says, no velocities (the
-    caption of the figure speaks of 13 variables). The loss is printed with :math:`\cos^2(q \cdot \hat q)`; the
-    cosine is the dot product.
+    Paper: the paper's loss compares normalised changes. Here there is no normaliser, so that the reward needs no model:
+    a metre counts as much as half a rotation. No velocities are compared, as in the paper's table (the figure's
+    caption speaks of 13 variables). The paper prints :math:`\cos^2(q \cdot \hat q)`; the dot product is the cosine.
 
-    The target is a whole state of the scene ``[N, 13]``, of which only position and orientation of these bodies
-    are read, and so is the task. Where the chain of joints to a body starts fixed to the world, a target farther
-    away than its links are long is refused.
+    Target and task are a state of the scene ``[N, 13]``; only the bodies' positions and orientations are read. Targets
+    out of a body's :func:`arm_reach` are refused.
 
     Args:
         scene: scene whose states are judged.
         bodies: names of the bodies, summed over.
 
     Raises:
-        ValueError: the scene has no such body, or ``bodies`` is no list of different ones.
+        ValueError: the scene has no such body, or ``bodies`` is no list of different names.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -66,8 +64,8 @@ class ImitatePose(Reward):
         """The target ``[*B, N, 13]`` itself; see :meth:`Reward.task_of`.
 
         Raises:
-            ValueError: the target has a wrong shape, is not finite, has a quaternion of norm zero for one of the
-                bodies, or a position that it cannot reach.
+            ValueError: the target has a wrong shape, is not finite, or gives a body a quaternion of norm zero or a
+                position out of reach.
         """
         task = super().task_of(state, target)
         if not bool((self.bodies.orientation(task).norm(dim=-1) > 0).all()):
@@ -91,8 +89,8 @@ class ImitatePose(Reward):
         target = self.require_task(task, next_state)
         away = self.bodies.position(next_state) - self.bodies.position(target)
         wanted = quaternion.normalize(self.bodies.orientation(target))
-        turned = quaternion.product(quaternion.conjugate(self.bodies.orientation(next_state)), wanted)[..., 1:]
-        return -torch.cat((away, turned), dim=-1).square().sum(-1).sum(-1, keepdim=True)
+        rotated = quaternion.product(quaternion.conjugate(self.bodies.orientation(next_state)), wanted)[..., 1:]
+        return -torch.cat((away, rotated), dim=-1).square().sum(-1).sum(-1, keepdim=True)
 
     def extra_repr(self) -> str:
         return f"scene={self.bodies.scene_name!r}, bodies={self.bodies.names}"

@@ -19,18 +19,17 @@ class Velocity(Reward):
 
     .. math:: r = (v'_a)^k
 
-    with :math:`v'` the velocity of the body's frame after the step, m/s (paper, SM "Planning
-    configuration": horizontal velocity of Cheetah's and Walker2d's torso with ``axis="x"``, squared
-    vertical speed of Cheetah's with ``axis="z", power=2``).
+    with :math:`v'` the velocity of the body's frame after the step, m/s (paper, SM "Planning configuration":
+    horizontal velocity of Cheetah's and Walker2d's torso, squared vertical speed of Cheetah's torso).
 
     Args:
         scene: scene whose states are judged.
         body: name of the body.
-        axis: ``"x"``, ``"y"`` or ``"z"``; z is up. Signed where ``power`` is odd: backwards is negative.
-        power: the exponent, at least 1.
+        axis: ``"x"``, ``"y"`` or ``"z"``; z is up.
+        power: the exponent, at least 1; odd powers keep the sign.
 
     Raises:
-        ValueError: the scene has no such body, or ``axis`` or ``power`` is none.
+        ValueError: the scene has no such body, or ``axis`` or ``power`` is invalid.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -64,7 +63,7 @@ class Position(Reward):
         axis: ``"x"``, ``"y"`` or ``"z"``; z is up.
 
     Raises:
-        ValueError: the scene has no such body, or ``axis`` is none.
+        ValueError: the scene has no such body, or ``axis`` is invalid.
     """
 
     def __init__(self, scene: Scene, body: str, axis: Axis):
@@ -113,16 +112,15 @@ class VerticalDistance(Reward):
 
     .. math:: r = \sum_i (z'_i - z'_\text{reference})^2
 
-    after the step (paper, SM "Planning configuration", Walker2d "Feet to head height", with the torso
-    for the height of the walker). Larger where they are farther apart, whichever is above.
+    after the step (paper, SM "Planning configuration", Walker2d "Feet to head height", with the torso as the head).
 
     Args:
         scene: scene whose states are judged.
         bodies: names of the bodies, summed over.
-        reference: name of the body that they are compared with.
+        reference: name of the reference body.
 
     Raises:
-        ValueError: the scene has no such body, or ``bodies`` is no list of different ones.
+        ValueError: the scene has no such body, or ``bodies`` is no list of different names.
     """
 
     def __init__(self, scene: Scene, bodies: Sequence[str], reference: str):

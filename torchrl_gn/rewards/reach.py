@@ -19,13 +19,12 @@ class Reach(Reward):
 
     .. math:: r = d \cdot u - c\, (d \cdot u_\perp)^2
 
-    with :math:`d` the displacement of the body in this step, metres, :math:`u` the unit vector from where the
-    body was when planning started to the target, :math:`u_\perp` the horizontal direction across it, and
-    :math:`c` the shaping (paper, SM "Planning configuration", Swimmer "Move towards target").
+    with :math:`d` the displacement of the body in this step, metres, :math:`u` the horizontal unit vector to the target
+    from the body's position when planning started, :math:`u_\perp` the horizontal direction across it, and :math:`c`
+    the shaping (paper, SM "Planning configuration", Swimmer "Move towards target").
 
-    The target is a location ``[3]`` in metres, world frame, whose height is not read. The task is :math:`u`, ``[3]``
-    with zero height. It is the zero vector if the body already is above or below the target, to a
-    nanometre: then there is no direction, every step gets 0 and gradients are 0.
+    The target is a location ``[3]`` in metres, world frame; its height is ignored. The task is :math:`u`, ``[3]`` with
+    zero height. Within a nanometre of the target (horizontally) the task is zero, and so are rewards and gradients.
 
     Args:
         scene: scene whose states are judged.
@@ -61,7 +60,7 @@ class Reach(Reward):
         """Direction ``[*B, 3]`` from the body in ``state`` to the target ``[*B, 3]``; see :meth:`Reward.task_of`."""
         location = super().task_of(state, target).to(state.dtype)
         way = (location - self.bodies.position(state).squeeze(-2))[..., :2]
-        # Dividing by the largest entry first keeps the squares from overflowing or vanishing.
+        # Divide by the largest entry first, so that squares neither overflow nor vanish.
         largest = way.abs().amax(-1, keepdim=True)
         there = largest < _THERE
         scaled = torch.where(there, torch.ones_like(way), way / torch.where(there, torch.ones_like(largest), largest))

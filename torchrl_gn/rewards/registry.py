@@ -1,4 +1,4 @@
-"""The paper's tasks by name."""
+"""Rewards of the paper's tasks by name."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchrl_gn.scenes.scene import Scene
 _WALKER_UPRIGHT = ("torso", "right_thigh", "left_thigh", "right_leg", "left_leg")
 _WALKER_FEET = ("right_foot", "left_foot")
 
-# (system, task) -> how to build the reward; one line a row of the paper's table.
+# (system, task) -> builder of the reward; one line per row of the paper's table.
 _REWARDS: MappingProxyType[tuple[str, str], Callable[[Scene], Reward]] = MappingProxyType(
     {
         ("pendulum", "balance"): lambda scene: Balance(scene, ["pole"]),
@@ -33,36 +33,35 @@ _REWARDS: MappingProxyType[tuple[str, str], Callable[[Scene], Reward]] = Mapping
         ("walker2d", "inverse_verticality"): lambda scene: Balance(scene, _WALKER_UPRIGHT),
         ("walker2d", "feet_to_head"): lambda scene: VerticalDistance(scene, _WALKER_FEET, "torso"),
         ("jaco", "palm_pose"): lambda scene: ImitatePose(scene, ["jaco_hand/hand"]),
-        # Paper: "13 variables x 9 bodies": those that move, welded ones together.
+        # Paper: "13 variables x 9 bodies": the moving nodes.
         ("jaco", "full_pose"): lambda scene: ImitatePose(scene, scene.node_names[1:]),
     }
 )
 
 
 def available_rewards() -> tuple[tuple[str, str], ...]:
-    """Every ``(system, task)`` that :func:`make_reward` knows; ``"swimmerN"`` stands for every number of links."""
+    """Every ``(system, task)`` of :func:`make_reward`; ``"swimmerN"`` stands for any number of links."""
     return tuple(_REWARDS)
 
 
 def make_reward(task: str, scene: Scene) -> Reward:
     """Reward of a task of the paper, bound to a scene (paper, SM "Planning configuration").
 
-    Paper: Walker2d's ``"inverse_verticality"`` has its name from there, and is what its text there says, "same as
-    Pendulum-Balance summed for torso, thighs and legs": it is largest where the walker stands. For one on its head
-    use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
+    Paper: Walker2d's ``"inverse_verticality"`` follows the paper's text, "same as Pendulum-Balance summed for torso,
+    thighs and legs": it is largest for a standing walker, despite its name. For a walker on its head use
+    ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
 
     Args:
         task: the task's name, for example ``"balance"``.
-        scene: a scene of one of the paper's systems, its random variants too. For a scene of your own
-            build the reward itself: ``Balance(scene, ["my_pole"])``.
+        scene: a scene of one of the paper's systems, or a variant. For your own scene build the reward directly:
+            ``Balance(scene, ["my_pole"])``.
 
     Returns:
         The reward, bound to the scene's bodies.
 
     Raises:
-        TypeError: it is no scene but a robot known by its joints alone.
-        ValueError: no such task for this system (the message lists those there are), or
-            the scene lacks a body that the task needs.
+        TypeError: ``scene`` is a robot known by its joints alone.
+        ValueError: the system has no such task (the message lists all), or the scene lacks a body that the task needs.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene

@@ -1,4 +1,4 @@
-"""What a task reward is."""
+"""Base class of task rewards."""
 
 from __future__ import annotations
 
@@ -12,18 +12,14 @@ from torchrl_gn.finite import require_finite
 class Reward(nn.Module):
     """Reward of one control step, a differentiable function of tensors.
 
-    A subclass is bound to one scene when it is built: it looks up its bodies
-    there and refuses a scene that has not got them. What is fixed (target
-    orientations, say) is a buffer, so that ``reward.to(device)`` moves it.
-    Environments accept any callable with the signature of :meth:`forward`.
+    A subclass is built for one scene and looks up its bodies there. Constants (target orientations, say) are buffers,
+    so that ``reward.to(device)`` moves them. Environments accept any callable with the signature of :meth:`forward`.
 
-    What varies between episodes is the ``target`` that the TensorDict of an episode carries.
-    When planning starts, :meth:`task_of` makes of it and of the state then the ``task`` that
-    :meth:`forward` reads at every step of the plan (:class:`~torchrl_gn.rewards.FixTask` does
-    this in front of a planner).
+    Goals that vary between episodes are the entry ``target`` of an episode's TensorDict. When planning starts,
+    :meth:`task_of` turns the target and the current state into the ``task`` that :meth:`forward` reads at every step of
+    the plan; :class:`~torchrl_gn.rewards.FreezeGoal` does this before a planner.
 
-    Gradients flow to ``state``, ``action``, ``next_state``, ``task`` and ``target``; nothing is
-    detached, and whoever wants gradients keeps autograd on.
+    Gradients flow to ``state``, ``action``, ``next_state``, ``task`` and ``target``; nothing is detached.
 
     Attributes:
         target_shape: shape of a target without batch; None if the reward needs none.
@@ -40,20 +36,19 @@ class Reward(nn.Module):
                 linear velocity 3, angular velocity 3; SI, world frame).
             action: ``[*B, A]`` controls during the step.
             next_state: ``[*B, N, 13]`` states after the step.
-            task: what varies between episodes (a direction to move in, say), where the
-                task has such a thing; its batch broadcasts against ``*B``.
+            task: goal of the episode, such as a direction, if the reward needs one; broadcasts against ``*B``.
 
         Returns:
             ``[*B, 1]`` rewards in the dtype of ``next_state``.
 
         Raises:
-            ValueError: the reward needs a ``task`` and there is none, or it has a wrong shape.
+            ValueError: the reward needs a ``task`` and gets none, or one of a wrong shape.
         """
 
     def task_of(self, state: Tensor, target: Tensor) -> Tensor:
-        """What is fixed when planning starts: the target itself, unless a subclass says otherwise.
+        """Task of a plan that starts in ``state``; the target itself, unless a subclass overrides this.
 
-        Waits for a GPU, as every check of a user's numbers.
+        Synchronises with a GPU to check the target.
 
         Args:
             state: ``[*B, N, 13]`` states that planning starts from.
@@ -63,12 +58,11 @@ class Reward(nn.Module):
             The ``task`` that :meth:`forward` reads.
 
         Raises:
-            ValueError: the reward needs no target, or the target has a wrong shape, is not finite
-                or out of reach.
+            ValueError: the reward needs no target, or the target has a wrong shape, is not finite or out of reach.
         """
         name = type(self).__name__
         if self.target_shape is None:
-            raise ValueError(f"{name} needs no target: leave out FixTask and the entry 'target'")
+            raise ValueError(f"{name} needs no target: leave out FreezeGoal and the entry 'target'")
         wanted = (*state.shape[:-2], *self.target_shape)
         if target.shape != wanted:
             raise ValueError(
@@ -78,23 +72,23 @@ class Reward(nn.Module):
         return target
 
     def require_task(self, task: Tensor | None, next_state: Tensor) -> Tensor:
-        """Task as a subclass's :meth:`forward` reads it: it is there, and its shape fits.
+        """Checked task, for a subclass's :meth:`forward`.
 
         Args:
-            task: ``[*B, *target_shape]`` or what broadcasts to it.
+            task: ``[*B, *target_shape]``, or broadcastable to it.
             next_state: ``[*B, N, 13]``.
 
         Returns:
             ``task`` in the dtype of ``next_state``.
 
         Raises:
-            ValueError: there is none, or its shape does not fit.
+            ValueError: there is no task, or its shape does not fit.
         """
         name, shape, batch = type(self).__name__, self.target_shape or (), next_state.shape[:-2]
         if task is None:
             raise ValueError(
                 f"{name} needs a task: give the episode's TensorDict an entry 'target' {list(shape)} and put"
-                " FixTask(reward) before the planner, or pass task=reward.task_of(state, target)"
+                " FreezeGoal(reward) before the planner, or pass task=reward.task_of(state, target)"
             )
         split = task.ndim - len(shape)
         lead = task.shape[: max(split, 0)]

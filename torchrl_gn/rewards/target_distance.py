@@ -1,4 +1,4 @@
-"""Rewards on observations."""
+"""Reward of the control suite's reaching tasks, on observations."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from torchrl_gn.scenes import ObservationGraph
 
 
 class TargetDistance(nn.Module):
-    """The suite's reward of reaching a target, on what is observed of the way there.
+    """The suite's reward for reaching a target, from the observed vector to the target.
 
-    1 within ``radius``, falling with the distance ``d`` beyond it as ``1 / (1 + (3 (d - radius) / margin)^2)``
-    (``dm_control.utils.rewards.tolerance`` with a long tail). Its gradient at the target itself is 0.
+    1 within ``radius``; at larger distances ``d`` it is ``1 / (1 + (3 (d - radius) / margin)^2)``
+    (``dm_control.utils.rewards.tolerance`` with a long tail). The gradient at the target is 0.
 
     Args:
-        graph: names the entry that holds the vector to the target.
-        entry: that entry.
+        graph: graph of the observations.
+        entry: entry of the observation that holds the vector to the target.
         radius: size of the target, metres; 0.1 for the suite's swimmers.
-        margin: where the reward is 0.1, metres beyond the radius.
+        margin: metres beyond the radius at which the reward is 0.1.
 
     Raises:
-        ValueError: if there is no such entry, or a length is not positive.
+        ValueError: there is no such entry, or a length is not positive and finite.
     """
 
     def __init__(
@@ -38,8 +38,8 @@ class TargetDistance(nn.Module):
         self.where, self.radius, self.margin = slice(start, start + graph.observation[entry]), radius, margin
 
     def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-        """Reward ``[*B, 1]`` of the observation ``[*B, O]`` that a step led to."""
+        """Reward ``[*B, 1]`` of the observation ``[*B, O]`` after the step."""
         square = next_observation[..., self.where].square().sum(-1, keepdim=True)
-        # Within the radius nothing changes; clamping first keeps the root's gradient finite at 0.
+        # Clamp before the root: its gradient stays finite at 0.
         beyond = square.clamp(min=self.radius**2).sqrt() - self.radius
         return 1 / (1 + (3 * beyond / self.margin).square())
