@@ -1,10 +1,9 @@
-"""Command line: built-in systems and trained models, a scene as a graph, and what this machine can do.
+"""Command line ``torchrl-gn``, or ``python -m torchrl_gn``; imports slow modules only when needed.
 
+Usage:
     torchrl-gn [list]
     torchrl-gn show NAME_OR_MJCF [--image FILE]
     torchrl-gn doctor
-
-The same as ``python -m torchrl_gn``. Everything that takes long to import is imported when it is needed.
 """
 
 from __future__ import annotations
@@ -18,26 +17,23 @@ _SIZE = 480  # pixels of a picture's width and height
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        arguments: what stands behind the program's name; by default those of this process.
+    """Run a command; by default with the arguments of this process.
 
     Returns:
-        Exit code 0. What cannot be done is one message on standard error and, as argparse has it, exit code 2.
+        Exit code 0. Errors print one message on standard error and exit with code 2.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
     try:
-        text = _text(options)
+        text = _output(options)
     except (ValueError, OSError, ImportError) as error:
         parser.exit(2, f"{parser.prog}: {error}\n")
     print(text)
     return 0
 
 
-def _text(options: argparse.Namespace) -> str:
-    """What a command prints."""
+def _output(options: argparse.Namespace) -> str:
+    """Return the output of a command."""
     if options.command == "show":
         return _show(options.scene, options.image)
     if options.command == "doctor":
@@ -50,16 +46,16 @@ def _text(options: argparse.Namespace) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("torchrl-gn", description="Graph-network physics models of articulated bodies.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    commands.add_parser("list", help="the built-in systems and the trained models that come with the package (default)")
-    show = commands.add_parser("show", help="one scene as a graph: nodes, joints, motors, what moves")
+    commands.add_parser("list", help="built-in systems and pretrained models (default)")
+    show = commands.add_parser("show", help="a scene as a graph: nodes, joints, motors, moving parts")
     show.add_argument("scene", metavar="NAME_OR_MJCF", help="a built-in system, or the path of an MJCF file")
-    show.add_argument("--image", metavar="FILE", help="also draw its start state into this file (.png, .jpg, ...)")
-    commands.add_parser("doctor", help="what this machine has, how fast it multiplies, and what to switch on here")
+    show.add_argument("--image", metavar="FILE", help="draw the start state into this file (.png, .jpg, ...)")
+    commands.add_parser("doctor", help="this machine: hardware, libraries, speeds, and recommended options")
     return parser
 
 
 def _systems() -> str:
-    """Table of the built-in systems."""
+    """Return the table of built-in systems."""
     from torchrl_gn.scenes import SYSTEMS, has_variants, load_scene
 
     rows: list[tuple[str, ...]] = [("system", "nodes", "joints", "actions", "control step", "random variants")]
@@ -68,11 +64,11 @@ def _systems() -> str:
         sizes = (scene.num_nodes, len(scene.joint_names), scene.num_actions)
         step = f"{1e3 * scene.timestep:g} ms"
         rows.append((name, *map(str, sizes), step, "yes" if has_variants(scene) else "no"))
-    return _table(rows) + "\nswimmerN exists for every N from 3; any MJCF file will do as well."
+    return _table(rows) + "\nswimmerN exists for every N >= 3; any MJCF file is a scene, too."
 
 
 def _models() -> str:
-    """Table of the trained models that come with the package, with the errors that they state."""
+    """Return the table of pretrained models and their stated errors."""
     from torchrl_gn.pretrained import load_pretrained, pretrained_names
 
     keys = ("one_step_error", "rollout_error_20", "rollout_error_100")
@@ -86,11 +82,11 @@ def _models() -> str:
         for system in sorted(stated, key=lambda system: (system.rstrip("0123456789"), len(system), system)):
             errors = (f"{stated[system][key]:.1e}" if key in stated[system] else "-" for key in keys)
             rows.append((name, system, "yes" if system in trained else "no", *errors))
-    return _table(rows) + "\nSquared errors relative to the prediction that nothing moves (1), of 20 trajectories."
+    return _table(rows) + "\nSquared errors of 20 trajectories, relative to the persistence baseline (no motion)."
 
 
 def _show(source: str, image: str | None) -> str:
-    """A scene's summary, and the path of its picture if there is to be one."""
+    """Return a scene's summary and, with ``image``, draw its start state."""
     from torchrl_gn.scenes import load_scene
 
     scene = load_scene(source)
@@ -108,7 +104,7 @@ def _show(source: str, image: str | None) -> str:
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as lines, columns aligned, a rule under the first row."""
+    """Format rows of cells with aligned columns and a rule under the first row."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
     return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])

@@ -1,4 +1,4 @@
-"""Write a file completely or not at all."""
+"""Atomic writes: a file is complete or unchanged."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from typing import Any
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that replaces it once the block succeeds.
+    """Yield a temporary path, with the same suffix, that replaces ``path`` if the block succeeds.
 
-    The temporary file keeps the suffix, from which writers tell the format.
-    Missing parent folders are made. If the block fails, ``path`` stays as it was.
+    Makes missing parent folders. If the block fails, ``path`` is unchanged.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         yield temporary
-        # Some writers keep others out; a file is as readable as any that the user writes.
+        # Some writers deny access to others: give the file the user's default mode.
         temporary.chmod(_mode())
         os.replace(temporary, path)
     finally:
@@ -37,7 +36,7 @@ def _mode() -> int:
 
 
 def write_json(path: str | os.PathLike, values: Any) -> None:
-    """Write plain values as indented JSON, atomically; NaN and Inf are refused by name."""
+    """Write plain values as indented JSON, atomically; raise ValueError for NaN and infinity."""
     try:
         text = json.dumps(values, indent=2, allow_nan=False)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""What this machine has, how fast it multiplies, and what to switch on here: ``torchrl-gn doctor``."""
+"""Report on this machine: hardware, libraries, speeds and recommended options (``torchrl-gn doctor``)."""
 
 from __future__ import annotations
 
@@ -26,17 +26,11 @@ from torchrl_gn.training.checkpoint import package_versions
 _MODEL = "swimmer6"
 _BATCHES = (1, 200, 2000)
 _ROUNDS = 5
-_GAIN = 1.3  # of more threads, to be worth their cores
+_MIN_GAIN = 1.3  # smallest speed-up for which to recommend more threads
 
 
 def diagnose() -> str:
-    """Describe processor, libraries and speeds of this machine, with advice at the end.
-
-    Takes a few seconds. Bug reports begin with it.
-
-    Returns:
-        Lines of text.
-    """
+    """Return a report on processor, libraries and speeds, with advice; takes a few seconds."""
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     seconds = _thread_seconds(threads)
     compiler, gpus = _compiler(), _gpus()
@@ -69,13 +63,13 @@ def _system(threads: int) -> list[tuple[str, str]]:
 
 
 def _libraries() -> list[tuple[str, str]]:
-    said = torch.__config__.show()
-    found = {
+    config = torch.__config__.show()
+    patterns = {
         "MKL": r"Math Kernel Library Version ([\w.-]+)",
         "oneDNN": r"MKL-DNN v([\w.]+)",
         "BLAS": r"BLAS_INFO=(\w+)",
     }
-    rows = [(name, match[1]) for name, pattern in found.items() if (match := re.search(pattern, said))]
+    rows = [(name, match[1]) for name, pattern in patterns.items() if (match := re.search(pattern, config))]
     return [*rows, ("torch threads", str(torch.get_num_threads()))]
 
 
@@ -85,47 +79,47 @@ def _products() -> list[tuple[str, str]]:
     return [
         ("float64", f"{speeds.float64:.0f}"),
         ("float32", f"{speeds.float32:.0f}"),
-        ("float32, oneDNN", onednn if speeds.onednn else "cannot be chosen in this torch"),
+        ("float32, oneDNN", onednn if speeds.onednn else "not selectable in this version of torch"),
         ("bfloat16", f"{speeds.bfloat16:.0f}"),
         ("float16", f"{speeds.float16:.0f}"),
     ]
 
 
 def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
-    """Seconds of predictions and of a training step on one and on all threads; the least of some, taken in turn."""
+    """Time predictions and a training step on one and on all threads: seconds, best of ``_ROUNDS``."""
     loaded = load_pretrained(_MODEL)
     bound = loaded.model.bind(loaded.scene())
-    quick, loss = specialize(bound), ForwardModelLoss(bound)
+    specialized, loss = specialize(bound), ForwardModelLoss(bound)
     batch = trajectory_buffer(collect_trajectories(bound.scene, 20, seed=0), batch_size=max(_BATCHES), seed=0).sample()
 
     def predict(count: int) -> None:
         with torch.no_grad(), fast_matmul():
-            quick.step(batch["state"][:count], batch["action"][:count])
+            specialized.step(batch["state"][:count], batch["action"][:count])
 
     def train() -> None:
         with fast_matmul():
             loss(batch[:200])["loss_forward_model"].backward()
 
-    works: dict[str, Callable[[], None]] = {f"step of {count:,}": partial(predict, count) for count in _BATCHES}
-    works["gradient of 200"] = train
-    before, found = torch.get_num_threads(), {}
+    tasks: dict[str, Callable[[], None]] = {f"step of {count:,}": partial(predict, count) for count in _BATCHES}
+    tasks["gradient of 200"] = train
+    before, seconds = torch.get_num_threads(), {}
     try:
-        for name, work in tqdm(works.items(), desc="measuring", leave=False):
+        for name, task in tqdm(tasks.items(), desc="measuring", leave=False):
             best = {1: float("inf"), threads: float("inf")}
             for _ in range(_ROUNDS):
                 for count in best:
                     torch.set_num_threads(count)
                     start = time.perf_counter()
-                    work()
+                    task()
                     best[count] = min(best[count], time.perf_counter() - start)
-            found[name] = best[1], best[threads]
+            seconds[name] = best[1], best[threads]
     finally:
         torch.set_num_threads(before)
-    return found
+    return seconds
 
 
 def _compiler() -> str | None:
-    """First line of what the C++ compiler says of itself, the one that torch.compile calls."""
+    """Return the version of the C++ compiler that torch.compile uses."""
     command = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
     if not command:
         return None
@@ -146,7 +140,7 @@ def _advice(seconds: dict[str, tuple[float, float]], threads: int, compiler: boo
     lines.append(
         "specialize(model, compile=True) for few states at a time and for planning"
         if compiler
-        else "no compile=True: install g++ first (5 to 8 times faster steps of few states)"
+        else "install g++ for compile=True: 5 to 8 times faster steps of few states"
     )
     slower = products.slowdown(torch.bfloat16)
     lines.append(
@@ -158,12 +152,14 @@ def _advice(seconds: dict[str, tuple[float, float]], threads: int, compiler: boo
         gain = products.onednn / products.float32
         lines.append(f"fast_matmul() around large batches: float32 products {gain:.1f} times as fast")
     else:
-        lines.append("no fast_matmul(): oneDNN " + ("rounds" if products.onednn_error > 1e-5 else "gains nothing"))
+        lines.append(
+            "no fast_matmul(): oneDNN " + ("rounds the factors" if products.onednn_error > 1e-5 else "is not faster")
+        )
     one, all_ = seconds["gradient of 200"]
     if threads > 1:
         lines.append(
             f"threads={threads} in recipes while nothing else runs: training {one / all_:.1f} times as fast"
-            if one > _GAIN * all_
+            if one > _MIN_GAIN * all_
             else f"threads=1 in recipes: on {threads} threads training is {one / all_:.1f} times as fast"
         )
     lines.append("device=cuda in recipes" if gpu else "device=cpu: torch sees no GPU")

@@ -1,4 +1,4 @@
-"""Refuse NaN and infinity where numbers come in, before they spread."""
+"""Check that input numbers are finite."""
 
 from __future__ import annotations
 
@@ -9,18 +9,8 @@ from torch import Tensor
 
 
 def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> None:
-    """Raise where a number is NaN or infinite.
-
-    Waits for a GPU, so it stands where a user's numbers enter and never between steps. ``torch.compile`` leaves it out:
-    a compiled function cannot stop halfway.
-
-    Args:
-        value: any shape; of a TensorDict every entry.
-        what: what it is, for the message.
-
-    Raises:
-        ValueError: naming what it is, the number and its index.
-    """
+    """Raise ValueError, naming ``what``, value and index, if a number of ``value`` (any shape) is NaN or infinite."""
+    # Synchronises with a GPU: call it on a user's input, not between steps. Compiled code cannot raise on values.
     if torch.compiler.is_compiling():
         return
     if isinstance(value, TensorDictBase):

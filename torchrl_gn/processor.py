@@ -1,4 +1,4 @@
-"""Matrix products that this processor computes fast: timed once, kept for later processes."""
+"""Speed of matrix products on this processor, measured once and cached on disk."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LIMITS = ("ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA", "MKL
 
 
 class SlowDtypeWarning(UserWarning):
-    """A dtype was asked for that this processor multiplies more slowly than float32."""
+    """This processor multiplies the chosen dtype more slowly than float32."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,10 @@ class ProductSpeeds:
     """Speed of matrix products on one thread, GFLOP/s.
 
     Attributes:
-        float64: in float64.
-        float32: in float32, by torch's default library.
-        onednn: in float32, by oneDNN; 0 if this torch cannot choose it.
-        bfloat16: in bfloat16.
-        float16: in float16.
-        onednn_error: relative error of a product of oneDNN's, above 1e-5 where it rounds the factors.
+        float64, bfloat16, float16: in that dtype.
+        float32: by torch's default library.
+        onednn: in float32, by oneDNN; 0 if this version of torch cannot select it.
+        onednn_error: relative error of oneDNN; above 1e-5 if it rounds the factors.
     """
 
     float64: float
@@ -49,32 +47,32 @@ class ProductSpeeds:
 
     @property
     def onednn_pays(self) -> bool:
-        """Whether oneDNN is faster in float32 with the same digits."""
+        """Whether oneDNN is faster in float32 at the same precision."""
         return self.onednn_error < 1e-5 and self.onednn > 1.1 * self.float32
 
     def slowdown(self, dtype: torch.dtype) -> float:
-        """How many times longer a product takes in a dtype of 16 bits than in float32; 1 for other dtypes."""
+        """Return the time of a product in a 16-bit dtype relative to float32; 1 for other dtypes."""
         speed = {torch.bfloat16: self.bfloat16, torch.float16: self.float16}.get(dtype)
         return 1.0 if speed is None else max(self.float32, self.onednn if self.onednn_pays else 0.0) / speed
 
     def pays(self, dtype: torch.dtype) -> bool:
-        """Whether a dtype is no slower than float32, but for noise."""
+        """Return whether a dtype is no slower than float32, up to noise."""
         return self.slowdown(dtype) < 1.2
 
 
 @functools.cache
 def product_speeds() -> ProductSpeeds:
-    """Time products of 1,400 x 128 by 128 x 128, or read what an earlier process measured.
+    """Measure products of 1,400 x 128 by 128 x 128 (0.1 s), or read the result of an earlier process.
 
-    Kept in ``$XDG_CACHE_HOME/torchrl_gn`` (``~/.cache/torchrl_gn``) by processor, restriction of instruction sets and
-    torch version; where that cannot be written, every process measures for itself (a tenth of a second).
+    Cached in ``$XDG_CACHE_HOME/torchrl_gn`` (``~/.cache/torchrl_gn``) if writable, by processor, instruction sets and
+    torch version.
     """
     key = "\n".join([processor_name(), instruction_sets(), torch.__version__, *restrictions()])
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
     file = folder / f"products-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
     try:
         return ProductSpeeds(**json.loads(file.read_text()))
-    except (OSError, ValueError, TypeError):  # not there, damaged, or of an older version of this package
+    except (OSError, ValueError, TypeError):  # missing, damaged, or of another version of this package
         pass
     speeds = _measure()
     try:
@@ -85,13 +83,13 @@ def product_speeds() -> ProductSpeeds:
 
 
 def processor_name() -> str:
-    """Name of the processor's model, ``"AMD EPYC"`` for example."""
+    """Return the processor's model, such as ``"AMD EPYC"``."""
     fields = _cpuinfo()
     return fields.get("model name") or platform.processor() or platform.machine()
 
 
 def instruction_sets() -> str:
-    """The vector and matrix instructions that matter here and that the processor has, ``"AVX2, FMA"`` for example."""
+    """Return the processor's vector and matrix instruction sets, such as ``"AVX2, FMA"``."""
     flags = set((_cpuinfo().get("flags") or _cpuinfo().get("Features") or "").split())
     known = {
         "avx2": "AVX2",
@@ -109,13 +107,13 @@ def instruction_sets() -> str:
 
 
 def restrictions() -> list[str]:
-    """Environment variables that keep this process from using all instruction sets, as ``NAME=VALUE``."""
+    """Return the environment variables that restrict instruction sets, as ``NAME=VALUE``."""
     return [f"{name}={os.environ[name]}" for name in _LIMITS if os.environ.get(name)]
 
 
 @functools.cache
 def _cpuinfo() -> dict[str, str]:
-    """Fields of the first core in Linux's ``/proc/cpuinfo``; empty on other systems."""
+    """Return the first core's fields of Linux's ``/proc/cpuinfo``; empty on other systems."""
     try:
         first = Path("/proc/cpuinfo").read_text().split("\n\n")[0]
     except OSError:
@@ -125,7 +123,7 @@ def _cpuinfo() -> dict[str, str]:
 
 
 def onednn_precision():
-    """What sets the precision of oneDNN's products in float32 (``fp32_precision``), or None before torch 2.9."""
+    """Return the settings with oneDNN's ``fp32_precision``, or None before torch 2.9."""
     settings = getattr(torch.backends.mkldnn, "matmul", None)
     usable = torch.backends.mkldnn.is_available() and hasattr(settings, "fp32_precision")
     return settings if usable else None
@@ -142,7 +140,7 @@ def _measure() -> ProductSpeeds:
     onednn, error = float("inf"), 0.0
     torch.set_num_threads(1)
     try:
-        # In turn, so that all meet the same load; the first round warms up.
+        # Take turns under the same load; the first round warms up.
         for _ in range(_ROUNDS):
             for name, pair in factors.items():
                 seconds[name] = min(seconds[name], _seconds(pair)[0])

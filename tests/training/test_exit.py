@@ -48,7 +48,7 @@ def test_interruptions_say_what_is_kept_and_where(saved, tmp_path, capsys):
     assert caught.value.code == 130
     said = capsys.readouterr().err
     assert said == (
-        f"Interrupted; what was done is in {run.path}, and run_dir={run.path} goes on from there.\n"
+        f"Interrupted; progress is saved in {run.path}; resume with run_dir={run.path}.\n"
         if saved
         else "Interrupted; nothing was kept.\n"
     )

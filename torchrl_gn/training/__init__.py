@@ -12,8 +12,8 @@ from torchrl_gn.training.exit import clean_exit as clean_exit
 from torchrl_gn.training.help import with_help as with_help
 from torchrl_gn.training.learning import learn_with_progress as learn_with_progress
 from torchrl_gn.training.learning import report_learning as report_learning
+from torchrl_gn.training.learning_curve import mean_return as mean_return
 from torchrl_gn.training.off_policy import OffPolicyTrainer as OffPolicyTrainer
-from torchrl_gn.training.off_policy import mean_return as mean_return
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer
 from torchrl_gn.training.optimizers import make_agent_optimizer as make_agent_optimizer
 from torchrl_gn.training.optimizers import make_optimizer as make_optimizer

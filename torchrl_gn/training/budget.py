@@ -1,4 +1,4 @@
-"""How long a training may take: an amount of work, a time, or both."""
+"""Limits of a training: optimiser steps, minutes, or both."""
 
 from __future__ import annotations
 
@@ -11,18 +11,12 @@ _CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
 @dataclass(frozen=True)
 class Budget:
-    """Limits on optimiser steps and on training minutes; a training ends at the first that it reaches.
-
-    Steps alone give the same training on every machine. Minutes beside them are a cap for slow ones.
+    """Limits on optimiser steps and training minutes; training ends at the first one reached.
 
     Attributes:
-        steps: optimiser steps; None: no limit.
-        minutes: minutes of training, over all resumed runs together; None: no limit.
-        clock: which minutes: ``"wall"``, or the ``"processor"``'s, which do not pass faster on a busy
-            machine (count one thread: threads add up).
-
-    Raises:
-        ValueError: if there is no limit, one is not positive and finite, or there is no such clock.
+        steps: positive number of optimiser steps; None: no limit.
+        minutes: positive minutes of training, summed over resumed runs; None: no limit.
+        clock: ``"wall"`` time, or ``"processor"`` time, which sums over threads.
     """
 
     steps: int | None = None
@@ -40,34 +34,30 @@ class Budget:
                 raise ValueError(f"A training budget must be positive and finite, got {name}={limit}.")
 
     def now(self) -> float:
-        """Seconds of the clock, from any start."""
+        """Read the clock, in seconds."""
         return _CLOCKS[self.clock]()
 
     def fraction(self, step: int, seconds: float, *, windows: float = 0.0, window_cost: float = 1.0) -> float:
-        """Share of the budget that is spent, 0 to 1: of its steps or its minutes, whichever is more.
+        """Return the spent share of the budget, 0 to 1: the larger of steps and minutes.
 
-        Args:
-            step: optimiser steps done.
-            seconds: training seconds spent.
-            windows: share of the work that goes to updates on windows, at the end.
-            window_cost: work of such an update, in updates on single transitions.
+        The last ``windows`` share of the work trains on windows; each such step costs ``window_cost`` plain ones.
         """
-        by_steps = 0.0 if self.steps is None else _work(step / self.steps, windows, window_cost)
+        by_steps = 0.0 if self.steps is None else _work_share(step / self.steps, windows, window_cost)
         by_time = 0.0 if self.minutes is None else seconds / 60 / self.minutes
         return min(max(by_steps, by_time), 1.0)
 
     def is_cut_short(self, step: int, seconds: float) -> bool:
-        """Whether the minutes ended a training before its steps were done."""
+        """Return whether the minutes ran out before the steps."""
         if self.steps is None or self.minutes is None:
             return False
         return step < self.steps and seconds >= 60 * self.minutes
 
 
-def _work(share: float, windows: float, cost: float) -> float:
-    """Share of the work done after a share of the steps, where those of the last ``windows`` of the work cost more."""
+def _work_share(steps: float, windows: float, cost: float) -> float:
+    """Convert a share of the steps to a share of the work, where steps of the last ``windows`` share cost more."""
     if windows == 0:
-        return share
-    plain = (1 - windows) * cost / ((1 - windows) * cost + windows)  # share of the steps before the windows
-    if share < plain:
-        return (1 - windows) * share / plain
-    return 1 - windows * (1 - share) / (1 - plain)
+        return steps
+    single = (1 - windows) * cost / ((1 - windows) * cost + windows)  # share of the steps before the windows
+    if steps < single:
+        return (1 - windows) * steps / single
+    return 1 - windows * (1 - steps) / (1 - single)

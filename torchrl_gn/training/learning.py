@@ -1,4 +1,4 @@
-"""What a person at a terminal sees of a policy being learned, and what is left of it; shared by the recipes."""
+"""Policy training on the terminal: progress bar, checkpoints and the final report."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from torchrl_gn.training.tracking import Tracker
 
 
 def learn_with_progress(
-    trainer: OffPolicyTrainer, path: Path, begun: Checkpoint | None, tracker: Tracker, *, config: Mapping[str, Any]
+    trainer: OffPolicyTrainer, path: Path, resumed: Checkpoint | None, tracker: Tracker, *, config: Mapping[str, Any]
 ) -> None:
-    """Learn to the end with a progress bar, saving now and then, on Ctrl-C and at the end.
+    """Train a policy with a progress bar; save regularly, on Ctrl-C and at the end.
 
     Args:
-        trainer: what learns.
-        path: the checkpoint to write.
-        begun: the checkpoint to go on from, if the run was begun before.
-        tracker: where losses and returns are logged.
-        config: configuration of the run; its ``checkpoint_seconds`` are the seconds between checkpoints.
+        trainer: the trainer.
+        path: checkpoint to write.
+        resumed: checkpoint to resume from, if any.
+        tracker: logs losses and returns.
+        config: configuration of the run; ``checkpoint_seconds`` are the seconds between checkpoints.
     """
-    if begun is not None:
-        trainer.load_state_dict(begun.training)
+    if resumed is not None:
+        trainer.load_state_dict(resumed.training)
 
     def save() -> None:
         save_checkpoint(path, trainer.agent, config=config, training=trainer.state_dict())
@@ -59,15 +59,15 @@ def report_learning(
     seed: int,
     more: Mapping[str, float] | None = None,
 ) -> None:
-    """Write ``curve.json``, ``curve.png`` and ``metrics.json``, and print a table and the paths.
+    """Write ``curve.json``, ``curve.png`` and ``metrics.json``; print a table and the paths.
 
     Args:
-        trainer: what has learned.
-        run: where to.
-        tracker: what the figure is logged with.
-        label: what to call the agent.
-        seed: of the run.
-        more: further numbers of the metrics.
+        trainer: the finished trainer.
+        run: folder to write to.
+        tracker: logs the metrics and files.
+        label: name of the agent in the figure.
+        seed: seed of the run.
+        more: further metrics.
     """
     curve = trainer.curve
     write_json(run.file("curve.json"), vars(curve))
@@ -85,9 +85,8 @@ def report_learning(
         **(more or {}),
     }
     run.write_metrics(numbers, seed=seed)
-    tracker.finish(numbers, [*run.written, run.checkpoint], trainer.frames)
+    files = [*run.written, run.checkpoint]
+    tracker.finish(numbers, files, trainer.frames)
     width = max(map(len, numbers))
-    for name, value in numbers.items():
-        tqdm.write(f"{name:{width}}  {value:,.4g}")
-    for path in [*run.written, run.checkpoint]:
-        tqdm.write(str(path))
+    for line in [*(f"{name:{width}}  {value:,.4g}" for name, value in numbers.items()), *map(str, files)]:
+        tqdm.write(line)

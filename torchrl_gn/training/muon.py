@@ -1,17 +1,17 @@
-"""Muon: momentum whose updates of matrices are made orthogonal, in float32 and one batch a shape."""
+"""Muon: momentum with orthogonalised matrix updates, in float32 and one batch per shape."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-# Odd quintics, of which each comes closest to 1 on what the one before makes of singular values from 0.002 to 1 (N.
-# Amsel et al., "The Polar Express", 2025). These four end between 0.68 and 1.32, as Muon's usual five equal ones do.
+# Odd quintics (linear, cubic, quintic), each optimal after the one before for singular values in [0.002, 1] (N. Amsel
+# et al., "The Polar Express", 2025). Four of them reach [0.68, 1.32], like five of Muon's usual equal ones.
 _POLYNOMIALS = (
     (8.4268, -24.9361, 18.4925),
     (4.1116, -3.0591, 0.57495),
@@ -23,18 +23,17 @@ _POLYNOMIALS = (
 class Muon(torch.optim.Optimizer):
     """Muon for weight matrices (K. Jordan, "Muon: an optimizer for hidden layers", 2024).
 
-    Nesterov momentum, its matrix replaced by the nearest semi-orthogonal one (all singular values about 1), times
-    ``lr * sqrt(max(1, rows / columns))``: the updates of ``torch.optim.Muon`` without weight decay. That one multiplies
-    in bfloat16, 20 times slower on processors without such instructions. This one multiplies in the matrices' own
-    dtype, float32 or float64 (float32 for halves), all matrices of a shape in one batched product.
+    The update is the nearest semi-orthogonal matrix to the Nesterov momentum, times ``lr * sqrt(max(1, rows /
+    columns))``: that of ``torch.optim.Muon`` without weight decay, but in the parameter's float32 or float64 (float32
+    for 16-bit ones) instead of bfloat16.
 
     Args:
-        params: matrices, or groups of them.
-        lr: learning rate: the size of an update's singular values.
-        momentum: weight of the past gradients.
+        params: matrices, or parameter groups of them.
+        lr: learning rate: the singular values of an update.
+        momentum: weight of past gradients.
 
     Raises:
-        ValueError: if a parameter is not a matrix, the rate is negative or the momentum not from 0 to 1.
+        ValueError: if a parameter is not a matrix, ``lr`` is negative or not finite, or ``momentum`` not in [0, 1).
     """
 
     def __init__(self, params: Iterable[Any], lr: float = 1e-2, *, momentum: float = 0.95) -> None:
@@ -50,11 +49,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # pyright: ignore
-        """Update the matrices that have gradients.
-
-        Args:
-            closure: computes loss and gradients anew, as in every ``torch.optim`` optimiser.
-        """
+        """Update the matrices that have gradients; ``closure`` recomputes the loss, as in ``torch.optim``."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -78,14 +73,7 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalize(matrices: Tensor) -> Tensor:
-    """Bring all singular values of matrices to about 1 (0.7 to 1.3), by polynomials.
-
-    Args:
-        matrices: ``[K, m, n]``; its products are computed in its dtype.
-
-    Returns:
-        ``[K, m, n]``; zero where the matrix is zero.
-    """
+    """Map the singular values of matrices ``[K, m, n]`` to about 1 (0.7 to 1.3); zero matrices stay zero."""
     if matrices.shape[-2] > matrices.shape[-1]:
         return orthogonalize(matrices.mT).mT
     out = matrices / torch.linalg.matrix_norm(matrices, keepdim=True).clamp(min=1e-7)
@@ -93,32 +81,31 @@ def orthogonalize(matrices: Tensor) -> Tensor:
     if columns < 1.5 * rows:
         for linear, cubic, quintic in _POLYNOMIALS:
             gram = out @ out.mT
-            rest = torch.baddbmm(gram, gram, gram, beta=cubic, alpha=quintic)
-            out = torch.baddbmm(out, rest, out, beta=linear)
+            higher = torch.baddbmm(gram, gram, gram, beta=cubic, alpha=quintic)
+            out = torch.baddbmm(out, higher, out, beta=linear)
         return out
-    # A wide matrix: iterate on its Gram matrix, and multiply by the product of all polynomials at the end.
+    # Wide matrices: iterate on the smaller Gram matrix, and apply the product of all polynomials once.
     gram, factor = out @ out.mT, None
     for iteration, (linear, cubic, quintic) in enumerate(_POLYNOMIALS):
-        rest = torch.baddbmm(gram, gram, gram, beta=cubic, alpha=quintic)
+        higher = torch.baddbmm(gram, gram, gram, beta=cubic, alpha=quintic)
         if iteration + 1 < len(_POLYNOMIALS):
-            half = torch.baddbmm(gram, rest, gram, beta=linear)
-            gram = torch.baddbmm(half, half, rest, beta=linear)
+            half = torch.baddbmm(gram, higher, gram, beta=linear)
+            gram = torch.baddbmm(half, half, higher, beta=linear)
         if factor is None:
-            factor = rest
+            factor = higher
             factor.diagonal(dim1=-2, dim2=-1).add_(linear)
         else:
-            factor = torch.baddbmm(factor, rest, factor, beta=linear)
+            factor = torch.baddbmm(factor, higher, factor, beta=linear)
     return out if factor is None else factor @ out
 
 
-def _orthogonalize_all(matrices: Iterable[Tensor]) -> list[Tensor]:
-    """Orthogonalise matrices ``[m, n]``, those of one shape, dtype and device together."""
-    matrices = list(matrices)
-    alike: dict[tuple, list[int]] = defaultdict(list)
+def _orthogonalize_all(matrices: Sequence[Tensor]) -> list[Tensor]:
+    """Orthogonalise matrices ``[m, n]``, batched by shape, dtype and device."""
+    groups: dict[tuple, list[int]] = defaultdict(list)
     for index, matrix in enumerate(matrices):
-        alike[tuple(matrix.shape), matrix.dtype, matrix.device].append(index)
+        groups[tuple(matrix.shape), matrix.dtype, matrix.device].append(index)
     out = list(matrices)
-    for indices in alike.values():
+    for indices in groups.values():
         batch = torch.stack([matrices[index] for index in indices])
         exact = batch.dtype if batch.dtype in (torch.float32, torch.float64) else torch.float32
         for index, update in zip(indices, orthogonalize(batch.to(exact)).to(batch.dtype), strict=True):

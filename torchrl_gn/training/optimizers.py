@@ -1,9 +1,9 @@
-"""Optimiser presets: which optimisers a model trains with and how their rates fall."""
+"""Optimiser presets: optimisers and learning-rate schedules."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, cast, get_args
 
 import torch
@@ -19,15 +19,9 @@ class ScheduledOptimizer:
     """Optimisers that step together, with clipped gradients and scheduled learning rates.
 
     Args:
-        optimizers: the optimisers, each with its own parameters; the learning rates they
-            are made with are the highest.
-        schedule: factor on all learning rates from ``(step, fraction)``, where
-            ``fraction`` of the training budget is spent; None leaves the rates alone (to a scheduler of
-            ``torch.optim.lr_scheduler``, say).
-        max_norm: norm that the gradient of all parameters together is clipped to; infinite: never.
-
-    Raises:
-        ValueError: if ``max_norm`` is not positive.
+        optimizers: the optimisers, at their peak learning rates.
+        schedule: factor on the learning rates from ``(step, fraction of the budget spent)``; None: no change.
+        max_norm: positive norm (else a ValueError) that the joint gradient is clipped to; infinite: no clipping.
     """
 
     def __init__(
@@ -40,12 +34,12 @@ class ScheduledOptimizer:
         if not max_norm > 0:
             raise ValueError(f"max_norm={max_norm} must be positive.")
         self.optimizers, self.schedule, self.max_norm = optimizers, schedule, max_norm
-        self._highest = [[group["lr"] for group in optimizer.param_groups] for optimizer in optimizers]
+        self._peak_rates = [[group["lr"] for group in optimizer.param_groups] for optimizer in optimizers]
         self._parameters = [p for o in optimizers for group in o.param_groups for p in group["params"]]
 
     @classmethod
     def of(cls, optimizer: ScheduledOptimizer | torch.optim.Optimizer) -> ScheduledOptimizer:
-        """An optimiser of ``torch.optim`` as it is: its own rates, and gradients that are not clipped."""
+        """Wrap an optimiser of ``torch.optim`` without schedule or clipping; raise TypeError for anything else."""
         if isinstance(optimizer, cls):
             return optimizer
         if not isinstance(optimizer, torch.optim.Optimizer):
@@ -55,28 +49,23 @@ class ScheduledOptimizer:
         return cls([optimizer], None, max_norm=math.inf)
 
     def zero_grad(self) -> None:
-        """Forget all gradients."""
+        """Set all gradients to None."""
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
 
     def step(self, step: int, fraction: float) -> float:
-        """Clip gradients, set the rates and update the parameters.
+        """Clip the gradients, set the learning rates, update the parameters; return the norm before clipping.
 
         Args:
             step: updates done before this one.
             fraction: share of the training budget spent, 0 to 1.
 
-        Returns:
-            Norm of the gradient before clipping.
-
         Raises:
-            FloatingPointError: if the gradient is not finite; no parameter is changed.
+            FloatingPointError: if the gradient is not finite; no parameter changes.
         """
-        norm = float(nn.utils.clip_grad_norm_(self._parameters, self.max_norm))
-        if not math.isfinite(norm):
-            raise FloatingPointError(f"The gradient is not finite at step {step}; lower the learning rate.")
+        norm = clip_gradients(self._parameters, self.max_norm, f"step {step}")
         factor = None if self.schedule is None else self.schedule(step, fraction)
-        for optimizer, rates in zip(self.optimizers, self._highest, strict=True):
+        for optimizer, rates in zip(self.optimizers, self._peak_rates, strict=True):
             if factor is not None:
                 for group, rate in zip(optimizer.param_groups, rates, strict=True):
                     group["lr"] = rate * factor
@@ -88,36 +77,40 @@ class ScheduledOptimizer:
         return {str(index): optimizer.state_dict() for index, optimizer in enumerate(self.optimizers)}
 
     def load_state_dict(self, state: dict) -> None:
-        """Take back what :meth:`state_dict` gave."""
+        """Load what :meth:`state_dict` returned."""
         for index, optimizer in enumerate(self.optimizers):
             optimizer.load_state_dict(state[str(index)])
 
 
-def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | None = None) -> ScheduledOptimizer:
-    """Optimiser of a preset for a module's parameters.
+def clip_gradients(parameters: Iterable[torch.Tensor], max_norm: float, when: str) -> float:
+    """Clip the joint gradient; return its norm before. Raise FloatingPointError, naming ``when``, if not finite."""
+    norm = float(nn.utils.clip_grad_norm_(parameters, max_norm))
+    if not math.isfinite(norm):
+        raise FloatingPointError(f"The gradient is not finite at {when}; lower the learning rate.")
+    return norm
 
-    - ``"muon"``: Muon on matrices (1e-2) and Adam on the rest (1e-3), cosine to 0.
-    - ``"adam"``: Adam (1e-3), cosine to 0.
-    - ``"paper"``: Adam at 1e-4, times 0.975 every 50,000 steps (SM "Training details", fast
-      training; Paper: the rate is printed as ``1^{-4}``).
+
+def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | None = None) -> ScheduledOptimizer:
+    """Make a preset optimiser for a module's parameters.
 
     Args:
-        module: what to train.
-        preset: name of the preset.
-        lr: highest learning rate (of Muon's matrices), instead of the preset's.
+        module: the module to train.
+        preset: ``"muon"`` (Muon 1e-2 on matrices, Adam 1e-3 on the rest, cosine to 0), ``"adam"`` (1e-3, cosine to 0)
+            or ``"paper"`` (Adam 1e-4, times 0.975 every 50,000 steps: SM "Training details").
+        lr: peak learning rate (of Muon's matrices), instead of the preset's.
 
     Raises:
-        ValueError: if the preset is unknown or the rate is not positive and finite.
+        ValueError: if the preset is unknown or ``lr`` is not positive and finite.
     """
     if preset not in get_args(Preset):
         raise ValueError(f"Optimiser preset {preset!r} is not known; use one of {list(get_args(Preset))}.")
     if lr is not None and not 0 < lr < math.inf:
         raise ValueError(f"lr={lr} must be positive and finite.")
     parameters = [parameter for parameter in module.parameters() if parameter.requires_grad and parameter.numel()]
-    if preset == "paper":
-        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-4, fused=True)], _paper_decay)
-    if preset == "adam":
-        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or 1e-3, fused=True)], _cosine)
+    if preset != "muon":
+        # Paper: the rate is printed as 1^{-4}.
+        rate, schedule = (1e-4, _paper_decay) if preset == "paper" else (1e-3, _cosine)
+        return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or rate, fused=True)], schedule)
     matrices = [parameter for parameter in parameters if parameter.ndim == 2]
     rest = [parameter for parameter in parameters if parameter.ndim != 2]
     optimizers: list[torch.optim.Optimizer] = []
@@ -131,17 +124,16 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
 def make_agent_optimizer(
     losses: Sequence[LossModule], *, policy_lr: float, value_lr: float, model_lr: float | None = None
 ) -> torch.optim.Optimizer:
-    """One Adam for all that an agent learns by, each network with a rate of its own.
+    """Make one Adam for an agent's networks.
 
     Args:
-        losses: a loss of policy and value first (``DDPGLoss``, :class:`~torchrl_gn.objectives.SVGLoss`), those of what
-            it plans with after.
+        losses: the loss of policy and value (``DDPGLoss``, ``SVGLoss``) first, then those of model and reward.
         policy_lr: learning rate of the policy.
-        value_lr: of the value.
-        model_lr: of model and reward, which the other losses train.
+        value_lr: learning rate of the value.
+        model_lr: learning rate of model and reward.
 
     Raises:
-        ValueError: if a rate that is needed is missing, or not positive and finite.
+        ValueError: if a needed rate is missing, or not positive and finite.
     """
     first = cast(Any, losses[0])
     groups = [(first.actor_network_params, policy_lr, "policy_lr"), (first.value_network_params, value_lr, "value_lr")]

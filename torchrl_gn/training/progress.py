@@ -1,4 +1,4 @@
-"""What a person at a terminal sees of long work, shared by the recipes."""
+"""Progress bars of long work: data collection and training, with checkpoints."""
 
 from __future__ import annotations
 
@@ -23,11 +23,7 @@ HORIZON = max(HORIZONS)
 
 @contextmanager
 def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Progress bar of collecting data, as ``create_dataset(..., progress=...)`` wants it.
-
-    Args:
-        what: what is collected.
-    """
+    """Show a progress bar of data collection; yield the callback for ``create_dataset(..., progress=...)``."""
     with tqdm(desc=f"collecting {what}", unit=" trajectories", leave=False) as bar:
 
         def show(done: int, total: int) -> None:
@@ -40,58 +36,47 @@ def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
 def dataset_with_progress(
     folder: Path, scene: Scene, data: Mapping[str, Any], *, variants: int | None = None
 ) -> TrajectoryDataset:
-    """Make a system's data set, finish it or open the one that is there, with a progress bar.
+    """Create, complete or open a system's data set, with a progress bar.
 
     Args:
-        folder: holds the data sets, each in a folder of its own: ``<name>``, of variants ``<name>_variants``.
+        folder: parent of the data sets ``<name>`` and, with variants, ``<name>_variants``.
         scene: the scene.
-        data: configuration of the data: trajectories to ``train``, for ``validation`` and to ``test``, their ``length``
-            in control steps, and their ``seed``; if it has ``ray``, the address of a Ray cluster to simulate on.
-        variants: number of random variants in each split. Default: all trajectories are of the scene itself.
+        data: numbers of ``train``, ``validation`` and ``test`` trajectories, ``length`` in control steps, ``seed``, and
+            optionally ``ray``, the address of a Ray cluster to simulate on.
+        variants: random variants per split. Default: the scene itself.
 
     Raises:
-        ValueError: if trajectories are too short for the errors that recipes measure.
+        ValueError: if trajectories are shorter than the longest rollout measured.
     """
     if data["length"] < HORIZON:
         raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
     name = scene.name if variants is None else f"{scene.name}_variants"
-    sizes = {split: data[split] for split in ("train", "validation", "test")}
-    options: dict[str, Any] = {"steps": data["length"], "seed": data["seed"], "variants": variants}
+    options: dict[str, Any] = {split: data[split] for split in ("train", "validation", "test")}
+    options |= {"steps": data["length"], "seed": data["seed"], "variants": variants}
     address = data.get("ray")
     with collecting(f"data of {scene.name}") as show:
         if address is None:
-            return create_dataset(folder / name, scene, **sizes, **options, progress=show)
+            return create_dataset(folder / name, scene, **options, progress=show)
         with RayCluster(address) as cluster:
-            # Every core has a chunk of its own.
+            # The cluster simulates one chunk per core.
             options |= {"map_chunks": cluster.imap, "num_threads": 1}
-            return create_dataset(folder / name, scene, **sizes, **options, progress=show)
+            return create_dataset(folder / name, scene, **options, progress=show)
 
 
 def cut_short_note(trainer: Trainer, folder: Path) -> str | None:
-    """Tell how to go on with a training whose minutes were over before its steps were done; None for another.
-
-    Args:
-        trainer: what has trained.
-        folder: the run's folder.
-    """
+    """Say how to resume a training in ``folder`` that ran out of minutes before steps; None for any other."""
     budget = trainer.budget
     if not trainer.cut_short or budget.steps is None or budget.minutes is None:
         return None
     return (
-        f"Cut short by minutes={budget.minutes:g}, at {trainer.step:,} of {budget.steps:,} steps: the errors are larger"
-        f" than they would be. To go on: the same command with run_dir={folder} minutes={2 * budget.minutes:g}"
+        f"Cut short by minutes={budget.minutes:g}, at {trainer.step:,} of {budget.steps:,} steps; more would lower the"
+        f" errors. To resume, run the same command with run_dir={folder} minutes={2 * budget.minutes:g}"
     )
 
 
 @contextmanager
 def saving(save: Callable[[], None], seconds: Callable[[], float], every: float) -> Iterator[Callable[[], None]]:
-    """Save on Ctrl-C, and whenever what this yields is called and enough time has passed since the last time.
-
-    Args:
-        save: saves.
-        seconds: spent on what is saved.
-        every: seconds between saves.
-    """
+    """Save on Ctrl-C; yield a function that saves if ``every`` seconds of ``seconds()`` passed since it last did."""
     last = seconds()
 
     def save_when_due() -> None:
@@ -110,34 +95,34 @@ def saving(save: Callable[[], None], seconds: Callable[[], float], every: float)
 def train_with_progress(
     trainer: Trainer,
     path: Path,
-    begun: Checkpoint | None,
+    resumed: Checkpoint | None,
     tracker: Tracker,
     *,
     scene: Scene | Sequence[Scene],
     config: Mapping[str, Any],
     name: str = "",
 ) -> dict[str, list]:
-    """Train to the end with a progress bar, saving now and then, on Ctrl-C and at the end, with the best weights.
+    """Train with a progress bar; save regularly, on Ctrl-C and, with the best weights, at the end.
 
-    Of several workers the first shows, logs and saves, and the others train along.
+    With several processes, only rank 0 shows, logs and saves.
 
     Args:
-        trainer: what trains.
-        path: the checkpoint to write.
-        begun: the checkpoint to go on from, if the run was begun before.
-        tracker: where losses and validation errors are logged.
+        trainer: the trainer.
+        path: checkpoint to write.
+        resumed: checkpoint to resume from, if any.
+        tracker: logs losses and validation errors.
         scene: the scene, or scenes, trained on.
-        config: configuration of the run; its ``checkpoint_seconds`` are the training seconds between checkpoints.
-        name: what is trained, where a run trains several: it begins the names in the log.
+        config: configuration of the run; ``checkpoint_seconds`` are the training seconds between checkpoints.
+        name: prefix of logged names, if a run trains several models.
 
     Returns:
         ``"seconds"`` and mean ``"loss"`` of every 100 steps.
     """
     prefix = f"{name}/" if name else ""
     curves: dict[str, list] = {"seconds": [], "loss": []}
-    if begun is not None:
-        trainer.load_state_dict(begun.training)
-        curves = begun.training["curves"]
+    if resumed is not None:
+        trainer.load_state_dict(resumed.training)
+        curves = resumed.training["curves"]
     if not trainer.workers.first:
         for _ in trainer.run():
             pass
@@ -148,13 +133,15 @@ def train_with_progress(
         save_checkpoint(path, trainer.model, scene=scene, config=config, training=state)
 
     losses: list[float] = []
-    start = 100 * trainer.fraction
-    # Equal shares take equal time, so that the remaining time is what the bar says.
-    style = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+    options: dict[str, Any] = {
+        "desc": f"training {name}".strip(),
+        "initial": 100 * trainer.fraction,
+        # Equal shares of the budget take equal time, so an unsmoothed rate gives the remaining time.
+        "smoothing": 0,
+        "bar_format": "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}",
+    }
     with (
-        tqdm(
-            total=100, initial=start, smoothing=0, bar_format=style, desc=f"training {name}".strip(), leave=False
-        ) as bar,
+        tqdm(total=100, leave=False, **options) as bar,
         saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
     ):
         for progress in trainer.run():

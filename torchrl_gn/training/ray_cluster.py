@@ -1,4 +1,4 @@
-"""Work spread over the machines of a Ray cluster."""
+"""Tasks on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -13,14 +13,11 @@ R = TypeVar("R")
 
 
 class RayCluster:
-    """A Ray cluster, as a context: joined on entry and left on exit.
-
-    All machines need this package, and see the same files where work writes any.
+    """Context manager that joins a Ray cluster, whose machines have this package and share the files of the tasks.
 
     Args:
-        address: ``"auto"`` or the address of a running cluster, or ``"local"``: one that lasts as long as the block, on
-            this machine.
-        cpus: cores that every piece of work takes.
+        address: ``"auto"``, the address of a running cluster, or ``"local"`` for a temporary one on this machine.
+        cpus: cores per task.
 
     Raises:
         ImportError: if Ray is not installed.
@@ -34,16 +31,16 @@ class RayCluster:
             raise ImportError(f"ray={address} needs Ray: pip install ray, or torchrl_gn's extra [ray].") from error
         self._ray: Any = ray
         self.address, self.cpus = address, cpus
-        self._started: list[Any] = []
+        self._submitted: list[Any] = []
 
     def __enter__(self) -> RayCluster:
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or it warns of a change to come
-        where: dict[str, Any] = {"address": self.address}
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # silences a deprecation warning
+        options: dict[str, Any] = {"address": self.address}
         if self.address == "local":
-            where = {"address": None, "include_dashboard": False}
-            # Ray's workers give way to all else; but this process only waits for them.
+            options = {"address": None, "include_dashboard": False}
+            # Ray lowers its workers' priority by default, but this process only waits for them.
             os.environ.setdefault("RAY_worker_niceness", "0")
-        self._ray.init(log_to_driver=False, logging_level="ERROR", **where)
+        self._ray.init(log_to_driver=False, logging_level="ERROR", **options)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -52,14 +49,14 @@ class RayCluster:
 
     @property
     def size(self) -> int:
-        """Pieces of work that the cluster does at a time."""
+        """Number of tasks that run at a time."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)) // self.cpus)
 
     def imap(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Like the built-in ``map``, on the whole cluster: results come in the order of the items."""
+        """Map a function over items on the cluster; yield results in order."""
         shared, pending = self._ray.put(function), deque()
         task = self._ray.remote(num_cpus=self.cpus)(_call)
-        limit = 2 * self.size  # so that results that nobody took yet do not fill the memory
+        limit = 2 * self.size  # bounds the memory of waiting results
         for item in items:
             if len(pending) >= limit:
                 yield self._ray.get(pending.popleft())
@@ -68,20 +65,20 @@ class RayCluster:
             yield self._ray.get(pending.popleft())
 
     def submit(self, function: Callable[..., R], *arguments: Any) -> Future[R]:
-        """Begin ``function(*arguments)`` somewhere; once, whatever happens."""
-        started = self._ray.remote(num_cpus=self.cpus, max_retries=0)(_call).remote(function, *arguments)
-        self._started.append(started)
-        return started.future()
+        """Run ``function(*arguments)`` on the cluster, without retries."""
+        task = self._ray.remote(num_cpus=self.cpus, max_retries=0)(_call).remote(function, *arguments)
+        self._submitted.append(task)
+        return task.future()
 
     def stop(self) -> None:
-        """Interrupt what was submitted, as Ctrl-C would, and wait until it has ended."""
-        for started in self._started:
-            self._ray.cancel(started)
-        if self._started:
-            self._ray.wait(self._started, num_returns=len(self._started))
-        self._started.clear()
+        """Interrupt submitted tasks, as Ctrl-C would, and wait for their end."""
+        for task in self._submitted:
+            self._ray.cancel(task)
+        if self._submitted:
+            self._ray.wait(self._submitted, num_returns=len(self._submitted))
+        self._submitted.clear()
 
 
 def _call(function: Callable[..., R], *arguments: Any) -> R:
-    """Ray takes only what is written as a function or class."""
+    """Call a callable object: Ray accepts only functions and classes."""
     return function(*arguments)

@@ -1,4 +1,4 @@
-"""The folder that a recipe writes to, and nothing else."""
+"""Folder of a run: the only place that a recipe writes to."""
 
 from __future__ import annotations
 
@@ -17,21 +17,19 @@ from torchrl_gn.training.config import plain_config
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.json"
-_RECIPE = "# A run of "  # begins that file, and the recipe's name
+_RECIPE = "# A run of "  # the first line of CONFIG_FILE, with the recipe's name
 
 
 class RunFolder:
-    """A run's folder: configuration, metrics, checkpoint, figures and videos.
-
-    A folder that already holds a run is continued.
+    """Folder with a run's configuration, metrics, checkpoint, figures and videos; an existing one is resumed.
 
     Args:
-        path: the folder; by default ``runs/<name>/<time>``.
+        path: the folder. Default: ``runs/<name>/<time>``.
         name: name of the recipe.
 
     Raises:
         NotADirectoryError: if ``path`` is a file.
-        ValueError: if it holds a run of another recipe, which would be written over.
+        ValueError: if it holds a run of another recipe.
     """
 
     _latest: ClassVar[RunFolder | None] = None
@@ -56,28 +54,28 @@ class RunFolder:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        RunFolder._latest = self  # of workers that share the first one's
+        RunFolder._latest = self  # for the processes that share the folder of rank 0
 
     @classmethod
     def what_is_kept(cls) -> str:
-        """What a run that stops now leaves in this process's latest folder, as a person is told."""
+        """Say what an interrupted run leaves in this process's latest folder, and how to resume."""
         run = cls._latest
         if run is None or not any(path.name != CONFIG_FILE for path in run.path.glob("*")):
             return "nothing was kept."
-        return f"what was done is in {run.path}, and run_dir={run.path} goes on from there."
+        return f"progress is saved in {run.path}; resume with run_dir={run.path}."
 
     @property
     def checkpoint(self) -> Path:
-        """Where the run's checkpoint lies."""
+        """Path of the checkpoint."""
         return self.path / CHECKPOINT_FILE
 
     @property
     def data(self) -> Path:
-        """Where the run keeps data that it collects."""
+        """Folder of collected data."""
         return self.path / "data"
 
     def file(self, name: str) -> Path:
-        """Path of a file of this run, listed in :attr:`written`."""
+        """Return the path of a file, and list it in :attr:`written`."""
         path = self.path / name
         if path not in self._written:
             self._written.append(path)
@@ -85,16 +83,16 @@ class RunFolder:
 
     @property
     def written(self) -> list[Path]:
-        """Files of this run that exist, in the order they were asked for."""
+        """Existing files of :meth:`file`, in order."""
         return [path for path in self._written if path.exists()]
 
     def refuse_changes(self, before: Mapping[str, Any], now: Mapping[str, Any], *, free: Collection[str]) -> None:
-        """Refuse to continue a run with options that would make it another run.
+        """Refuse to resume a run with other options.
 
         Args:
-            before: configuration that the run was begun with.
-            now: configuration that it is to go on with.
-            free: names of options that may differ, for example ``"minutes"``, ``"data.folder"`` or all of ``"data"``.
+            before: configuration of the run so far.
+            now: configuration to resume with.
+            free: options that may differ: ``"minutes"``, ``"data.folder"`` or all of ``"data"``, for example.
 
         Raises:
             ValueError: naming every other option that differs.
@@ -111,22 +109,17 @@ class RunFolder:
             )
 
     def write_config(self, text: str) -> None:
-        """Write ``config.yaml``, with the recipe's name in its first line."""
+        """Write ``config.yaml``: the recipe's name, then ``text``."""
         with atomic_path(self.file(CONFIG_FILE)) as temporary:
             temporary.write_text(f"{_RECIPE}{self.name}\n{text}")
 
     def write_metrics(self, metrics: Mapping[str, Any], *, seed: int) -> dict[str, Any]:
-        """Write ``metrics.json``: flat names and plain numbers, processor, versions, seed and seconds.
+        """Write ``metrics.json``, with processor, versions, seed and seconds; return its content.
 
-        JSON has no infinity: a number that is not finite (the error of a diverged
-        rollout) is written as null.
-
-        Returns:
-            What was written.
+        Numbers that are not finite, such as the error of a diverged rollout, become null.
         """
-        numbers = {key: _plain(value) for key, value in metrics.items()}
         everything = {
-            **numbers,
+            **{key: _finite_or_none(value) for key, value in metrics.items()},
             "seed": seed,
             "wall_clock_seconds": round(time.perf_counter() - self._start, 3),
             "processor": ", ".join([processor_name(), instruction_sets(), *restrictions()]),
@@ -137,7 +130,7 @@ class RunFolder:
 
 
 def _new_folder(parent: Path) -> Path:
-    """A folder named by the time; of two that begin in one second, the later is the next one."""
+    """Make a folder named by the time, numbered if there is one from the same second."""
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     path, number = parent / name, 1
     while True:
@@ -159,7 +152,5 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def _finite_or_none(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value

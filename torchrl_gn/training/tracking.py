@@ -1,4 +1,4 @@
-"""Log a run with TorchRL's loggers."""
+"""Logging through TorchRL's loggers."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ LoggerKind = Literal["none", "csv", "tensorboard", "wandb"]
 
 
 class Tracker:
-    """Numbers, figures, videos and configuration of a run, sent to a TorchRL logger.
+    """Log numbers, figures, videos and configuration of a run.
 
     Args:
-        kind: ``"none"``, ``"csv"`` files, ``"tensorboard"`` or ``"wandb"``. Without an account (no API key and no
-            login), wandb runs offline; ``wandb sync`` uploads such a run later.
-        folder: where the logger writes, in the run's folder.
+        kind: ``"none"``, ``"csv"``, ``"tensorboard"`` or ``"wandb"``; wandb runs offline without an account (API key or
+            login), and ``wandb sync`` uploads later.
+        folder: the logger's folder, inside the run folder.
         name: name of the run.
-        config: configuration of the run, as Hydra gives it, or plain values.
+        config: configuration of the run, from Hydra or as plain values.
 
     Raises:
         ValueError: if the kind is unknown.
-        ImportError: if wandb or tensorboard is asked for but not installed.
+        ImportError: if wandb or tensorboard is not installed.
     """
 
     def __init__(self, kind: LoggerKind, folder: Path, *, name: str, config: Mapping[str, Any]) -> None:
@@ -46,7 +46,7 @@ class Tracker:
                 "offline": not _has_account(),
                 "project": "torchrl_gn",
                 "config": config,
-                # The same folder is the same run, so that a resumed run goes on where it was.
+                # The folder identifies the run, so resuming extends its log.
                 "id": hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
                 "log_env_packages": False,
             }
@@ -62,7 +62,7 @@ class Tracker:
             self._logger.log_hparams({**config, "versions": package_versions()})
 
     def log(self, numbers: Mapping[str, float], step: int) -> None:
-        """Log numbers at a step; entries that are no numbers are passed over."""
+        """Log numbers at a step; skip other entries."""
         if self._logger is None:
             return
         for name, value in numbers.items():
@@ -70,10 +70,7 @@ class Tracker:
                 self._logger.log_scalar(name, float(value), step=step)
 
     def log_files(self, paths: Sequence[Path]) -> None:
-        """Log figures, videos and checkpoints, as far as the logger takes them; they lie in the run folder anyway.
-
-        wandb takes all of them, checkpoints as artifacts; tensorboard pictures and GIFs; csv none.
-        """
+        """Log files: wandb takes figures, videos and checkpoints (as artifacts), tensorboard figures and GIFs."""
         if self._logger is None:
             return
         for path in paths:
@@ -82,10 +79,10 @@ class Tracker:
             elif self.kind == "tensorboard" and path.suffix in (".png", ".gif"):
                 from tensorboard.compat.proto import summary_pb2
 
-                # As the file has it: the writer's own way decodes pictures, and needs moviepy for moving ones.
-                made: Any = summary_pb2  # its classes are made at import
-                image = made.Summary.Image(encoded_image_string=path.read_bytes())
-                summary = made.Summary(value=[made.Summary.Value(tag=self._tag(path), image=image)])
+                # Write the encoded file: the writer's own methods decode it, and need moviepy for GIFs.
+                proto: Any = summary_pb2  # creates its classes at import, unseen by type checkers
+                image = proto.Summary.Image(encoded_image_string=path.read_bytes())
+                summary = proto.Summary(value=[proto.Summary.Value(tag=self._tag(path), image=image)])
                 self._logger.experiment._get_file_writer().add_summary(summary)
 
     def _log_to_wandb(self, path: Path) -> None:
@@ -97,19 +94,19 @@ class Tracker:
         elif path.suffix in (".gif", ".mp4"):
             run.log({self._tag(path): wandb.Video(str(path), format="gif" if path.suffix == ".gif" else "mp4")})
         elif path.suffix == ".safetensors":
-            # By all of its place: a run of several models has a checkpoint of each, and episodes of each planner.
+            # Named by its whole path: a run may hold several checkpoints and recorded episodes.
             kind = "model" if path.name == CHECKPOINT_FILE.name else "episodes"
             artifact = wandb.Artifact(f"{run.id}-{self._tag(path).replace('/', '-')}", type=kind)
             artifact.add_file(str(path))
             run.log_artifact(artifact)
 
     def _tag(self, path: Path) -> str:
-        """Name of a figure; of several systems each has a folder of its own."""
+        """Name a file by its path in the run folder, without suffix."""
         path, run = path.resolve(), self._run.resolve()
         return str(path.relative_to(run).with_suffix("")) if path.is_relative_to(run) else path.stem
 
     def log_table(self, name: str, rows: Sequence[Sequence[Any]]) -> None:
-        """Log a table whose first row holds the titles; csv takes none."""
+        """Log a table whose first row holds the titles; csv skips it."""
         titles, *data = rows
         if self.kind == "wandb":
             import wandb
@@ -120,13 +117,13 @@ class Tracker:
             self._logger.experiment.add_text(name, "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines))
 
     def finish(self, numbers: Mapping[str, float], paths: Sequence[Path], step: int = 0) -> None:
-        """Log what came out of the run, its numbers and its files, and close."""
+        """Log the final numbers and files, and close."""
         self.log(numbers, step)
         self.log_files(paths)
         self.close()
 
     def close(self) -> None:
-        """Finish the run."""
+        """Close the logger."""
         if self.kind == "wandb":
             self._logger.experiment.finish()
         elif self.kind == "tensorboard":

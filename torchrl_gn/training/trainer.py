@@ -1,4 +1,4 @@
-"""The training loop of a forward model, resumable at any step."""
+"""Training loop of a forward model, resumable at any step."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from torchrl_gn.training.workers import Workers
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a training stands, yielded after every step.
+    """State of the training after a step.
 
     Attributes:
         step: optimiser steps done.
-        seconds: training seconds spent, over all resumed runs.
-        fraction: share of the budget spent.
+        seconds: training seconds over all resumed runs.
+        fraction: share of the budget spent, 0 to 1.
         loss: loss of this step's batch.
-        validation: validation error, if it was measured after this step.
+        validation: validation error, if measured after this step.
     """
 
     step: int
@@ -37,33 +37,27 @@ class Progress:
 
 
 class Trainer:
-    """Train a forward model from a replay buffer.
+    """Train a forward model from a replay buffer; iterate over :meth:`run`.
 
-    Iterate over :meth:`run`; every step yields a :class:`Progress`, so the caller shows
-    progress, logs and saves checkpoints where it likes, and may stop at any step.
-
-    With several ``workers`` every process runs a trainer of its own on its shard of every batch. Gradients are
-    averaged, the first worker's clock and validation count for all, and its checkpoint is everybody's. What comes out
-    is what one process would train, but for rounding (and for input noise, which each draws on its own).
+    With several ``workers``, each process runs a trainer on its shard of every batch; gradients are averaged, and the
+    clock, validation and checkpoint of rank 0 count. The result equals that of one process up to rounding and input
+    noise, which every process draws on its own.
 
     Args:
-        loss: the loss, of one scene or several; its model is what is trained.
+        loss: the loss of one or several scenes; holds the model to train.
         buffer: replay buffer of transitions.
-        optimizer: optimiser of the model's weights: of :func:`~torchrl_gn.training.make_optimizer`, or any of
-            ``torch.optim``, which keeps its rates and gets unclipped gradients.
-        budget: when to stop.
-        unroll: buffer of windows of several steps, used at the end of the training.
-        unroll_fraction: share of the work that goes to the windows of ``unroll``.
-        unroll_cost: work of an update on windows, in updates on transitions of ``buffer``: with budgets of steps it
-            makes a share of the work, and so of the time, out of fewer steps.
-        validate: error on data that is not trained on; the weights with the lowest one
-            seen are kept (paper: 20-step rollouts of the validation set).
-        validations: how often to validate over the whole budget.
-        patience: stop after so many validations without a new best. Default: never.
+        optimizer: from ``make_optimizer``, or any of ``torch.optim`` (no schedule, no clipping).
+        budget: limits of the training.
+        unroll: replay buffer of windows of several steps, for the end of the training.
+        unroll_fraction: share of the work, 0 to 1, that trains on ``unroll``.
+        unroll_cost: cost of an update on windows, in updates on transitions.
+        validate: returns the validation error; the weights with the lowest are kept (paper: 20-step rollouts).
+        validations: number of validations over the whole budget.
+        patience: validations without a new best before training stops. Default: never stop early.
         workers: the processes that train together. Default: this one alone.
 
     Raises:
-        ValueError: if ``unroll_fraction`` is no share, or ``unroll_cost`` not positive.
+        ValueError: if ``unroll_fraction`` is not in [0, 1], or ``unroll_cost`` not positive.
     """
 
     def __init__(
@@ -95,48 +89,45 @@ class Trainer:
         self.step, self.seconds = 0, 0.0
         self.best, self.since_best, self.validated = math.inf, 0, 0
         self.best_weights: dict[str, torch.Tensor] = {}
-        # Seconds by part, to see what a step spends outside the model.
+        # Seconds by part of a step.
         self.spent = {"sampling": 0.0, "model": 0.0, "optimizer": 0.0, "validation": 0.0, "caller": 0.0}
 
     @property
     def fraction(self) -> float:
-        """Share of the budget that is spent, 0 to 1."""
+        """Share of the budget spent, 0 to 1."""
         windows = 0.0 if self.unroll is None else self.unroll_fraction
         return self.budget.fraction(self.step, self.seconds, windows=windows, window_cost=self.unroll_cost)
 
     @property
     def cut_short(self) -> bool:
-        """Whether the budget's minutes ended the training before its steps were done."""
+        """Whether the budget's minutes ran out before its steps."""
         return self.budget.is_cut_short(self.step, self.seconds)
 
     def run(self) -> Iterator[Progress]:
         """Train until the budget is spent, yielding after every step.
 
         Raises:
-            FloatingPointError: if the loss or the gradient is not finite, before any
-                weight is touched by it.
+            FloatingPointError: if the loss or the gradient is not finite; no weight changes.
         """
         module, fraction = self.workers.wrap(self.loss), self.workers.agree(lambda: self.fraction)
         while fraction < 1 and not self._patience_is_over():
-            start = self.budget.now()
             with fast_matmul():
                 loss = self._update(module, fraction)
-            self._add("", start)
             fraction = self.workers.agree(lambda: self.fraction)
             validation = self._validation(fraction)
             start = self.budget.now()
             yield Progress(self.step, self.seconds, fraction, loss, validation)
-            self._add("caller", start)
+            self._lap("caller", start)
 
     def _update(self, module: nn.Module, fraction: float) -> float:
         clock = self.budget.now()
         buffer = self.buffer
-        if self.unroll is not None and fraction >= 1 - self.unroll_fraction - 1e-9:  # but for rounding
+        if self.unroll is not None and fraction >= 1 - self.unroll_fraction - 1e-9:  # tolerates rounding
             buffer = self.unroll
         batch = buffer.sample().to(self.device)
         clock = self._lap("sampling", clock)
         loss = module(batch)["loss_forward_model"]
-        # Of all workers, so that all stop when one has to.
+        # Averaged over processes, so that all raise if one does.
         mean = self.workers.mean(loss.item())
         if not math.isfinite(mean):
             raise FloatingPointError(f"The loss is {mean} at step {self.step}; lower the learning rate.")
@@ -160,7 +151,7 @@ class Trainer:
         if error < self.best:
             self.best, self.since_best = error, 0
             self.best_weights = {name: value.clone() for name, value in self.model.state_dict().items()}
-        self._add("validation", start)
+        self._lap("validation", start)
         return error
 
     def _patience_is_over(self) -> bool:
@@ -169,26 +160,21 @@ class Trainer:
     def _lap(self, part: str, since: float) -> float:
         now = self.budget.now()
         self.spent[part] += now - since
+        self.seconds += now - since
         return now
 
-    def _add(self, part: str, since: float) -> None:
-        elapsed = self.budget.now() - since
-        self.seconds += elapsed
-        if part:
-            self.spent[part] += elapsed
-
     def outside_share(self) -> float:
-        """Share of a step's time spent outside model and optimiser: sampling and the caller's work."""
+        """Return the share of a step's time outside model and optimiser: sampling and the caller."""
         step = sum(seconds for part, seconds in self.spent.items() if part != "validation")
         return (self.spent["sampling"] + self.spent["caller"]) / step if step else 0.0
 
     def restore_best(self) -> None:
-        """Give the model the weights of the best validation, if there was one."""
+        """Load the weights of the best validation, if any, into the model."""
         if self.best_weights:
             self.model.load_state_dict(self.best_weights)
 
     def state_dict(self) -> dict:
-        """All that is needed to go on later exactly here, weights apart."""
+        """State to resume from exactly, without the weights."""
         buffers = {"main": self.buffer, "unroll": self.unroll}
         return {
             "optimizer": self.optimizer.state_dict(),
@@ -206,10 +192,10 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from what :meth:`state_dict` gave."""
+        """Resume from what :meth:`state_dict` returned."""
         self.optimizer.load_state_dict(state["optimizer"])
         self.loss.load_training_state(state["loss"])
-        self._draw_own_noise()
+        self._reseed_noise()
         self.buffer.sampler.load_state_dict(state["samplers"]["main"])
         if self.unroll is not None and "unroll" in state["samplers"]:
             self.unroll.sampler.load_state_dict(state["samplers"]["unroll"])
@@ -218,13 +204,13 @@ class Trainer:
         self.step, self.seconds, self.spent = progress["step"], progress["seconds"], dict(progress["spent"])
         self.best = math.inf if progress["best"] is None else progress["best"]
         self.since_best = progress["since_best"]
-        # Of a larger budget less is spent: its own validations are still to come.
+        # With a larger budget, a smaller share is spent and fewer validations are done.
         self.validated = min(progress["validated"], math.floor(self.fraction * self.validations))
 
-    def _draw_own_noise(self) -> None:
-        """Of several workers each goes on with noise of its own: what is loaded is the first one's."""
+    def _reseed_noise(self) -> None:
+        """Reseed the noise on every rank but 0 after loading the state of rank 0."""
         for module in () if self.workers.first else self.loss.modules():
-            if isinstance(own := getattr(module, "generator", None), torch.Generator):
-                # Drawn from the state, which no two resumed runs share.
-                fresh = torch.randint(2**62, (self.workers.size,), generator=own)
-                own.manual_seed(int(fresh[self.workers.rank]))
+            if isinstance(generator := getattr(module, "generator", None), torch.Generator):
+                # Drawn from the loaded state, so that every resumed run gets new seeds.
+                seeds = torch.randint(2**62, (self.workers.size,), generator=generator)
+                generator.manual_seed(int(seeds[self.workers.rank]))

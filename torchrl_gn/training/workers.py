@@ -1,4 +1,4 @@
-"""Processes that train one model together, as `torchrun` starts them."""
+"""Data-parallel processes, as `torchrun` starts them."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from torch.nn.parallel import DistributedDataParallel
 
 T = TypeVar("T")
 
-# The others wait while the first collects data or evaluates.
-_PATIENCE = timedelta(hours=12)
+# Other processes wait while rank 0 collects data or evaluates.
+_TIMEOUT = timedelta(hours=12)
 
 
 @dataclass(frozen=True)
 class Workers:
-    """The processes that train together, of which this is one; by default it is alone.
+    """The processes that train together, as seen by this one.
 
     Attributes:
-        rank: which one this is, from 0.
-        size: how many there are.
+        rank: rank of this process, from 0.
+        size: number of processes.
     """
 
     rank: int = 0
@@ -35,16 +35,16 @@ class Workers:
 
     @property
     def first(self) -> bool:
-        """Whether this is the one that writes files, shows progress and validates."""
+        """Whether this is rank 0, which writes files, shows progress and validates."""
         return self.rank == 0
 
     @property
     def shard(self) -> tuple[int, int]:
-        """Rank and size, as :func:`~torchrl_gn.data.trajectory_buffer` takes them."""
+        """Rank and size, for :func:`~torchrl_gn.data.trajectory_buffer`."""
         return self.rank, self.size
 
     def agree(self, make: Callable[[], T]) -> T:
-        """What ``make`` gives the first one, for all; the others do not call it."""
+        """Call ``make`` on rank 0 only, and broadcast what it returns."""
         if self.size == 1:
             return make()
         shared = [make() if self.first else None]
@@ -52,7 +52,7 @@ class Workers:
         return cast(T, shared[0])
 
     def mean(self, number: float) -> float:
-        """Mean of everybody's number; not finite if any is not."""
+        """Average a number over processes; not finite if any is not."""
         if self.size == 1:
             return number
         shared = torch.tensor(number, dtype=torch.float64)
@@ -60,7 +60,7 @@ class Workers:
         return float(shared) / self.size
 
     def device(self, name: str) -> torch.device:
-        """Where this one computes: of several on one machine, each on a GPU of its own.
+        """Return this process's device: ``"cuda"`` means one GPU per process of a machine.
 
         Raises:
             ValueError: if there is no such device.
@@ -76,21 +76,21 @@ class Workers:
             count = torch.cuda.device_count()
             if local >= count:
                 raise ValueError(
-                    f"device={name} is GPU {local}, but there are {count}, counted from 0; use one of these, and as"
-                    " many processes at most."
+                    f"device={name} is GPU {local}, but there are {count}, counted from 0; name one of them, and start"
+                    f" at most {count} processes per machine."
                 )
             device = torch.device("cuda", local)
             torch.cuda.set_device(device)
         return device
 
     def wait(self) -> None:
-        """Go on when all have come this far."""
+        """Wait until all processes get here."""
         if self.size > 1:
             dist.barrier()
 
     @contextmanager
     def first_goes_first(self) -> Iterator[None]:
-        """The first one runs the block alone, then the others do: it makes what they find."""
+        """Run the block on rank 0 first, then on the others."""
         if not self.first:
             self.wait()
         yield
@@ -98,27 +98,23 @@ class Workers:
             self.wait()
 
     def wrap(self, module: nn.Module) -> nn.Module:
-        """The module with gradients averaged over all, its weights and statistics set to the first one's."""
+        """Average gradients over processes, from the weights and buffers of rank 0."""
         if self.size == 1:
             return module
         if "forward_sync_buffers" in inspect.signature(DistributedDataParallel).parameters:
             return DistributedDataParallel(module, forward_sync_buffers=False)
-        for buffer in module.buffers():  # an older torch has one option for the begin and every step
+        for buffer in module.buffers():  # older versions of torch sync at the start only together with every step
             dist.broadcast(buffer, 0)
         return DistributedDataParallel(module, broadcast_buffers=False)
 
 
 @contextmanager
 def join_workers() -> Iterator[Workers]:
-    """Join the others that `torchrun` started, if it did; leave them in the end.
-
-    Yields:
-        Who trains together: with ``torchrun --nproc-per-node 2 recipes/forward_model.py`` two, without it one.
-    """
+    """Join the process group of `torchrun`, if there is one; leave it at the end."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Workers()
         return
-    dist.init_process_group(timeout=_PATIENCE)  # gloo, and NCCL for what is on GPUs
+    dist.init_process_group(timeout=_TIMEOUT)  # gloo on CPUs, NCCL on GPUs
     try:
         yield Workers(dist.get_rank(), dist.get_world_size())
     finally:

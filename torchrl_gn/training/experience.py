@@ -1,0 +1,67 @@
+"""Experience of a policy: the collector of transitions, and the replay buffer's state for checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector, Collector
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+
+def make_collector(
+    env: EnvBase | Sequence[Callable[[], EnvBase]], policy: TensorDictModuleBase, *, seed: int | None, **options: Any
+) -> BaseCollector:
+    """Make a collector that explores.
+
+    Args:
+        env: environments, or functions that make some, each for a Ray actor.
+        policy: exploration policy.
+        seed: seed of the environments; None keeps theirs.
+        options: further options of ``torchrl.collectors.Collector``.
+    """
+    options |= {"exploration_type": ExplorationType.RANDOM}
+    collector_kwargs: dict[str, Any] = {"track_traj_ids": False, "auto_register_policy_transforms": False}
+    if isinstance(env, EnvBase):
+        if seed is not None:
+            env.set_seed(seed)
+        return Collector(env, policy, **options, **collector_kwargs)
+    makers = list(env)
+    if seed is not None:
+        makers = [partial(_seeded, make, seed + index) for index, make in enumerate(makers)]
+    backend_options = {"collector_kwargs": collector_kwargs, "remote_configs": {"num_cpus": 1, "num_gpus": 0}}
+    collector = Collector(makers, policy, backend="ray", sync=True, backend_options=backend_options, **options)
+    collector.update_policy_weights_(policy)
+    return collector
+
+
+def _seeded(make: Callable[[], EnvBase], seed: int) -> EnvBase:
+    env = make()
+    env.set_seed(seed)
+    return env
+
+
+def buffer_state(buffer: TensorDictReplayBuffer) -> dict[str, torch.Tensor]:
+    """Return the transitions of a replay buffer by dotted key, oldest first, each ``[size, ...]``."""
+    filled = buffer.storage[: len(buffer)] if len(buffer) else TensorDict()
+    oldest = int(buffer.writer.state_dict()["_cursor"]) % max(1, len(buffer))
+    return {".".join(key): value.roll(-oldest, 0) for key, value in _leaves(filled)}
+
+
+def load_buffer_state(buffer: TensorDictReplayBuffer, state: dict[str, torch.Tensor], capacity: int) -> None:
+    """Extend a replay buffer with the last ``capacity`` transitions of :func:`buffer_state`."""
+    if state:
+        flat = TensorDict(state)
+        flat.auto_batch_size_(1)
+        buffer.extend(flat.unflatten_keys(".")[-capacity:])
+
+
+def _leaves(tensordict: TensorDictBase) -> Iterator[tuple[tuple[str, ...], torch.Tensor]]:
+    for key, value in tensordict.items(include_nested=True, leaves_only=True):
+        yield ((key,) if isinstance(key, str) else key), cast(torch.Tensor, value)
