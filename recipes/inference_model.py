@@ -3,7 +3,7 @@
     python recipes/inference_model.py [system=pendulum] [minutes=4] [baselines=true] [run_dir=PATH]
 
 Trains both on random variants of the system whose parameters they never see (paper, "Inference models"; SM "End-to-end
-training algorithm for System ID"). On new variants every system is identified once, from `phase` steps of one
+training algorithm for System ID"). On new variants every system is identified once, from `context_length` steps of one
 trajectory, and another of its trajectories is predicted: with what was inferred of it, and with what was inferred of
 another system. `baselines=true` also trains models without identification and with the true parameters for the same
 time (paper, Figure "System identification performance"). Ctrl-C saves everything; the same `run_dir` goes on.
@@ -86,21 +86,25 @@ def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset
     """Wire data, loss and optimiser together."""
     noise = torch.Generator().manual_seed(cfg.seed)
     loss = IdentificationLoss(
-        model, scene, phase=cfg.phase, shortest=cfg.shortest, parts=cfg.parts, noise=cfg.noise, generator=noise
+        model,
+        scene,
+        context_length=cfg.context_length,
+        shortest=cfg.shortest,
+        num_queries=cfg.num_queries,
+        noise=cfg.noise,
+        generator=noise,
     )
 
     def buffer(batch_size: int, length: int, seed: int):
-        elsewhere = (cfg.parts, length)
-        return trajectory_buffer(dataset.train, batch_size=batch_size, window=cfg.phase, elsewhere=elsewhere, seed=seed)
+        context, queries = cfg.context_length, (cfg.num_queries, length)
+        return trajectory_buffer(dataset.train, batch_size=batch_size, window=context, query_windows=queries, seed=seed)
 
     def validate() -> float:
         """Identified from the first steps, predicted from after them."""
-        held = dataset.validation
-        later = TensorDict(
-            {"state": held["state"][:, cfg.phase :], "action": held["action"][:, cfg.phase :]}, [len(held)]
-        )
+        held, steps = dataset.validation, cfg.context_length
+        later = TensorDict({key: held[key][:, steps:] for key in ("state", "action")}, [len(held)])
         bound, inference = loss.bound, loss.inference
-        errors = identification_errors(bound, inference, held, later, steps=cfg.phase, horizons=(20,), one_step=False)
+        errors = identification_errors(bound, inference, held, later, steps=steps, horizons=(20,), one_step=False)
         return errors["rollout_error_20"].total
 
     return Trainer(
@@ -116,9 +120,10 @@ def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset
 
 def refuse_sizes(cfg: DictConfig) -> None:
     """Refuse at once what would fail when the training is done."""
-    if cfg.phase + 20 > cfg.data.length:
+    if cfg.context_length + 20 > cfg.data.length:
         raise ValueError(
-            f"phase={cfg.phase} leaves fewer than 20 of data.length={cfg.data.length} steps to predict in validation."
+            f"context_length={cfg.context_length} leaves fewer than 20 of data.length={cfg.data.length} steps to"
+            " predict in validation."
         )
     if cfg.test.systems < 4:
         raise ValueError(f"test.systems={cfg.test.systems} must be 4 or more: parameters are read from three quarters.")
@@ -143,8 +148,8 @@ def identified_errors(cfg: DictConfig, model: IdentifyingModel, scene: Scene, sy
     bound, inference = model.bind(scene)
     pairs = bound, inference, systems.observed, systems.predicted
     tables = {
-        "identified": identification_errors(*pairs, steps=cfg.phase),
-        "identified from another system": identification_errors(*pairs, steps=cfg.phase, wrong=True),
+        "identified": identification_errors(*pairs, steps=cfg.context_length),
+        "identified from another system": identification_errors(*pairs, steps=cfg.context_length, wrong=True),
     }
     curve = {}
     for steps in tqdm([steps for steps in cfg.test.steps if steps <= cfg.data.length], desc="evaluating", leave=False):
@@ -158,7 +163,7 @@ def probe(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestS
     _, inference = model.bind(scene)
     state, action = (cast(Tensor, systems.observed.get(key)) for key in ("state", "action"))
     with torch.no_grad():
-        parameters = inference.identify(state[:, : cfg.phase + 1], action[:, : cfg.phase])
+        parameters = inference.identify(state[:, : cfg.context_length + 1], action[:, : cfg.context_length])
     features = torch.cat([cast(Tensor, value).flatten(1) for value in parameters.values()], dim=1)
     share = linear_probe(features, torch.from_numpy(systems.parameters), train=int(0.75 * len(features)))
     return dict(zip(systems.names, share.tolist(), strict=True))
@@ -177,12 +182,12 @@ def control_figure(cfg: DictConfig, model: IdentifyingModel, scene: Scene, path:
     panels = {}
     for title, factor in (("with control", 1.0), ("without control", 0.0)):
         actions = controls.copy()
-        actions[:, : cfg.phase] *= factor
+        actions[:, : cfg.context_length] *= factor
         states = cast(Tensor, simulator.rollout(start, actions, each).get("state"))
         actions = torch.from_numpy(actions)
         with torch.no_grad():
-            parameters = inference.identify(states[:, : cfg.phase + 1], actions[:, : cfg.phase])
-            predicted = bound.rollout(states[:, cfg.phase], actions[:, cfg.phase :], parameters)
+            parameters = inference.identify(states[:, : cfg.context_length + 1], actions[:, : cfg.context_length])
+            predicted = bound.rollout(states[:, cfg.context_length], actions[:, cfg.context_length :], parameters)
         panels[f"identified {title}"] = (states, predicted)
     return plot_motions(panels, scene, path, labels=("smallest", "middle", "largest"))
 

@@ -86,7 +86,7 @@ class Episodes:
     def __init__(self, path: Path, start: TensorDictBase) -> None:
         self.path, self.now = path, start
         self.records: dict[str, list[Tensor]] = {"state": [start["state"]], "action": [], "reward": [], "seconds": []}
-        self.records["foreseen"] = []
+        self.records["planned"] = []
         if path.exists():
             saved = load_file(path)
             flat = {key.removeprefix("now."): value for key, value in saved.items() if key.startswith("now.")}
@@ -94,7 +94,7 @@ class Episodes:
             self.now = cast(TensorDictBase, TensorDict(flat, batch_size=batch).unflatten_keys("."))
             for name, record in self.records.items():
                 values = saved[name]
-                record[:] = list(values.unbind(0) if name in ("seconds", "foreseen") else values.unbind(1))
+                record[:] = list(values.unbind(0) if name in ("seconds", "planned") else values.unbind(1))
 
     def __len__(self) -> int:
         return len(self.records["action"])
@@ -104,7 +104,7 @@ class Episodes:
         record = self.records[name]
         if not record:
             return torch.zeros(0)
-        return torch.stack(record, dim=0 if name in ("seconds", "foreseen") else 1)
+        return torch.stack(record, dim=0 if name in ("seconds", "planned") else 1)
 
     @property
     def over(self) -> Tensor:
@@ -142,7 +142,7 @@ def fill_in(cfg: DictConfig) -> None:
     for part, key, value in defaults:
         if part[key] is None:
             part[key] = value
-    for key in ("horizon", "steps", "episodes", "phase", "threads"):
+    for key in ("horizon", "steps", "episodes", "context_length", "threads"):
         check_count(key, cfg[key], 1)
     with open_dict(cfg):  # what other systems get is none of this run's business
         del cfg.tasks
@@ -240,13 +240,13 @@ def begin(cfg: DictConfig, env: SceneEnv, bound, inference) -> TensorDictBase:
     """Start states with what the model reads of each system: true parameters, or what random controls showed of it."""
     now = env.reset(TensorDict(batch_size=[cfg.episodes])).exclude("done", "terminated")
     if inference is not None:
-        controls = torch.from_numpy(spline_controls(env.scene, cfg.episodes, cfg.phase, cfg.seed + 1))
+        controls = torch.from_numpy(spline_controls(env.scene, cfg.episodes, cfg.context_length, cfg.seed + 1))
         simulated = env.simulator.rollout(now["physics"], controls)  # its scenes in turn, as reset has them
         unstable = int((~simulated["stable"]).sum())
         if unstable:
             raise UnstableSimulationError(
-                f"{unstable} of {cfg.episodes} simulations became unstable under the {cfg.phase} random controls that a"
-                " system is identified from; try another seed, or a shorter phase."
+                f"{unstable} of {cfg.episodes} simulations became unstable under the {cfg.context_length} random"
+                " controls that a system is identified from; try another seed, or a smaller context_length."
             )
         now.update({key: simulated[key][:, -1] for key in ("state", "physics")})
         with torch.no_grad():
@@ -266,7 +266,7 @@ def play(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv |
                 now = policy(played.now.copy())
                 seconds = time.perf_counter() - started
                 if name in ("gn", "ilqg"):
-                    played.records["foreseen"].append(foresee(env, imagined if name == "gn" else None, now))
+                    played.records["planned"].append(planned_state(env, imagined if name == "gn" else None, now))
                 stepped = env.step(now)
                 played.now = stepped.exclude("next", "action", "done", "terminated")
                 played.now.update(stepped["next"].exclude("reward", "done", "terminated"))
@@ -286,7 +286,7 @@ def play(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv |
         played.save()
 
 
-def foresee(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase) -> Tensor:
+def planned_state(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase) -> Tensor:
     """The last state of the first episode's plan, imagined or, without a model, simulated."""
     left = cast(Tensor, now["plan", "actions"])
     left = left if left.ndim == 3 else left[:, 0]  # of candidates the best
@@ -384,12 +384,12 @@ def main(cfg: DictConfig) -> None:
 
 
 def film(played: Episodes, scene: Scene, cfg: DictConfig, path: Path) -> None:
-    """The first episode, beside what its plan foresaw a horizon ago."""
-    states, foreseen = played["state"][0], played["foreseen"]
+    """Film the first episode beside the plan of a horizon ago."""
+    states, planned = played["state"][0], played["planned"]
     states = states[states.isfinite().flatten(1).all(1)]  # until its simulation became unstable
     speed, prediction = min(1.0, scene.timestep / 0.01), None
-    if len(played) == len(foreseen) and len(states) > cfg.horizon + 1:  # older runs kept no plans of ilqg
-        prediction = torch.cat((states[: cfg.horizon], foreseen))[: len(states)]
+    if len(played) == len(planned) and len(states) > cfg.horizon + 1:  # older runs kept no plans of ilqg
+        prediction = torch.cat((states[: cfg.horizon], planned))[: len(states)]
     rollout_video(scene, states, prediction, path, speed=speed, labels=("played", "planned a horizon before"))
 
 

@@ -93,7 +93,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
     loss = ForwardModelLoss(
         bound,
         noise=cfg.noise,
-        forced=cfg.warm_up if recurrent else 1,
+        teacher_forced_steps=cfg.warm_up if recurrent else 1,
         generator=torch.Generator().manual_seed(cfg.seed),
     )
     # Teacher-forced over the warm-up, then fed its own predictions.

@@ -36,7 +36,7 @@ def test_it_trains_is_saved_and_evaluated_like_any_scene(robot, core, tmp_path):
     options = {"layout": joint_layout(tree.extras), "joint_axes": False, "contacts": False, "core": core}
     model = ForwardModel(ParameterNames.of(tree), **options, **SMALL)
     bound = model.bind(tree)
-    loss = ForwardModelLoss(bound, forced=5)
+    loss = ForwardModelLoss(bound, teacher_forced_steps=5)
     loss.fit_normalizers(trajectory_buffer(data, batch_size=1000, seed=0).sample())
     buffer = trajectory_buffer(data, batch_size=64, window=5 if core == "recurrent" else 1, seed=0)
     optimizer = torch.optim.Adam(model.core.parameters(), 3e-3)
@@ -142,7 +142,7 @@ def test_a_double_pendulum_with_one_motor_or_none(core, motors):
     options = {"layout": joint_layout(), "joint_axes": False, "contacts": False, "core": core}
     model = ForwardModel(ParameterNames.of(tree), **options, **SMALL)
     bound = model.bind(tree)
-    loss = ForwardModelLoss(bound, forced=5)
+    loss = ForwardModelLoss(bound, teacher_forced_steps=5)
     loss.fit_normalizers(trajectory_buffer(data, batch_size=300, seed=0).sample())
     batch = trajectory_buffer(data, batch_size=16, window=5 if core == "recurrent" else 1, seed=0).sample()
     loss(batch)["loss_forward_model"].backward()

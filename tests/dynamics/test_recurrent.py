@@ -113,7 +113,7 @@ def test_errors_begin_behind_the_warm_up(bound, trajectories):
 
 @pytest.mark.parametrize("forced", [1, 3, 9])
 def test_teacher_forcing_feeds_true_states_first(bound, trajectories, forced):
-    loss = ForwardModelLoss(bound, forced=forced)
+    loss = ForwardModelLoss(bound, teacher_forced_steps=forced)
     batch = trajectory_buffer(trajectories, batch_size=4, window=5, seed=0).sample()
     loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=50, seed=0).sample())
     state, action, target = batch["state"], batch["action"], batch["next", "state"]
@@ -128,8 +128,8 @@ def test_teacher_forcing_feeds_true_states_first(bound, trajectories, forced):
     loss(batch)["loss_forward_model"].backward()
     core = bound.model.core
     assert all(cell.weight_hh.grad.abs().sum() > 0 for cell in (core.nodes, core.edges, core.globals_))
-    with pytest.raises(ValueError, match="forced=0"):
-        ForwardModelLoss(bound, forced=0)
+    with pytest.raises(ValueError, match="teacher_forced_steps=0"):
+        ForwardModelLoss(bound, teacher_forced_steps=0)
 
 
 @pytest.mark.slow
@@ -146,7 +146,7 @@ def test_it_learns_what_a_state_does_not_say():
         sizes = {"latent": 16, "edge_hidden": (16,), "node_hidden": (16,), "global_hidden": (16,)}
         model = ForwardModel(ParameterNames.of(scene), core=core, hidden_state=(8, 8, 8), **sizes)
         bound = model.bind(scene)
-        loss = ForwardModelLoss(bound, forced=6)
+        loss = ForwardModelLoss(bound, teacher_forced_steps=6)
         loss.fit_normalizers(trajectory_buffer(late, batch_size=500, seed=0).sample())
         optimizer = torch.optim.Adam(model.core.parameters(), 1e-2)
         buffer = trajectory_buffer(late, batch_size=32, window=6, seed=0)

@@ -64,7 +64,7 @@ def several_scenes() -> Case:
 def identification() -> Case:
     scene = load_scene("pendulum")
     forward = ForwardModel(ParameterNames.of(scene), parameters="inferred", inferred=(3, 3, 3), **SMALL)
-    loss = IdentificationLoss(IdentifyingModel(forward), scene, phase=3)
+    loss = IdentificationLoss(IdentifyingModel(forward), scene, context_length=3)
     batch = transitions("pendulum", window=4)
     flat = transitions("pendulum")
     return Case(loss, batch, lambda: loss.fit_normalizers(flat), r"Call fit_normalizers\(transitions\)", loss.trained)

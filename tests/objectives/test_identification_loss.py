@@ -36,8 +36,8 @@ def make_loss(trajectories):
 
 @pytest.mark.parametrize("length", [1, 3])
 def test_it_is_the_forward_models_loss_with_the_inferred_graph(make_loss, trajectories, length):
-    loss = make_loss(phase=6, parts=2)
-    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(2, length), seed=0).sample()
+    loss = make_loss(context_length=6, num_queries=2)
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, query_windows=(2, length), seed=0).sample()
     assert batch.shape == (5, 6 + 2 * length)
     time, trajectory = batch["index"][..., 1], batch["index"][..., 0]
     assert (trajectory == trajectory[:, :1]).all() and (time[:, :6].diff(dim=1) == 1).all()
@@ -54,9 +54,9 @@ def test_it_is_the_forward_models_loss_with_the_inferred_graph(make_loss, trajec
 
 
 def test_a_random_number_of_steps_is_identified_from_the_last_of_the_phase(make_loss, trajectories):
-    loss = make_loss(phase=6, shortest=4, parts=1, generator=torch.Generator().manual_seed(0))
-    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(1, 1), seed=0).sample()
-    fewer = [make_loss(phase=steps)(batch[:, 6 - steps :])["loss_forward_model"].item() for steps in (4, 5, 6)]
+    loss = make_loss(context_length=6, shortest=4, num_queries=1, generator=torch.Generator().manual_seed(0))
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, query_windows=(1, 1), seed=0).sample()
+    fewer = [make_loss(context_length=steps)(batch[:, 6 - steps :])["loss_forward_model"].item() for steps in (4, 5, 6)]
     drawn = [loss(batch)["loss_forward_model"].item() for _ in range(12)]
     nearest = [min(fewer, key=lambda one: abs(one - value)) for value in drawn]
     assert drawn == pytest.approx(nearest, rel=1e-9) and set(nearest) == set(fewer)
@@ -68,14 +68,14 @@ def test_a_random_number_of_steps_is_identified_from_the_last_of_the_phase(make_
     loss.eval()
     assert loss(batch)["loss_forward_model"].item() == pytest.approx(fewer[-1])
     for shortest in (0, 7):
-        with pytest.raises(ValueError, match=f"shortest={shortest} must be from 1 to phase=6"):
-            make_loss(phase=6, shortest=shortest)
+        with pytest.raises(ValueError, match=f"shortest={shortest} must be from 1 to context_length=6"):
+            make_loss(context_length=6, shortest=shortest)
 
 
 @pytest.mark.slow
 def test_one_loss_trains_both_models_and_identification_pays(make_loss, trajectories):
-    loss = make_loss(phase=10, parts=4)
-    buffer = trajectory_buffer(trajectories, batch_size=16, window=10, elsewhere=(4, 1), seed=0)
+    loss = make_loss(context_length=10, num_queries=4)
+    buffer = trajectory_buffer(trajectories, batch_size=16, window=10, query_windows=(4, 1), seed=0)
     loss(buffer.sample())["loss_forward_model"].backward()
     for part in (loss.trained.inference, loss.trained.forward_model.core):
         assert all(weight.grad.abs().sum() > 0 for weight in part.parameters() if weight.ndim == 2)
@@ -90,36 +90,36 @@ def test_one_loss_trains_both_models_and_identification_pays(make_loss, trajecto
 
 
 def test_true_parameters_in_the_samples_are_not_read(make_loss, trajectories):
-    loss = make_loss(phase=6)
-    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(1, 1), seed=0).sample()
+    loss = make_loss(context_length=6)
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, query_windows=(1, 1), seed=0).sample()
     mixed = batch.clone().set("parameters", batch["parameters"].apply(lambda value: value.flip(0)))
     assert torch.equal(loss(batch)["loss_forward_model"], loss(mixed)["loss_forward_model"])
     assert "parameters" not in loss.in_keys
 
 
 def test_what_does_not_fit_is_named(make_loss, trajectories):
-    loss = make_loss(phase=6, parts=2)
-    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(2, 1), seed=0).sample()
+    loss = make_loss(context_length=6, num_queries=2)
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, query_windows=(2, 1), seed=0).sample()
     for wrong in (batch[:, :6], batch[:, :7], batch[0]):
-        with pytest.raises(ValueError, match=r"must be \[B, 6 \+ 2 \* H\].*elsewhere=\(2, H\)"):
+        with pytest.raises(ValueError, match=r"must be \[B, 6 \+ 2 \* H\].*query_windows=\(2, H\)"):
             loss(wrong)
     with pytest.raises(KeyError, match=r"needs .{0,2}'action"):
         loss(batch.exclude("action"))
     batch["state"][0, 0, 1, 0] = torch.nan
     with pytest.raises(ValueError, match="'state' of the batch"):
         loss(batch)
-    with pytest.raises(ValueError, match="phase=0"):
-        make_loss(phase=0)
+    with pytest.raises(ValueError, match="context_length=0"):
+        make_loss(context_length=0)
     with pytest.raises(ValueError, match="count and a length"):
-        trajectory_buffer(trajectories, batch_size=5, elsewhere=(0, 1))
+        trajectory_buffer(trajectories, batch_size=5, query_windows=(0, 1))
     with pytest.raises(ValueError, match="8 observed and 16 test"):
         identification_errors(loss.bound, loss.inference, trajectories[:8], trajectories)
 
 
 def test_of_a_model_that_diverged_the_loss_is_nan(make_loss, trajectories):
     """The samples are not to blame: a trainer says so."""
-    loss = make_loss(phase=6)
-    batch = trajectory_buffer(trajectories, batch_size=5, window=6, elsewhere=(1, 1), seed=0).sample()
+    loss = make_loss(context_length=6)
+    batch = trajectory_buffer(trajectories, batch_size=5, window=6, query_windows=(1, 1), seed=0).sample()
     with torch.no_grad():
         for weight in loss.identifying.inference.parameters():
             weight.fill_(torch.nan)
@@ -134,7 +134,7 @@ def test_a_model_that_reads_true_parameters_is_no_part_of_it():
 
 
 def test_other_windows_start_elsewhere(trajectories):
-    buffer = trajectory_buffer(trajectories, batch_size=400, window=4, elsewhere=(3, 5), seed=0)
+    buffer = trajectory_buffer(trajectories, batch_size=400, window=4, query_windows=(3, 5), seed=0)
     time = buffer.sample()["index"][..., 1]
     first, others = time[:, 0], time[:, 4::5]
     assert (others != first[:, None]).all()

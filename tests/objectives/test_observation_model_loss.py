@@ -116,10 +116,10 @@ def test_what_is_missing_or_not_finite_is_named_and_changes_nothing(make_loss):
         broken[key][4, 0] = torch.nan
         with pytest.raises(KeyError) as caught:
             loss(missing)
-        assert f"ObservationModelLoss needs {key!r}, there is" in str(caught.value.args[0])
+        assert f"ObservationModelLoss needs {key!r}, the batch has" in str(caught.value.args[0])
         with pytest.raises(ValueError, match="has nan at index") as refused:
             loss(broken)
-        assert str(refused.value).startswith(f"{key!r} has nan at index (4, 0)")
+        assert str(refused.value).startswith(f"{key!r} of the batch has nan at index (4, 0)")
     assert all(torch.equal(value, before[name]) for name, value in loss.state_dict().items())
 
 

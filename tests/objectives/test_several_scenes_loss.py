@@ -75,5 +75,5 @@ def test_what_does_not_fit_is_named(losses, buffer, make_loss):
         SeveralScenesLoss([losses[0], make_loss("swimmer6")])
     with pytest.raises(ValueError, match=r"\['pendulum', 'pendulum'\] must have different names"):
         SeveralScenesLoss([losses[0], losses[0]])
-    with pytest.raises(ValueError, match="has 1 parts for 2 scenes"):
+    with pytest.raises(ValueError, match="has 1 sub-batches for 2 scenes"):
         SeveralScenesLoss(losses)([buffer.sample()[0]])

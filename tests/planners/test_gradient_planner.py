@@ -239,7 +239,7 @@ def test_a_first_plan_is_of_the_best_samples_only(monkeypatch):
 
 def test_as_many_samples_as_candidates_are_sorted_too():
     planner, start = GradientPlanner(point_env(1.0), 4, warm_up=0, candidates=3, samples=3, seed=0), at(1.0)
-    first = planner._first(start)
+    first = planner._initial_plan(start)
     totals = planner._imagine(start.repeat_interleave(3, 0), first)
     assert (totals.diff(dim=1) <= 0).all() and (first[:, 0] != 0).any()
 
@@ -413,9 +413,9 @@ def test_noise_is_a_share_of_the_range_around_the_best():
     plan[:, 1:] = -0.9
     for noise in (0.0, 0.05, 0.5):
         planner = GradientPlanner(point_env(2.0), HORIZON, candidates=4, noise=noise, seed=0)
-        off = planner._renewed(plan)[:, 2:] - 0.1
+        off = planner._resample(plan)[:, 2:] - 0.1
         assert (off.abs() <= noise + 1e-6).all() and (off.abs().max() > 0.5 * noise or noise == 0)
-        assert torch.equal(planner._renewed(plan)[:, :2], plan[:, :2])
+        assert torch.equal(planner._resample(plan)[:, :2], plan[:, :2])
 
 
 def test_a_gradient_that_is_no_number_costs_an_iteration_and_no_more():

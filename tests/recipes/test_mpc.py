@@ -52,7 +52,7 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, cal
 @pytest.mark.slow
 def test_variants_start_alike_whoever_plans(tmp_path, call):
     """They are identified first, whether somebody plans with the model or not."""
-    options = (*SMALL, "variants=true", "phase=5", "steps=1", "video=false", f"run_dir={tmp_path}")
+    options = (*SMALL, "variants=true", "context_length=5", "steps=1", "video=false", f"run_dir={tmp_path}")
     for planners in ("random", "[gn,random]"):
         code, _, errors = call(*options, f"planner={planners}", recipe="mpc")
         assert code == 0, errors
@@ -141,7 +141,7 @@ def test_a_recurrent_model_plans_too_and_videos_show_plans(tmp_path, call):
             widths[name] = film.width
     assert widths["gn"] == widths["ilqg"] > 1.8 * widths["random"]
     kept = load_file(tmp_path / "run" / "ilqg.safetensors")
-    assert torch.equal(kept["foreseen"], kept["state"][0, 1:])  # of one step on the true physics, that comes true
+    assert torch.equal(kept["planned"], kept["state"][0, 1:])  # of one step on the true physics, that comes true
 
 
 @pytest.mark.slow

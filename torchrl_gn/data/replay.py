@@ -22,7 +22,7 @@ def trajectory_buffer(
     window: int = 1,
     seed: int | None = None,
     capacity: int | None = None,
-    elsewhere: tuple[int, int] | None = None,
+    query_windows: tuple[int, int] | None = None,
     shard: tuple[int, int] = (0, 1),
 ) -> TensorDictReplayBuffer:
     """Replay buffer that draws transitions, or windows of them, from trajectories without copying these.
@@ -40,7 +40,7 @@ def trajectory_buffer(
         window: consecutive transitions in a draw.
         seed: seed of the draws; default: drawn from torch's global generator.
         capacity: trajectories to allocate, for ``extend`` to add more and replace the oldest; default: read-only.
-        elsewhere: ``(count, length)`` of query windows at other times of the same trajectory, which follow the first
+        query_windows: ``(count, length)`` of query windows at other times of the same trajectory, which follow the first
             along the second dimension, ``[batch_size, window + count * length]`` (paper, SM "End-to-end training
             algorithm for System ID").
         shard: ``(rank, size)``: return only this equal part of each draw; ranks with one seed share the draws.
@@ -59,13 +59,13 @@ def trajectory_buffer(
     """
     if batch_size < 1 or window < 1:
         raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
-    if elsewhere is not None and min(elsewhere) < 1:
-        raise ValueError(f"elsewhere must be a count and a length of at least 1, got {elsewhere}")
+    if query_windows is not None and min(query_windows) < 1:
+        raise ValueError(f"query_windows must be a count and a length of at least 1, got {query_windows}")
     if not 0 <= shard[0] < shard[1]:
         raise ValueError(f"shard must be a rank and a size above it, got {shard}")
     if batch_size % shard[1]:
         raise ValueError(f"batch_size={batch_size} cannot be split evenly among {shard[1]} processes; use a multiple")
-    trajectories = _checked(trajectories, max(window, elsewhere[1] if elsewhere else 1))
+    trajectories = _checked(trajectories, max(window, query_windows[1] if query_windows else 1))
     count = len(trajectories)
     if capacity is None:
         storage, writer = TrajectoryStorage(trajectories), ImmutableDatasetWriter()
@@ -74,7 +74,7 @@ def trajectory_buffer(
     else:
         room = trajectories.apply(lambda x: x.new_zeros(capacity, *x.shape[1:]), batch_size=[capacity])
         storage, writer = TrajectoryStorage(room, writable=True), TensorDictRoundRobinWriter()
-    sampler = WindowSampler(window, seed, elsewhere=elsewhere, shard=shard)
+    sampler = WindowSampler(window, seed, query_windows=query_windows, shard=shard)
     buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, writer=writer, batch_size=batch_size)
     if capacity is not None:
         buffer.extend(trajectories.copy())
@@ -147,10 +147,10 @@ class WindowSampler(Sampler):
         window: int = 1,
         seed: int | None = None,
         *,
-        elsewhere: tuple[int, int] | None = None,
+        query_windows: tuple[int, int] | None = None,
         shard: tuple[int, int] = (0, 1),
     ):
-        self.window, self.elsewhere, self.shard = window, elsewhere, shard
+        self.window, self.query_windows, self.shard = window, query_windows, shard
         self._generator = torch.Generator()
         self._generator.manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
@@ -162,9 +162,9 @@ class WindowSampler(Sampler):
         drawn = torch.randint(len(storage) * starts, (batch_size,), generator=self._generator)
         trajectory = drawn.div(starts, rounding_mode="floor")
         time = drawn - trajectory * starts
-        if self.window > 1 or self.elsewhere:
+        if self.window > 1 or self.query_windows:
             time = time[:, None] + torch.arange(self.window)
-            if self.elsewhere:
+            if self.query_windows:
                 time = torch.cat((time, self._query_windows(time[:, 0], storage.steps)), dim=1)
             trajectory = trajectory[:, None].expand_as(time)
         rank, size = self.shard
@@ -173,8 +173,8 @@ class WindowSampler(Sampler):
 
     def _query_windows(self, start: Tensor, steps: int) -> Tensor:
         """Draw times ``[B, count * length]`` of windows that do not start at ``start``."""
-        assert self.elsewhere is not None
-        count, length = self.elsewhere
+        assert self.query_windows is not None
+        count, length = self.query_windows
         starts = steps - length + 1
         drawn = torch.randint(max(starts - 1, 1), (len(start), count), generator=self._generator)
         drawn = drawn + (drawn >= start[:, None]) if starts > 1 else drawn

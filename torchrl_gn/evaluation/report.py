@@ -58,7 +58,13 @@ def report(
 
 
 def fresh_errors(
-    model: ForwardModel | IdentifyingModel, scene: Scene, *, sequences: int, length: int, seed: int, phase: int = 20
+    model: ForwardModel | IdentifyingModel,
+    scene: Scene,
+    *,
+    sequences: int,
+    length: int,
+    seed: int,
+    context_length: int = 20,
 ) -> ErrorTable:
     """Evaluate a model on new random trajectories of a scene, the same ones for the same seed.
 
@@ -71,7 +77,7 @@ def fresh_errors(
         sequences: number of trajectories, or of variants.
         length: control steps of each trajectory.
         seed: seed of the trajectories and variants.
-        phase: steps to identify from.
+        context_length: steps to identify from.
 
     Raises:
         ValueError: if trajectories are shorter than the longest rollouts, 100 steps, or the model identifies and
@@ -86,4 +92,4 @@ def fresh_errors(
     variants = sample_variants(scene.origin.get("system", scene.name), sequences, rng)
     both = collect_trajectories(variants, 2 * sequences, length, seed, split=4)
     observed, predicted = (cast(TensorDictBase, half) for half in (both[:sequences], both[sequences:]))
-    return identification_errors(*model.bind(scene), observed, predicted, steps=phase)
+    return identification_errors(*model.bind(scene), observed, predicted, steps=context_length)

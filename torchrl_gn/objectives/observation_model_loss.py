@@ -10,7 +10,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives import LossModule
 
-from torchrl_gn.finite import require_finite
+from torchrl_gn.objectives.batch_entries import read_entries
 from torchrl_gn.objectives.fitted import require_fitted
 from torchrl_gn.policies import LearnedReward, ObservationModel
 
@@ -21,16 +21,16 @@ UPDATE_NORMALIZERS = (
 
 
 class ObservationModelLoss(LossModule):
-    """Squared error of predicted changes of observations, and of predicted rewards.
+    """Squared error of predicted observation changes, and of predicted rewards.
 
-    Each number's error is in the spread of its change; numbers that never varied do not count. The model is trained
-    jointly with a policy, from the same replay buffer (paper, "Model-based reinforcement learning").
+    Errors are in standard deviations of each dimension's change; constant dimensions are left out. Train jointly with
+    a policy, from the same replay buffer (paper, "Model-based reinforcement learning").
 
-    Differentiated: the weights of the model and of the reward. The input TensorDict is never changed.
+    Differentiated: the weights of the model and of the reward.
 
     Args:
         model: the forward model.
-        reward: learned reward; None: the reward is known.
+        reward: learned reward. Default: the reward is known.
 
     Input: ``observation`` ``[*B, O]``, ``action`` ``[*B, A]``, ``("next", "observation")`` and, with a learned reward,
     ``("next", "reward")`` ``[*B, 1]``.
@@ -40,11 +40,7 @@ class ObservationModelLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that :meth:`set_keys` can change.
-
-        Attributes:
-            reward: read under ``"next"``.
-        """
+        """Keys that :meth:`set_keys` can change; ``reward`` is read under ``"next"``."""
 
         reward: NestedKey = "reward"
 
@@ -52,7 +48,6 @@ class ObservationModelLoss(LossModule):
     default_keys = _AcceptedKeys
     model: ObservationModel
     reward: LearnedReward | None
-    _fitted = False  # until asked once: reading statistics waits for the device
 
     def __init__(self, model: ObservationModel, reward: LearnedReward | None = None) -> None:
         super().__init__()
@@ -63,26 +58,12 @@ class ObservationModelLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Keys that the loss reads."""
         reward = [] if self.reward is None else [unravel_key(("next", self.tensor_keys.reward))]
         return [*self.model.in_keys, *self.model.out_keys, *reward]
 
     @property
     def out_keys(self) -> list[str]:
-        """Keys that the loss writes."""
         return ["loss_model", *([] if self.reward is None else ["loss_reward"])]
-
-    def _read(self, tensordict: TensorDictBase) -> list[torch.Tensor]:
-        values = []
-        for key in self.in_keys:
-            value = tensordict.get(key, None)
-            if value is None:
-                raise KeyError(
-                    f"{type(self).__name__} needs {key!r}, there is {sorted(map(str, tensordict.keys(True)))}."
-                )
-            require_finite(value, repr(key))
-            values.append(value)
-        return values
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -90,13 +71,11 @@ class ObservationModelLoss(LossModule):
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if a number is not finite, or rewards have another shape than those predicted.
+            ValueError: if a value is NaN or Inf, or the rewards' shape differs from the predicted one.
             RuntimeError: if the model's normalisers have seen no data.
         """
-        if not (self._fitted or torch.compiler.is_compiling()):
-            require_fitted(self, self.model, remedy=UPDATE_NORMALIZERS)
-            self._fitted = True
-        observation, action, next_observation, *rewards = self._read(tensordict)
+        require_fitted(self, self.model, remedy=UPDATE_NORMALIZERS)
+        observation, action, next_observation, *rewards = read_entries(self, tensordict, self.in_keys)
         inverse = torch.where(self.model.change_std > 0, 1 / self.model.change_std, 0).to(observation.dtype)
         target = (next_observation - observation) * inverse
         error = (self.model.normalized_change(observation, action) - target) * (inverse > 0)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, cast
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
@@ -23,51 +22,47 @@ ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 class SVGLoss(DDPGLoss):
-    r"""Losses of SVG(N) (paper, SM "SVG"): TorchRL's DDPG with a stochastic policy and a model under its policy's loss.
+    r"""Losses of SVG(N) (paper, SM "SVG"): TorchRL's DDPG with a stochastic policy and model rollouts.
 
-    The policy maximises, from observations :math:`x_t` of the replay buffer,
+    From observations :math:`x_t` of the replay buffer the policy maximises
 
     .. math::
         \mathbb{E}\Big[\sum_{k=0}^{N-1} \gamma^k r(x_{t+k}, a_{t+k}, x_{t+k+1}) + \gamma^N Q(x_{t+N}, a_{t+N})\Big],
         \quad a_{t+k} \sim \pi(\cdot | x_{t+k}), \quad x_{t+k+1} = g(x_{t+k}, a_{t+k})
 
-    with reparameterised actions, so that its gradient runs through the model :math:`g`, the reward and the value.
-    ``steps=0`` is the model-free SVG(0). Paper: the last action is printed as :math:`a_t`, a misprint. Imagined steps
-    do not end an episode.
+    with reparameterised actions: its gradient runs through the model :math:`g`, the reward and the value. ``steps=0``
+    is the model-free SVG(0), and DDPG with a deterministic policy. Imagined steps do not end an episode.
+    (Paper: :math:`a_t` as the last action is a misprint.)
 
-    The value's loss is DDPG's with actions drawn from the target policy; everything about keys, target networks,
-    ``make_value_estimator`` (which sets gamma) and priorities is as in :class:`~torchrl.objectives.DDPGLoss`. With a
-    deterministic policy and ``steps=0`` it *is* DDPG.
+    The value's loss is DDPG's with actions drawn from the target policy. Keys, target networks, priorities and
+    ``make_value_estimator``, which sets gamma, are as in :class:`~torchrl.objectives.DDPGLoss`.
 
-    Differentiated: the policy's weights in ``loss_actor``, the value's in ``loss_value``. Model and reward are no part
-    of this module: they get no gradient from it, and ``parameters()`` and ``to()`` leave them out; train the model
-    with :class:`~torchrl_gn.objectives.ObservationModelLoss`. Changes of their weights count at the next call.
+    Differentiated: the policy's weights in ``loss_actor``, the value's in ``loss_value``. Model and reward are not
+    submodules: they get no gradient, and ``parameters()`` and ``to()`` leave them out.
 
     Args:
-        actor_network: policy, for example a ``ProbabilisticActor``; one that does not sample is DDPG's.
+        actor_network: policy, for example a ``ProbabilisticActor``.
         value_network: writes ``state_action_value``.
         model: TensorDict module from observation and action to ``("next", observation)``, for example an
-            :class:`~torchrl_gn.policies.ObservationModel`. Not read with ``steps=0``. What policy and value read besides
-            (a goal) stays as it is.
+            :class:`~torchrl_gn.policies.ObservationModel`. Other inputs of policy and value (a goal) stay constant.
         reward: reward of an imagined step, known or learned.
         steps: ``N``, steps through the model.
         **options: of :class:`~torchrl.objectives.DDPGLoss`.
 
     Raises:
-        ValueError: if ``steps`` is negative, or there are steps but no model or reward, or one that predicts nothing of
-            what policy or value read.
+        ValueError: if ``steps`` is negative, model or reward is missing for ``steps > 0``, or the model predicts no
+            input of policy or value.
 
-    Input: as DDPG's: what the policy reads, ``action``, and under ``"next"`` the same and ``reward``, ``done`` and
+    Input: as DDPG's: the policy's inputs, ``action``, and under ``"next"`` the same inputs, ``reward``, ``done`` and
     ``terminated``.
 
-    Output: ``loss_actor`` and ``loss_value``, and for reading along ``pred_value``, ``target_value``, their largest,
+    Output: ``loss_actor`` and ``loss_value``, and for monitoring ``pred_value``, ``target_value``, the maximum of each,
     and ``td_error``.
     """
 
     deterministic_sampling_mode: Any = ExplorationType.RANDOM  # actions are drawn
     model: TensorDictModuleBase | None
     reward: ObservedReward | None
-    _fitted = False  # until asked once: reading statistics waits for the device
 
     def __init__(
         self,
@@ -94,12 +89,12 @@ class SVGLoss(DDPGLoss):
         super().__init__(actor_network, value_network, **options)
         self.steps = steps
         self._share_statistics()
-        # Not registered: their weights are none of this loss's.
+        # Not registered, so that their weights stay out of parameters().
         object.__setattr__(self, "model", model)
         object.__setattr__(self, "reward", reward)
 
     def _share_statistics(self) -> None:
-        """Let target networks read the statistics of what they are copies of: TorchRL's updaters copy weights only."""
+        """Let target networks read the buffers of their originals: TorchRL's updaters copy weights only."""
         for name in ("actor_network", "value_network"):
             target = cast("TensorDictBase | None", self._modules.get(f"target_{name}_params"))
             if target is not None:
@@ -109,7 +104,7 @@ class SVGLoss(DDPGLoss):
                     target.set(key, own.get(key))
 
     def _apply(self, fn, recurse: bool = True):
-        # TorchRL casts and moves copies of the networks' buffers: let them have the networks' own again.
+        # TorchRL casts and moves copies of the networks' buffers: restore the networks' own.
         super()._apply(fn)
         for name in ("actor_network", "value_network"):
             own = cast(TensorDictBase, self._modules[f"{name}_params"])
@@ -119,20 +114,16 @@ class SVGLoss(DDPGLoss):
         return self
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Loss of the value, and what to read along.
-
-        Raises:
-            RuntimeError: if normalisers of policy, value or model have seen no data.
-        """
+        """Loss of the value, and what to monitor; needs fitted normalisers, as :meth:`loss_actor`."""
         self._require_fitted()
-        with set_exploration_type(self.deterministic_sampling_mode):  # as in forward, where it is called alone
+        with set_exploration_type(self.deterministic_sampling_mode):  # as in forward, for direct calls
             return super().loss_value(tensordict)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Loss of the policy, and nothing more to read along.
+        """Loss of the policy, and nothing to monitor.
 
         Raises:
-            ValueError: if the reward of an imagined step has another shape than ``[*B, 1]``.
+            ValueError: if the reward of an imagined step is not ``[*B, 1]``.
             RuntimeError: if normalisers of policy, value or model have seen no data.
         """
         self._require_fitted()
@@ -147,7 +138,7 @@ class SVGLoss(DDPGLoss):
                 value = value + discount * reward
                 discount = discount * gamma
             now = self._act(now)
-        # In turn, not together: policy and value may have layers in common, which are the value's only here.
+        # One after the other: layers shared by policy and value must have the value's weights here.
         with with_weights(self.value_network, self._cached_detached_value_params):
             now = self.value_network(now)
         value = value + discount * now.get(self.tensor_keys.state_action_value)
@@ -163,25 +154,22 @@ class SVGLoss(DDPGLoss):
         return loss, {}
 
     def _require_fitted(self) -> None:
-        if self._fitted or torch.compiler.is_compiling():
-            return
         model = [self.model] if self.steps and self.model is not None else []
         require_fitted(self, self.actor_network, self.value_network, *model, remedy=UPDATE_NORMALIZERS)
-        self._fitted = True
 
     def _act(self, now: TensorDictBase) -> TensorDictBase:
-        """The policy's action beside what it read."""
+        """Add the policy's action."""
         with with_weights(self.actor_network, self.actor_network_params):
             return self.actor_network(now)
 
     @property
     def _carried(self) -> list[NestedKey]:
-        """What the model reads but for the action: imagined steps pass it on."""
+        """Inputs of the model that imagined steps pass on: all but the action."""
         keys = self.model.in_keys if self.steps and self.model is not None else []
         return [key for key in keys if key not in self.actor_network.out_keys]
 
     def _imagine(self, now: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """The next step's entries, and the reward ``[*B, 1]`` of getting there."""
+        """The next step's entries, and the step's reward ``[*B, 1]``."""
         assert self.model is not None and self.reward is not None
         observation, action = (cast(Tensor, now.get(key)) for key in self.model.in_keys[:2])
         with ExitStack() as stack:
@@ -192,6 +180,6 @@ class SVGLoss(DDPGLoss):
             reward = self.reward(observation, action, cast(Tensor, predicted.get(self.model.in_keys[0])))
         if reward.shape != (*now.batch_size, 1):
             raise ValueError(f"The reward must be {[*now.batch_size, 1]}, got {list(reward.shape)}.")
-        # What is not predicted stays as it is: a goal, for example.
+        # Inputs that are not predicted, a goal for example, stay constant.
         kept = now.select(*self.actor_in_keys, *self.value_exclusive_keys, *self._carried, strict=False)
         return kept.update(predicted), reward

@@ -1,10 +1,10 @@
-"""Small quadratic programs with bounds, many at once: the controls of one time step."""
+"""Batched box-constrained quadratic programs: the controls of one time step."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_STEPS = 0.5 ** np.arange(1, 12)  # tried where the full step does not do
+_STEP_SIZES = 0.5 ** np.arange(1, 12)  # of the line search, after the full step
 
 
 def solve_box_qp(
@@ -17,24 +17,24 @@ def solve_box_qp(
     iterations: int = 30,
     tolerance: float = 1e-10,
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Projected Newton (Tassa, Mansard and Todorov 2014, section III-B) for a batch of problems.
+    r"""Solve a batch of problems by projected Newton (Tassa, Mansard and Todorov 2014, section III-B).
 
     .. math:: \min_x \tfrac12 x^\top H x + g^\top x \quad \text{with} \quad l \le x \le u
 
-    A dimension is clamped where it is at a bound that its gradient pushes it against. A Newton
-    step in the others is projected on the box and shortened until the cost falls enough.
+    Dimensions at a bound that their gradient points beyond are clamped; the others take a projected Newton step with
+    line search.
 
     Args:
         hessian: ``[M, n, n]`` symmetric positive definite.
         gradient: ``[M, n]``.
-        lower: ``[M, n]``, or what broadcasts to it.
+        lower: ``[M, n]``, or broadcastable.
         upper: likewise, not below ``lower``.
-        start: ``[M, n]`` first guess, clipped to the bounds; the better, the fewer iterations. Default: 0.
-        iterations: Newton steps at most.
-        tolerance: a problem is solved where its free gradient is this much smaller than ``|g|``.
+        start: warm start ``[M, n]``, clipped to the bounds. Default: 0.
+        iterations: maximum number of Newton steps.
+        tolerance: bound on the free gradient, relative to ``|g|``.
 
     Returns:
-        Solutions ``[M, n]`` and which of their dimensions are free ``[M, n]`` bool.
+        Solutions ``[M, n]`` and the free dimensions ``[M, n]`` bool.
     """
     x = np.clip(np.zeros_like(gradient) if start is None else start, lower, upper)
     identity = np.eye(gradient.shape[-1])
@@ -48,16 +48,16 @@ def solve_box_qp(
             return x, free
         reduced = np.where(free[:, :, None] & free[:, None, :], hessian, identity)
         newton = -np.linalg.solve(reduced, slope[..., None])[..., 0]
-        moved = np.clip(x + newton, lower, upper)
-        if not (better := _descends(hessian, slope, moved - x)).all():
-            for step in _STEPS:
+        trial = np.clip(x + newton, lower, upper)
+        if not (better := _descends(hessian, slope, trial - x)).all():
+            for step in _STEP_SIZES:
                 shorter = np.clip(x + step * newton, lower, upper)
-                moved = np.where(better[:, None], moved, shorter)
-                better |= _descends(hessian, slope, moved - x)
+                trial = np.where(better[:, None], trial, shorter)
+                better |= _descends(hessian, slope, trial - x)
                 if better.all():
                     break
-        # What no step improves is solved as well as the numbers' precision allows.
-        change = np.where((better & unsolved)[:, None], moved - x, 0.0)
+        # Where no step size helps, floating-point precision is reached.
+        change = np.where((better & unsolved)[:, None], trial - x, 0.0)
         if not change.any():
             return x, free
         x = x + change
@@ -66,9 +66,9 @@ def solve_box_qp(
 
 
 def _descends(hessian: np.ndarray, slope: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Whether the cost falls by a tenth of what its slope promises (Armijo); the cost's change is exact here."""
-    promised = (slope * change).sum(axis=-1)
-    return promised + 0.5 * (change * _times(hessian, change)).sum(axis=-1) <= 0.1 * promised
+    """Armijo condition with factor 0.1; the quadratic cost's change is exact."""
+    predicted = (slope * change).sum(axis=-1)
+    return predicted + 0.5 * (change * _times(hessian, change)).sum(axis=-1) <= 0.1 * predicted
 
 
 def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:

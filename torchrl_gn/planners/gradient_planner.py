@@ -1,4 +1,4 @@
-"""Model-predictive control by gradients through the learned model."""
+"""Model-predictive control by gradients through a learned model."""
 
 from __future__ import annotations
 
@@ -18,65 +18,51 @@ from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.dynamics import Predictor
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.networks.frozen_weights import frozen
-from torchrl_gn.planners.plan import (
-    KEY,
-    RecedingHorizonPlanner,
-    check_count,
-    check_plannable,
-    plan_left,
-    plan_primer,
-    read_plan,
-)
+from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
 
-SMALLEST_STEP = 0.01  # as a share of the optimiser's
+_MIN_STEP_SIZE = 0.01  # as a fraction of the optimiser's
 
 OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
 
 
 class GradientPlanner(RecedingHorizonPlanner):
-    """Choose the actions whose imagined rewards are highest, by gradient ascent.
+    """Plan by gradient ascent on the rewards that a learned model predicts.
 
-    (Paper, SM "MPC planner with learned models".)
-    At every control step the rewards of the next ``horizon`` steps are imagined in one rollout of the model
-    (:meth:`~torchrl_gn.envs.ModelEnv.imagine`), differentiated with respect to the actions, and the actions changed, a
-    number of times. The first is taken; the others, shifted by one step and with the last repeated, are where the
-    next control step's planning starts (receding horizon). The best sequence seen counts, not the last.
+    Paper, SM "MPC planner with learned models". Every control step rolls out the next ``horizon`` steps
+    (:meth:`~torchrl_gn.envs.ModelEnv.imagine`), differentiates the sum of rewards by the actions, and updates them
+    ``iterations`` times. The first action of the best sequence seen is executed; the rest, shifted by one step with the
+    last action repeated, warm-starts the next plan.
 
-    An optimiser with a fixed rate cannot balance finely: near the best actions its steps go past them. So a state's
-    steps are ``shrink`` times as large after a control step that found nothing better than the plan it began with, and
-    twice as large, up to what the optimiser makes them, after one that did.
+    The planner keeps no state: the plan is the TensorDict's entry ``plan``. Without it the planner improves the best
+    of smooth random sequences. Where episodes auto-reset, append :meth:`make_tensordict_primer` to the environment;
+    ``Collector(..., auto_register_policy_transforms=True)`` does so.
 
-    A plan is the TensorDict's entry ``plan``: the planner itself keeps nothing, serves any batch, and an episode's
-    first call is one without that entry. It then draws smooth random sequences and improves the best ones for
-    ``warm_up`` iterations. Where episodes end and begin anew inside one rollout, :meth:`make_tensordict_primer` clears
-    the plan; ``Collector(..., auto_register_policy_transforms=True)`` appends it to the environment by itself.
+    Sequences with predictions or rewards that are not finite are discarded. If none is left, the planner keeps the
+    last plan, or the zero action without one, and warns.
 
-    A sequence whose predictions or rewards are not finite (float32 rewards overflow above 3e38) never gets into a plan.
-    Where all are, the last plan is kept, or nothing is done if there is none, with a warning.
-
-    Plan with a specialised model, ``ModelEnv(specialize(bound, compile=True), reward)``: several times as fast.
-    Works under ``no_grad`` and not under ``inference_mode``, where nothing has a gradient.
+    Opens autograd itself, also under ``no_grad``; ``inference_mode`` is refused. Actions are detached.
 
     Args:
-        env: the learned model with the reward to plan for.
-        horizon: control steps to look ahead.
-        iterations: changes of the plan at each control step (paper: 3 to 51).
-        warm_up: changes of a first plan. Default: ``iterations * horizon`` (paper), at most 200.
-        candidates: sequences that are improved at a time, each on its own; the best one acts.
-        samples: random sequences of which a first plan takes the best ones; at least ``candidates``. At every later
-            control step half of the candidates, the worst ones, start anew close to the best.
-        noise: how far from the best, as a share of the actions' range.
-        optimizer: makes the optimiser of the actions, which it sees in units of half their range.
-            Default: Adam with a rate of 0.1.
-        shrink: how much smaller steps get where they gain nothing, above 0; 1: never.
-        action_cost: subtracted for each step's mean squared action, in those units.
+        env: the learned model with the reward. A specialised model plans several times faster.
+        horizon: control steps ``H`` to look ahead.
+        iterations: updates at each control step (paper: 3 to 51).
+        warm_up: updates of a first plan. Default: ``iterations * horizon`` (paper), at most 200.
+        candidates: sequences ``K`` to improve in parallel.
+        samples: random sequences to choose the first candidates from; at least ``candidates``.
+        noise: amplitude, as a fraction of the actions' range, of the perturbations of the best candidate that replace
+            the worse half of the candidates at every later control step.
+        optimizer: makes the optimiser of the actions, in units of half their range. Default: Adam, learning rate 0.1.
+        shrink: factor on the step size after a control step without improvement; an improvement doubles it, up to the
+            optimiser's own. 1: constant.
+        action_cost: cost per step and mean squared action, in units of half the range.
         seed: of the random sequences. Default: drawn from torch's global generator.
 
     Raises:
         TypeError: if ``env`` is no ``ModelEnv``.
-        ValueError: if a number is out of its range, the environment has no reward or the scene no actions; when
-            planning, if rewards do not depend on the actions.
-        RuntimeError: when planning, in inference mode.
+        ValueError: if an option is out of range, or reward or actions are missing; when planning, if the rewards do
+            not depend on the actions.
+        KeyError: when planning, if the environment drops a recurrent model's hidden state.
+        RuntimeError: when planning in inference mode.
     """
 
     def __init__(
@@ -96,14 +82,12 @@ class GradientPlanner(RecedingHorizonPlanner):
     ) -> None:
         if not isinstance(env, ModelEnv):
             raise TypeError(
-                f"GradientPlanner plans through a ModelEnv, which has gradients; got {type(env).__name__}."
+                f"GradientPlanner needs a ModelEnv, which has gradients; got {type(env).__name__}."
                 " On the true physics use ILQGPlanner."
             )
-        check_plannable(env, horizon=horizon, iterations=iterations, candidates=candidates, samples=samples)
+        check_plannable(env, warm_up, horizon=horizon, iterations=iterations, candidates=candidates, samples=samples)
         if samples < candidates:
             raise ValueError(f"samples must be at least candidates={candidates}, got {samples}")
-        warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
-        check_count("warm_up", warm_up, 0)
         if not 0 <= noise <= 1 or not 0 <= action_cost < math.inf:
             raise ValueError(
                 f"noise must be in [0, 1] and action_cost finite and not negative, got {noise} and {action_cost}"
@@ -112,7 +96,8 @@ class GradientPlanner(RecedingHorizonPlanner):
             raise ValueError(f"shrink must be above 0 and at most 1, got {shrink}")
         super().__init__(env)
         self.shrink = shrink
-        self.horizon, self.iterations, self.warm_up = horizon, iterations, warm_up
+        self.horizon, self.iterations = horizon, iterations
+        self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
         self.candidates, self.samples, self.noise, self.action_cost = candidates, samples, noise, action_cost
         self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)
         low, high = torch.as_tensor(env.scene.action_low), torch.as_tensor(env.scene.action_high)
@@ -126,7 +111,7 @@ class GradientPlanner(RecedingHorizonPlanner):
 
     @property
     def imagined(self) -> ModelEnv:
-        """The environment that is planned in."""
+        """The learned environment."""
         return cast(ModelEnv, self.env)
 
     @property
@@ -135,20 +120,17 @@ class GradientPlanner(RecedingHorizonPlanner):
         return self.candidates, self.horizon, self.imagined.scene.num_actions
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Transform that clears the plan when an episode begins, for the environment that is acted in.
-
-        Of a recurrent model it also carries what that remembers.
-        """
+        """Transform for the real environment that resets the plan, and a recurrent model's hidden state."""
         hidden_state = (
-            cast(TensorDictBase, self.imagined.world_model.initial_hidden_state()) if self._remembers else None
+            cast(TensorDictBase, self.imagined.world_model.initial_hidden_state()) if self._recurrent else None
         )
         return plan_primer(self.plan_shape, torch.float32, self.imagined.device, hidden_state, step_size=(1,))
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
-        """The action to take now, ``[*B, A]``, where the states are; what is left of the plan; and hidden state."""
+        """Next action ``[*B, A]``, on the states' device; the remaining plan and the hidden state to write."""
         if torch.is_inference_mode_enabled():
             raise RuntimeError(
-                "GradientPlanner needs gradients, which torch.inference_mode() rules out; use torch.no_grad() there."
+                "GradientPlanner needs gradients: use torch.no_grad() instead of torch.inference_mode()."
             )
         batch, device = tensordict.shape, self.imagined.device
         flat = tensordict.reshape(-1)
@@ -156,43 +138,39 @@ class GradientPlanner(RecedingHorizonPlanner):
         states_at = cast(Tensor, tensordict.get("state", plan)).device
         plan, planned = self._scaled(plan.to(device)), planned.flatten().to(device)
         entries = self._entries(flat)
-        if self._remembers and "hidden_state" not in entries.keys() and bool(planned.any()):
+        if self._recurrent and "hidden_state" not in entries.keys() and bool(planned.any()):
             raise KeyError(
-                "The model remembers past states, and the environment drops its entry 'hidden_state' between steps: append"
-                " the planner's make_tensordict_primer() to the environment that is acted in."
+                "The model is recurrent, and the environment drops its hidden state 'hidden_state' between steps: append the"
+                " planner's make_tensordict_primer() to the real environment."
             )
-        best, size = plan.clone(), self._step_size(flat).to(device)
+        best, step_size = plan.clone(), self._step_size(flat).to(device)
         with frozen(self.imagined):
-            first = (~planned, self.warm_up, "there is no plan yet, and nothing is done")
-            for rows, iterations, otherwise in (first, (planned, self.iterations, "their last plan is kept")):
-                where = rows.nonzero().flatten()
-                if len(where) == 0:
+            for resumed in (False, True):
+                rows = (planned == resumed).nonzero().flatten()
+                if len(rows) == 0:
                     continue
-                some = entries if len(where) == len(flat) else cast(TensorDictBase, entries[where])
-                begin = self._renewed(plan[where]) if bool(planned[where[0]]) else self._first(some)
-                best[where], better = self._improve(some, begin, iterations, otherwise, size[where])
-                if rows is planned:
-                    size[where] *= torch.where(better, 2.0, self.shrink)
-        actions, size = self._actions(best), size.clamp(SMALLEST_STEP, 1.0)
-        left = plan_left(
-            batch,
-            actions.reshape(*batch, *self.plan_shape).to(states_at),
-            step_size=size.reshape(*batch, 1).to(states_at),
-        )
-        beside: dict[NestedKey, TensorDictBase] = {KEY: left}
-        if self._remembers:
-            beside["next", "hidden_state"] = self._remember(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
-        return actions[:, 0, 0].reshape(*batch, -1).to(states_at), beside
+                some = entries if len(rows) == len(flat) else cast(TensorDictBase, entries[rows])
+                start = self._resample(plan[rows]) if resumed else self._initial_plan(some)
+                best[rows], improved = self._improve(some, start, step_size[rows], resumed=resumed)
+                if resumed:
+                    step_size[rows] *= torch.where(improved, 2.0, self.shrink)
+        actions, step_size = self._actions(best), step_size.clamp(_MIN_STEP_SIZE, 1.0)
+        plan, step_size = actions.reshape(*batch, *self.plan_shape), step_size.reshape(*batch, 1)
+        remaining = shift_plan(batch, plan.to(states_at), step_size=step_size.to(states_at))
+        written: dict[NestedKey, TensorDictBase] = {KEY: remaining}
+        if self._recurrent:
+            written["next", "hidden_state"] = self._next_memory(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
+        return actions[:, 0, 0].reshape(*batch, -1).to(states_at), written
 
     def _step_size(self, flat: TensorDictBase) -> Tensor:
-        """Of every state ``[B, 1]``, as a share of the optimiser's; whole where there is no plan."""
+        """Step sizes ``[B, 1]``, as fractions of the optimiser's; 1 without a plan."""
         size = cast("Tensor | None", flat.get((KEY, "step_size"), None))
         if size is None:
             return torch.ones(len(flat), 1)
-        return size.where(size > 0, 1.0)  # a primer's is 0
+        return size.where(size > 0, 1.0)  # a primer writes 0
 
     def _scaled(self, actions: Tensor) -> Tensor:
-        """Actions ``[*B, A]`` in units of half their range, from -1 to 1 around its middle; 0 where they are fixed."""
+        """Actions ``[*B, A]`` in units of half their range, -1 to 1; 0 where they are fixed."""
         return torch.where(self.half_range > 0, (actions - self.middle) / self.half_range, 0.0)
 
     def _actions(self, scaled: Tensor) -> Tensor:
@@ -200,47 +178,47 @@ class GradientPlanner(RecedingHorizonPlanner):
         return scaled * self.half_range + self.middle
 
     @property
-    def _remembers(self) -> bool:
+    def _recurrent(self) -> bool:
         return "hidden_state" in self.imagined.world_model.in_keys
 
     @torch.no_grad()
-    def _remember(self, entries: TensorDictBase, action: Tensor) -> TensorDictBase:
-        """What the model remembers once it has seen this state and action."""
+    def _next_memory(self, entries: TensorDictBase, action: Tensor) -> TensorDictBase:
+        """The recurrent model's hidden state after this state and action."""
         action = self.env.action_spec.project(action)
         return self.imagined.world_model(entries.copy().set("action", action))["next", "hidden_state"]
 
     def _entries(self, flat: TensorDictBase) -> TensorDictBase:
-        """What imagining reads, detached."""
+        """Entries that a rollout reads, detached."""
         model = cast(object, self.imagined.world_model)
         if isinstance(model, Predictor):
-            model.parameters_in(flat)  # refuses other variants, of which the entries below tell nothing any more
+            model.parameters_in(flat)  # refuses other variants, which the entries below no longer show
         keys = [key for key in (*self.imagined.world_model.in_keys, "task") if key != "action"]
         read = flat.select(*keys, strict=False).detach()
-        # Of what was made in inference mode, which autograd refuses, copies.
+        # Autograd refuses tensors made in inference mode: clone them.
         usable = read.apply(lambda entry: entry.clone() if entry.is_inference() else entry)
         return cast(TensorDictBase, usable).to(self.imagined.device)
 
-    def _imagine(self, many: TensorDictBase, plan: Tensor) -> Tensor:
-        """Returns ``[B, K]`` of sequences ``[B, K, H, A]`` in units of half their range, from ``[B K]`` states.
+    def _imagine(self, starts: TensorDictBase, plan: Tensor) -> Tensor:
+        """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` from states ``[B K]``.
 
-        Minus infinity where a prediction is not finite: a reward may look at another body.
+        Minus infinity where any state is not finite: the reward may read other bodies only.
         """
-        states, rewards = self.imagined.imagine(many, self._actions(plan).flatten(0, 1))
+        states, rewards = self.imagined.imagine(starts, self._actions(plan).flatten(0, 1))
         finite = states.isfinite().flatten(1).all(1)
         total = torch.where(finite, rewards.sum((-2, -1)), -torch.inf).reshape(plan.shape[:2])
         return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
 
-    def _first(self, entries: TensorDictBase) -> Tensor:
-        """The best of random sequences ``[B, K, H, A]``; doing nothing is among them, and first if none is finite."""
+    def _initial_plan(self, entries: TensorDictBase) -> Tensor:
+        """The best random sequences ``[B, K, H, A]``, zero actions among them, which come first if none is finite."""
         rows = len(entries)
         drawn = self._splines(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
-        # A compiled model is compiled for every number of rows, in minutes: give it the one that it gets later.
+        # A compiled model recompiles, in minutes, for every number of rows: use the later one.
         size = self.candidates if getattr(self.imagined.world_model, "compile_steps", False) else self.samples
         drawn = drawn[:, : self.samples // size * size]
-        many = _repeated(entries, size)
+        starts = _repeated(entries, size)
         with torch.no_grad():
-            total = torch.cat([self._imagine(many, part) for part in drawn.split(size, dim=1)], dim=1)
+            total = torch.cat([self._imagine(starts, part) for part in drawn.split(size, dim=1)], dim=1)
         total = total.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
         best = total.argsort(dim=1, descending=True, stable=True)[:, : self.candidates]
         return drawn.gather(1, best[..., None, None].expand(-1, -1, *drawn.shape[2:]))
@@ -250,70 +228,73 @@ class GradientPlanner(RecedingHorizonPlanner):
         controls = torch.from_numpy(drawn).float().to(self.half_range.device)
         return self._scaled(controls).reshape(rows, count, self.horizon, -1)
 
-    def _renewed(self, plan: Tensor) -> Tensor:
-        """Sequences ``[B, K, H, A]``, of which the worse half starts anew close to the first, the best."""
-        renewed = self.candidates // 2
-        if not renewed:
+    def _resample(self, plan: Tensor) -> Tensor:
+        """Replace the worse half of the candidates ``[B, K, H, A]`` by perturbations of the first, the best."""
+        count = self.candidates // 2
+        if not count:
             return plan
-        noise = self.noise * self._splines(len(plan), renewed)
-        return torch.cat([plan[:, : self.candidates - renewed], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
+        noise = self.noise * self._splines(len(plan), count)
+        return torch.cat([plan[:, : self.candidates - count], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
 
     def _improve(
-        self, entries: TensorDictBase, plan: Tensor, iterations: int, otherwise: str, size: Tensor
+        self, entries: TensorDictBase, plan: Tensor, step_size: Tensor, *, resumed: bool
     ) -> tuple[Tensor, Tensor]:
-        """Sequences ``[B, K, H, A]`` improved, the best one first, and ``[B, 1]`` whether that is a better one.
+        """Ascend the returns of candidates ``[B, K, H, A]`` by steps of ``step_size`` ``[B, 1]`` times the optimiser's.
 
-        As given, and a warning, where none is finite. Steps are ``size`` ``[B, 1]`` times the optimiser's.
+        Returns:
+            Best sequences seen, best candidate first, unchanged with a warning where no return is finite; and
+            ``[B, 1]`` whether any beats all given ones.
         """
-        # The same tensors in every iteration: what the model folds of them is folded once.
-        many = _repeated(entries, self.candidates)
-        best, record = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
-        began = record
-        # What the optimiser sees: a step of it is one of the actions times the step size.
-        size = size[..., None, None]
-        moved = torch.zeros_like(plan, requires_grad=True)
-        optimizer = self.optimizer([moved])
-        for iteration in range(iterations):
+        # The same tensors in every iteration, so that the model folds their parameters once.
+        starts = _repeated(entries, self.candidates)
+        best, best_return = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
+        initial_return = best_return
+        # The optimiser sees offsets in units of the step size.
+        scale = step_size[..., None, None]
+        offset = torch.zeros_like(plan, requires_grad=True)
+        optimizer = self.optimizer([offset])
+        for iteration in range(self.iterations if resumed else self.warm_up):
             with torch.enable_grad():
-                actions = plan + size * moved
-                total = self._imagine(many, actions)
+                actions = plan + scale * offset
+                total = self._imagine(starts, actions)
                 depends = total.requires_grad
-                gradient = torch.autograd.grad(-total.sum(), moved, allow_unused=True)[0] if depends else None
+                gradient = torch.autograd.grad(-total.sum(), offset, allow_unused=True)[0] if depends else None
                 if gradient is None:
                     raise ValueError(
-                        f"The rewards that {self.imagined} imagines do not depend on the actions. Has its model been"
-                        " trained, and is the horizon long enough for the reward to show what actions do?"
+                        f"The rewards that {self.imagined} imagines do not depend on the actions. Train the model, or"
+                        " lengthen the horizon until actions change the reward."
                     )
-            best, record = _keep_better(best, record, actions, total)
-            began = record if iteration == 0 else began
-            # A sequence whose rollout leaves all bounds has no usable gradient: it stays where it is.
-            usable = gradient.isfinite().flatten(2).all(-1)[..., None, None]
-            moved.grad = torch.where(usable, gradient, 0.0)
+            best, best_return = _keep_better(best, best_return, actions, total)
+            initial_return = best_return if iteration == 0 else initial_return
+            # A candidate whose gradient overflows stays where it is.
+            finite = gradient.isfinite().flatten(2).all(-1)[..., None, None]
+            offset.grad = torch.where(finite, gradient, 0.0)
             optimizer.step()
             with torch.no_grad():
-                moved.copy_(((plan + size * moved).clamp(-1, 1) - plan) / size)
+                offset.copy_(((plan + scale * offset).clamp(-1, 1) - plan) / scale)
         with torch.no_grad():
-            actions = plan + size * moved
-            best, record = _keep_better(best, record, actions, self._imagine(many, actions))
-        lost = int((record == -torch.inf).all(1).sum())
-        if lost:
+            actions = plan + scale * offset
+            best, best_return = _keep_better(best, best_return, actions, self._imagine(starts, actions))
+        failed = int((best_return == -torch.inf).all(1).sum())
+        if failed:
+            fallback = "their last plan is kept" if resumed else "there is no plan yet, and nothing is done"
             warnings.warn(
-                f"{self.imagined}: every imagined rollout of {lost} of {len(plan)} states has predictions or rewards"
-                f" that are not finite; {otherwise}.",
+                f"{self.imagined}: every imagined rollout of {failed} of {len(plan)} states has predictions or rewards"
+                f" that are not finite; {fallback}.",
                 RuntimeWarning,
                 stacklevel=2,
             )
-        order = record.argsort(dim=1, descending=True, stable=True)
-        better = record.amax(1, keepdim=True) > began.amax(1, keepdim=True)
-        return best.gather(1, order[..., None, None].expand_as(best)).clamp(-1, 1), better
+        order = best_return.argsort(dim=1, descending=True, stable=True)
+        improved = best_return.amax(1, keepdim=True) > initial_return.amax(1, keepdim=True)
+        return best.gather(1, order[..., None, None].expand_as(best)).clamp(-1, 1), improved
 
 
 def _repeated(entries: TensorDictBase, count: int) -> TensorDictBase:
     return entries if count == 1 else entries.repeat_interleave(count, dim=0)
 
 
-def _keep_better(best: Tensor, record: Tensor, actions: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
-    """The better of sequences seen before and now, each by its return; one that is not finite is never better."""
+def _keep_better(best: Tensor, best_return: Tensor, actions: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """Update the best candidates and their returns; returns that are not finite never win."""
     total = total.detach()
-    better = total.isfinite() & (total > record)
-    return torch.where(better[..., None, None], actions.detach(), best), torch.where(better, total, record)
+    better = total.isfinite() & (total > best_return)
+    return torch.where(better[..., None, None], actions.detach(), best), torch.where(better, total, best_return)

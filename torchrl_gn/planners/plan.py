@@ -1,4 +1,4 @@
-"""A planner's plan as an entry of the TensorDict, so that planners keep nothing themselves."""
+"""A planner's plan as an entry of the TensorDict, which keeps planners stateless."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from torchrl.modules.planners.common import MPCPlannerBase
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
 
-# An entry that an environment does not know stays as it is from step to step, and so does a primer's, which also sets
-# it back when an episode begins.
+# Environments carry entries unknown to them from step to step; a primer also resets its own when an episode begins.
 KEY = "plan"
 
 
@@ -28,41 +27,34 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
     @abstractmethod
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
-        """The action ``[*B, A]`` to take now, and what is to be written beside it."""
+        """The next action ``[*B, A]`` and the other entries to write."""
 
     def planning(self, td: TensorDictBase) -> Tensor:
-        """The action ``[*B, A]`` to take now."""
+        """The next action ``[*B, A]``."""
         return self.decide(td)[0]
 
     def forward(
         self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None, **kwargs: Any
     ) -> TensorDictBase:
-        """Plan, and write the action and what is left of the plan.
-
-        Raises:
-            ValueError: if there are other arguments.
-        """
+        """Write the action and the remaining plan; other arguments raise ValueError."""
         if kwargs:
             raise ValueError(f"{type(self).__name__} takes no {', '.join(kwargs)}.")
-        action, beside = self.decide(tensordict)
+        action, entries = self.decide(tensordict)
         written = self._write_to_tensordict(tensordict, [self.action_spec.project(action)], tensordict_out)
-        for key, value in beside.items():
+        for key, value in entries.items():
             written.set(key, value)
         return written
 
 
-def check_plannable(env: ModelEnv | SceneEnv, **counts: int) -> None:
-    """Refuse what no planner can plan with.
+def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int) -> None:
+    """Raise ValueError unless ``env`` has a reward and bounded actions, ``counts`` are at least 1, ``warm_up`` 0.
 
-    Args:
-        env: the environment to plan in; it needs a reward and actions with bounds. Equal ones fix an action.
-        **counts: what must be at least 1, by name.
-
-    Raises:
-        ValueError: naming what is wrong.
+    Equal bounds fix an action.
     """
     for name, value in counts.items():
         check_count(name, value, 1)
+    if warm_up is not None:
+        check_count("warm_up", warm_up, 0)
     scene = env.scene
     if env.reward is None:
         raise ValueError(f"{env} has no reward to plan for; give it one, as make_reward(task, scene).")
@@ -79,16 +71,7 @@ def check_plannable(env: ModelEnv | SceneEnv, **counts: int) -> None:
 
 
 def check_count(name: str, value: int, least: int) -> None:
-    """Refuse what is no count, before a plan trips over it.
-
-    Args:
-        name: of the argument, for the message.
-        value: what was given.
-        least: the lowest that will do.
-
-    Raises:
-        ValueError: it is no whole number, or below the least.
-    """
+    """Raise ValueError unless an option is a whole number of at least ``least``."""
     if not isinstance(value, Integral):
         raise ValueError(f"{name} must be a whole number, got {value!r}")
     if value < least:
@@ -96,18 +79,13 @@ def check_count(name: str, value: int, least: int) -> None:
 
 
 def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """The sequence of actions to go on from, and whether there is one.
-
-    Args:
-        tensordict: ``[*B]``.
-        shape: of a sample's sequences, ``(..., H, A)``.
-        dtype: of the actions.
+    """Planned actions of a TensorDict ``[*B]``, for sequences of ``shape`` ``(..., H, A)``.
 
     Returns:
-        Actions ``[*B, *shape]``, zeros where there are none, and ``[*B, 1]`` bool, whether they were planned.
+        Actions ``[*B, *shape]``, zeros without a plan, and ``[*B, 1]`` bool, whether they were planned.
 
     Raises:
-        ValueError: if they have another shape: the plan of another planner or horizon.
+        ValueError: if the plan has another shape, that of another planner or horizon.
     """
     batch = tensordict.shape
     plan = cast("TensorDictBase | None", tensordict.get(KEY, None))
@@ -118,22 +96,16 @@ def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.d
     if actions.shape != (*batch, *shape):
         raise ValueError(
             f"The TensorDict's plan is {list(actions.shape)}, this planner's is {[*batch, *shape]}: it comes from"
-            " another planner. Drop the entry 'plan', or give every planner its own episodes."
+            " another planner. Delete the entry 'plan', or give every planner its own episodes."
         )
     return actions.to(dtype), planned
 
 
-def plan_left(batch: torch.Size, actions: Tensor, **more: Tensor) -> TensorDict:
-    """The entry ``plan`` when the first action was taken, with the last one repeated.
-
-    Args:
-        batch: ``[*B]``.
-        actions: ``[*B, ..., H, A]``.
-        **more: what else the planner wants to find there at the next step, ``[*B, ...]``.
-    """
-    left = torch.cat([actions[..., 1:, :], actions[..., -1:, :]], dim=-2)
+def shift_plan(batch: torch.Size, actions: Tensor, **more: Tensor) -> TensorDict:
+    """Entry ``plan``: actions ``[*B, ..., H, A]`` shifted by a step, the last repeated, and ``more`` ``[*B, ...]``."""
+    shifted = torch.cat([actions[..., 1:, :], actions[..., -1:, :]], dim=-2)
     planned = torch.ones(*batch, 1, dtype=torch.bool, device=actions.device)
-    return TensorDict({"actions": left, "planned": planned, **more}, batch_size=batch)
+    return TensorDict({"actions": shifted, "planned": planned, **more}, batch_size=batch)
 
 
 def plan_primer(
@@ -143,13 +115,13 @@ def plan_primer(
     hidden_state: TensorDictBase | None = None,
     **more: tuple[int, ...],
 ) -> TensorDictPrimer:
-    """Transform that clears the plan when an episode begins; append it to the environment that is acted in.
+    """Transform that resets the plan when an episode begins; append it to the real environment.
 
     Args:
         shape: of a sample's sequences, ``(..., H, A)``.
         dtype: of the actions.
         device: of the environment.
-        hidden_state: what a recurrent model remembers of nothing, zeros, to clear too.
+        hidden_state: a recurrent model's initial hidden state, zeros, to reset too.
         **more: shapes of a sample's other entries of the plan.
     """
     entries = {key: Unbounded(shape=torch.Size(of), dtype=dtype, device=device) for key, of in more.items()}

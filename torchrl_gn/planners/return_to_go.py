@@ -1,4 +1,4 @@
-"""What TorchRL's MPPI weighs its candidates by."""
+"""Score of candidates for TorchRL's MPPI."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-_LEAST_SPREAD = 1e-12  # where all candidates are alike
-_FAR = 20.0  # times as far below the best as the upper quartile is: unstable, say
+_MIN_STD = 1e-12  # for equal candidates
+_OUTLIER = 20.0  # times as far below the best as the upper quartile: unstable rollouts, for example
 
 
 class ReturnToGo(TensorDictModuleBase):
-    r"""Score candidates by what they bring from each step on, for :class:`torchrl.modules.MPPIPlanner`.
+    r"""Score candidates by their normalised return-to-go, for :class:`torchrl.modules.MPPIPlanner`.
 
     .. math:: a_{kt} = \frac{R_{kt} - \max_j R_{jt}}{\mathrm{std}_j\, R_{jt}} \qquad R_{kt} = \sum_{s \ge t} r_{ks}
 
-    MPPI weighs candidates by the exponential of this times its temperature. Divided by their spread the same
-    temperature does for rewards of any size; less the best, nothing overflows. Candidates that are far off (unstable
-    ones) have no part in the spread, beside which all others would be alike.
+    The standard deviation makes one temperature fit rewards of any size, and leaves out outliers (unstable rollouts);
+    the maximum prevents overflow.
 
     Reads ``("next", "reward")`` ``[*B, K, H, 1]`` of ``K`` candidates; writes ``advantage`` of the same shape, 0 for
-    the best and below for the others. Differentiable, nothing is detached.
+    the best. Differentiable, except for the choice of outliers.
 
     Example:
         >>> from torchrl.modules import MPPIPlanner
@@ -48,10 +47,10 @@ class ReturnToGo(TensorDictModuleBase):
         reward = cast(Tensor, tensordict.get(("next", "reward")))
         returns = reward.flip(-2).cumsum(-2).flip(-2)
         best = returns.amax(-3, keepdim=True)
-        reach = best - returns.detach().quantile(0.75, dim=-3, keepdim=True)
-        near = best - returns <= _FAR * reach
-        count = near.sum(-3, keepdim=True)
-        mean = torch.where(near, returns, 0.0).sum(-3, keepdim=True) / count
-        squares = torch.where(near, returns - mean, 0.0).square().sum(-3, keepdim=True)
-        spread = (squares / (count - 1).clamp(min=1)).clamp(min=_LEAST_SPREAD**2).sqrt()
-        return tensordict.set("advantage", (returns - best) / spread)
+        quartile = best - returns.detach().quantile(0.75, dim=-3, keepdim=True)
+        inlier = best - returns <= _OUTLIER * quartile
+        count = inlier.sum(-3, keepdim=True)
+        mean = torch.where(inlier, returns, 0.0).sum(-3, keepdim=True) / count
+        squares = torch.where(inlier, returns - mean, 0.0).square().sum(-3, keepdim=True)
+        std = (squares / (count - 1).clamp(min=1)).clamp(min=_MIN_STD**2).sqrt()
+        return tensordict.set("advantage", (returns - best) / std)

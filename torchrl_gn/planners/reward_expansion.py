@@ -1,4 +1,4 @@
-"""Value, gradient and curvature of a reward along a trajectory."""
+"""Value, gradient and Gauss-Newton Hessian of a reward along a trajectory."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]  # state [*B, N, 13], action 
 
 
 class RewardExpansion:
-    """A reward of tensors as a function of arrays, with derivatives.
+    """A tensor reward as a function of arrays, with derivatives.
 
-    Autograd is opened inside, also under ``torch.no_grad`` and ``torch.inference_mode``; nothing flows
-    out of it.
+    Opens autograd itself, also under ``torch.no_grad`` and ``torch.inference_mode``; results are detached.
 
     Args:
-        reward: function ``(state, action, next_state, task) -> [*B, 1]``, each row by itself.
-        task: what the reward gets as task, without batch: a tensor, a TensorDict or None.
+        reward: function ``(state, action, next_state, task) -> [*B, 1]``, independent for each row.
+        task: the reward's task, without batch: a tensor, a TensorDict or None.
         device: where the reward computes.
     """
 
@@ -28,7 +27,7 @@ class RewardExpansion:
         self.reward = reward
         self.device = device
         with torch.inference_mode(False):
-            # A clone, since autograd cannot record what inference mode made.
+            # Autograd refuses tensors made in inference mode: clone it.
             self.task = None if task is None else task.detach().clone()
 
     def value(self, inputs: Inputs) -> np.ndarray:
@@ -37,18 +36,14 @@ class RewardExpansion:
             return self._call(self._tensors(inputs)).cpu().numpy()
 
     def derivatives(self, inputs: Inputs, jacobians: Inputs) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient and Gauss-Newton curvature by variables that the inputs depend on.
+        """Gradient ``[T, Z]`` and Gauss-Newton Hessian ``[T, Z, Z]`` by ``Z`` variables of the inputs.
 
         Args:
-            inputs: for ``T`` steps.
-            jacobians: of each input, flattened, by ``Z`` variables: ``[T, N * 13, Z]``, ``[T, A, Z]``,
-                ``[T, N * 13, Z]``.
-
-        Returns:
-            Gradient ``[T, Z]`` and curvature ``[T, Z, Z]``: that of the reward, of its inputs none.
+            inputs: of ``T`` steps.
+            jacobians: of each flattened input: ``[T, N * 13, Z]``, ``[T, A, Z]``, ``[T, N * 13, Z]``.
 
         Raises:
-            ValueError: the reward does not depend on its inputs differentiably.
+            ValueError: if autograd cannot differentiate the reward, or its shape is wrong.
         """
         num = jacobians[0].shape[-1]
         with torch.inference_mode(False), torch.enable_grad():
@@ -56,19 +51,19 @@ class RewardExpansion:
             gradients, _ = self._gradients(self._tensors(inputs))
             terms = [_transposed(j, g.flatten(1)) for j, g in zip(columns, gradients, strict=True)]
             gradient = (terms[0] + terms[1] + terms[2]).detach().cpu().numpy()
-            curvature = torch.zeros(len(inputs[1]), num, num, dtype=torch.float64)
+            hessian = torch.zeros(len(inputs[1]), num, num, dtype=torch.float64)
             if any(g.requires_grad for g in gradients):
-                # One copy of the trajectory a variable: rows do not mix, so one backward pass gives H J.
+                # One copy of the trajectory per variable: rows are independent, so one backward pass gives H J.
                 state, action, next_state = (np.broadcast_to(x, (num, *x.shape)) for x in inputs)
                 gradients, leaves = self._gradients(self._tensors((state, action, next_state)))
-                along = [j.permute(2, 0, 1).reshape(x.shape) for j, x in zip(columns, leaves, strict=True)]
-                pairs = [(g, v) for g, v in zip(gradients, along, strict=True) if g.requires_grad]
+                tangents = [j.permute(2, 0, 1).reshape(x.shape) for j, x in zip(columns, leaves, strict=True)]
+                pairs = [(g, v) for g, v in zip(gradients, tangents, strict=True) if g.requires_grad]
                 products = torch.autograd.grad(
                     [g for g, _ in pairs], leaves, [v for _, v in pairs], allow_unused=True, materialize_grads=True
                 )
                 for j, p in zip(columns, products, strict=True):
-                    curvature += torch.einsum("tiz,yti->tzy", j, p.flatten(2)).detach().cpu()
-        return gradient, curvature.numpy()
+                    hessian += torch.einsum("tiz,yti->tzy", j, p.flatten(2)).detach().cpu()
+        return gradient, hessian.numpy()
 
     def _gradients(self, leaves: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         leaves = tuple(leaf.requires_grad_() for leaf in leaves)
