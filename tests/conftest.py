@@ -15,57 +15,16 @@ from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.maths import quaternion
 from torchrl_gn.networks import Graph, GraphSize
 from torchrl_gn.policies import ObservationModel
-from torchrl_gn.scenes import ObservationGraph, ParameterNames, Scene, load_scene
+from torchrl_gn.scenes import ObservationGraph, ParameterNames, Scene
 
-# Every joint type, two joints between the same two nodes, a tilted slider, a joint without motor.
-ZOO = """
-<mujoco model="zoo">
-  <option timestep="0.01"/>
-  <worldbody>
-    <body name="floater" pos="0 0 2">
-      <freejoint name="free"/>
-      <geom size=".2"/>
-      <body name="arm" pos=".3 0 0">
-        <joint name="ball" type="ball"/>
-        <geom size=".1"/>
-      </body>
-    </body>
-    <body name="cart" pos="1 0 1" euler="20 30 40">
-      <joint name="slide" type="slide" axis="1 0 0"/>
-      <geom size=".1"/>
-      <body name="wheel" pos="0 0 .3">
-        <joint name="lift" type="slide" axis="0 0 1"/>
-        <joint name="spin" axis="0 1 0"/>
-        <geom size=".1"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor name="push" joint="slide" ctrlrange="-1 1" ctrllimited="true"/>
-    <motor name="turn" joint="spin" ctrlrange="-1 1" ctrllimited="true"/>
-  </actuator>
-</mujoco>
-"""
-
-FALLING = """
-<mujoco model="falling">
-  <worldbody>
-    <body><freejoint/><geom size=".1"/></body>
-  </worldbody>
-</mujoco>
-"""
-
-_SOURCES = {"zoo": ZOO, "falling": FALLING}
-
-
-def _load(name: str) -> Scene:
-    return load_scene(_SOURCES.get(name, name))
+from .. import zoo
+from ..sizes import SMALL
 
 
 @pytest.fixture(scope="session")
 def scenes() -> dict[str, Scene]:
     """Scenes by name; ``falling`` has no action."""
-    return {name: _load(name) for name in ("pendulum", "swimmer6", "cheetah", "zoo", "falling")}
+    return {name: zoo.load(name) for name in ("pendulum", "swimmer6", "cheetah", "joints", "falling")}
 
 
 def _random_states(scene: Scene, *batch: int, seed: int = 0, scale: float = 1.0) -> Tensor:
@@ -117,8 +76,7 @@ def make_model(fit) -> Callable[..., ForwardModel]:
 
     def make(scene: Scene, *, fitted: bool = True, seed: int = 0, **options) -> ForwardModel:
         torch.manual_seed(seed)
-        small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-        model = ForwardModel(ParameterNames.of(scene), **(small | options))
+        model = ForwardModel(ParameterNames.of(scene), **(SMALL | options))
         return fit(model, scene) if fitted else model
 
     return make
@@ -214,3 +172,18 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_runtest_setup() -> None:
     """Recipes set the number of threads by their options, TorchRL's SerialEnv raises it when it is closed."""
     torch.set_num_threads(THREADS)
+
+
+@pytest.fixture
+def folds(monkeypatch) -> list:
+    """Every core that is folded during the test, as a specialised model does when weights or values have changed."""
+    from torchrl_gn.networks import GNCore
+
+    folded, fold = [], GNCore.fold
+
+    def watched(core, *args, **options):
+        folded.append(core)
+        return fold(core, *args, **options)
+
+    monkeypatch.setattr(GNCore, "fold", watched)
+    return folded

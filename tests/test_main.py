@@ -16,6 +16,8 @@ from torchrl_gn.__main__ import main
 from torchrl_gn.pretrained import load_pretrained, pretrained_names
 from torchrl_gn.scenes import SYSTEMS, load_scene
 
+from . import zoo
+
 
 @pytest.fixture(scope="module")
 def listed() -> str:
@@ -57,10 +59,8 @@ def test_show_prints_the_scene(capsys):
 
 
 def test_show_draws_a_file_of_ones_own(tmp_path, capsys):
-    arm = '<joint axis="0 1 0" name="hinge"/><geom type="capsule" fromto="0 0 0 0 0 -1" size=".05"/>'
-    motor = '<motor joint="hinge" ctrlrange="-1 1"/>'
     file, image = tmp_path / "arm.xml", tmp_path / "new" / "arm.png"
-    file.write_text(f"<mujoco><worldbody><body>{arm}</body></worldbody><actuator>{motor}</actuator></mujoco>")
+    file.write_text(zoo.mjcf("pole"))
     assert main(["show", str(file), "--image", str(image)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == str(image)
     with Image.open(image) as picture:

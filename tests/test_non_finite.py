@@ -31,7 +31,8 @@ from torchrl_gn.scenes import ParameterNames, load_scene
 from torchrl_gn.training import Budget, Trainer, load_checkpoint, make_optimizer, save_checkpoint
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 
-ARM = '<mujoco><worldbody><body><joint axis="0 1 0" damping="{}"/><geom size=".1"/></body></worldbody></mujoco>'
+from . import zoo
+from .sizes import SMALL
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +45,7 @@ def given(scene, tmp_path, monkeypatch) -> SimpleNamespace:
     """Good numbers to spoil one of: trajectories, a batch, physics states, physical parameters, models."""
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
-    small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    model = ForwardModel(ParameterNames.of(scene), **small)
+    model = ForwardModel(ParameterNames.of(scene), **SMALL)
     trajectories = collect_trajectories(scene, 4, 6, seed=0)
     batch = trajectory_buffer(trajectories, batch_size=5, seed=0).sample().exclude("index")
     loss = ForwardModelLoss(model.bind(scene))
@@ -105,7 +105,11 @@ AT_2 = rf" has {NUMBER} at index \(2, "
 
 ENTRIES = [
     # Scenes
-    Entry("MJCF", lambda g, bad: load_scene(ARM.format(bad)), rf"dof_damping of joint .* is {NUMBER}|Nan, Inf"),
+    Entry(
+        "MJCF",
+        lambda g, bad: zoo.load("pole", ('damping=".1"', f'damping="{bad}"')),
+        rf"dof_damping of joint .* is {NUMBER}|Nan, Inf",
+    ),
     Entry("timestep", lambda g, bad: load_scene("pendulum", timestep=bad), rf"timestep={NUMBER}"),
     # Data
     Entry(

@@ -13,6 +13,8 @@ import pytest
 
 import torchrl_gn
 
+from . import zoo
+
 PACKAGE = Path(torchrl_gn.__file__).parent
 
 # A folder imports from itself and from those before it: the data flow is the reading order.
@@ -149,9 +151,8 @@ with pytest.raises(ImportError, match=r'pip install "torchrl_gn\\[suite\\]"'):
 
 @pytest.mark.slow
 def test_core_works_without_the_extras(tmp_path):
-    mjcf = """<mujoco><worldbody><body name="pole"><joint name="hinge" axis="0 1 0"/><geom size=".1"/></body>
-    </worldbody><actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
-    code = WITHOUT_EXTRAS.replace("MJCF", repr(mjcf)).replace("FILE", repr(str(tmp_path / "model.safetensors")))
+    mjcf, file = zoo.mjcf("pole"), str(tmp_path / "model.safetensors")
+    code = WITHOUT_EXTRAS.replace("MJCF", repr(mjcf)).replace("FILE", repr(file))
     done = run(code.replace("FOLDERS", ", ".join(f"torchrl_gn.{folder}" for folder in ALLOWED)))
     assert done.returncode == 0, done.stderr
 

@@ -29,6 +29,7 @@ from torchrl_gn.data import (
 from torchrl_gn.data.dataset_files import DatasetFiles
 from torchrl_gn.scenes import Scene, load_scene
 
+from .. import zoo
 from .conftest import repelled_hinge
 
 SIZES = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
@@ -323,12 +324,11 @@ def test_another_is_not_overwritten(tmp_path: Path, pendulum: Scene) -> None:
 
 def test_data_of_an_edited_model_are_refused(tmp_path: Path) -> None:
     """Unless what was edited moves nothing."""
-    model = """<mujoco><worldbody><geom type="plane" size="1 1 1" friction="0.5"/>
-      <body pos="0 0 1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    model = zoo.mjcf("plane")
     (tmp_path / "ball.xml").write_text(model)
     create_dataset(tmp_path / "d", load_scene(tmp_path / "ball.xml"), **SIZES)
     assert load_dataset(tmp_path / "d", load_scene(model)).train.shape == (10,)
-    (tmp_path / "ball.xml").write_text(model.replace("0.5", "1.5"))
+    (tmp_path / "ball.xml").write_text(zoo.mjcf("plane", ("0.5", "1.5")))
     edited = load_scene(tmp_path / "ball.xml")
     for attempt, message in (
         (lambda: create_dataset(tmp_path / "d", edited, **SIZES), r"another data set is there \(fingerprint is"),
@@ -336,7 +336,7 @@ def test_data_of_an_edited_model_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(DatasetError, match=message):
             attempt()
-    painted = load_scene(model.replace('size=".1"', 'size=".1" rgba="1 0 0 1"'), name="ball")
+    painted = zoo.load("plane", ('size=".1"', 'size=".1" rgba="1 0 0 1"'), name="ball")
     assert len(create_dataset(tmp_path / "d", painted, **SIZES).train) == 10
 
 

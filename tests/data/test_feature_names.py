@@ -16,9 +16,9 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.pretrained import load_pretrained
 from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants, static_features
 
-SIZES = {"train": 10, "validation": 2, "test": 3, "steps": 6, "variants": 10}
-SMALL = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+from ..sizes import SMALL
 
+SIZES = {"train": 10, "validation": 2, "test": 3, "steps": 6, "variants": 10}
 pytestmark = pytest.mark.filterwarnings("error::torchrl_gn.scenes.SceneChangedWarning")
 
 

@@ -10,17 +10,9 @@ import torch
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.scenes import Scene, load_scene
 
-PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
+from .. import zoo
 
-EXPLODING = """
-<mujoco model="exploding">
-  <option timestep="0.5"/>
-  <worldbody><body>
-    <joint name="a" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 0 0 1" mass="1e-3"/>
-  </body></worldbody>
-  <actuator><motor joint="a" gear="1e12" ctrllimited="true" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
+PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 def _inputs(scene: Scene, num: int, steps: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -104,10 +96,7 @@ def test_a_step_equals_that_of_a_rollout(memory: int | None) -> None:
 
 
 def test_scenes_of_different_mass() -> None:
-    xml = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/>
-      <geom type="capsule" size=".05" fromto="0 0 0 0 0 1" mass="{}"/></body></worldbody>
-      <actuator><motor joint="a" ctrllimited="true" ctrlrange="-1 1"/></actuator></mujoco>"""
-    scenes = [load_scene(xml.format(mass)) for mass in (1.0, 3.0)]
+    scenes = [zoo.load("pole", ('mass="1"', f'mass="{mass}"')) for mass in (1.0, 3.0)]
     physics, actions = _inputs(scenes[0], 4, 10)
     alone = [Simulator(scene, 1).rollout(physics, actions) for scene in scenes]
     assert not torch.equal(alone[0]["state"], alone[1]["state"])
@@ -134,14 +123,12 @@ def test_actions_outside_the_bounds_are_clamped(pendulum: Scene) -> None:
 
 
 def test_scene_without_actuators() -> None:
-    scene = load_scene(
-        """<mujoco><worldbody><body><freejoint/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
-    )
+    scene = zoo.load("falling")
     physics, _ = _inputs(scene, 2, 1)
     result = Simulator(scene, 1).rollout(physics, np.zeros((2, 10, 0)))
     fallen = result["state"][:, -1, 1, 2] - result["state"][:, 0, 1, 2]
     # Semi-implicit Euler: sum of k g dt^2 over 10 steps.
-    np.testing.assert_allclose(fallen, -55 * 9.81 * 0.002**2, rtol=1e-9)
+    np.testing.assert_allclose(fallen, -55 * 9.81 * 0.01**2, rtol=1e-9)
 
 
 def test_bad_input_is_refused_and_named(swimmer: Scene) -> None:
@@ -171,7 +158,7 @@ def test_unstable_simulations_are_told(threads: int, tmp_path, monkeypatch, capf
     request.addfinalizer(lambda: mujoco.set_mju_user_warning(before))
     mujoco.set_mju_user_warning(None)
     monkeypatch.chdir(tmp_path)
-    scene = load_scene(EXPLODING)
+    scene = zoo.load("cart", ('gear="1"', 'gear="1e12"'))
     simulator = Simulator(scene, threads)
     physics = np.tile(_inputs(scene, 1, 1)[0], (4, 1))
     actions = np.zeros((4, 6, 1))

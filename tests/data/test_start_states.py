@@ -10,23 +10,11 @@ import pytest
 from scipy import stats
 
 from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states
-from torchrl_gn.data.start_states import _draw, draw_start_states
+from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes import SYSTEMS, Scene, load_scene
 
+from .. import zoo
 from .conftest import repelled_hinge
-
-JOINTS = """
-<mujoco>
-  <worldbody>
-    <body name="b" pos="1 2 3"><joint name="ball" type="ball"/><geom size=".1"/>
-      <body name="l"><joint name="limited" type="ball" range="0 40" limited="true"/><geom size=".1"/></body>
-    </body>
-    <body name="f" pos="0 0 7"><freejoint/><geom size=".1"/>
-      <body name="s"><joint name="slide" type="slide" range="-2 .5" limited="true"/><geom size=".1"/></body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 
 
 def _qpos_qvel(scene: Scene, n: int = 2000) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +56,7 @@ def test_limited_and_rotational_joints(name: str) -> None:
 
 
 def test_rotations_are_uniform() -> None:
-    qpos, _ = _qpos_qvel(load_scene(JOINTS), 4000)
+    qpos, _ = _qpos_qvel(zoo.load("limited_joints"), 4000)
     ball, limited, place, free, slide = np.split(qpos, [4, 8, 11, 15], axis=1)
     np.testing.assert_array_equal(place, np.tile([0.0, 0.0, 7.0], (4000, 1)))
     for quat in (ball, limited, free):
@@ -82,7 +70,7 @@ def test_rotations_are_uniform() -> None:
 
 def test_cheetah_settles() -> None:
     scene = load_scene("cheetah")
-    drawn = _draw(scene, 3, np.random.default_rng(5))
+    drawn = sample_start_states(dataclasses.replace(scene, settle_steps=0), 3, 5)
     states = sample_start_states(scene, 3, 5)
     data, expected = mujoco.MjData(scene.model), np.empty(scene.physics_size)
     for i in range(3):

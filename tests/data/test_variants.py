@@ -22,6 +22,8 @@ from torchrl_gn.data import (
 )
 from torchrl_gn.scenes import PhysicalParameters, Scene, load_scene, make_variants, parameter_ranges, sample_variants
 
+from .. import zoo
+
 SYSTEMS = ["pendulum", "cartpole", "swimmer3", "swimmer6", "cheetah", "jaco"]
 SIZES = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
 SPLITS = ("train", "validation", "test")
@@ -156,10 +158,9 @@ def test_damaged_and_other_data_are_refused(tmp_path: Path) -> None:
 
 
 def test_scenes_without_variants_are_refused(tmp_path: Path, swimmer: Scene) -> None:
-    text = '<mujoco model="swimmer6"><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>'
     for scene, message in (
         (load_scene("acrobot"), "'acrobot' has no parameters to vary"),
-        (load_scene(text), "'swimmer6' is an MJCF model"),
+        (zoo.load("pole", name="swimmer6"), "'swimmer6' is an MJCF model"),
         (load_scene("pendulum", parameters={"mass": 2}), "'pendulum' is a variant already"),
     ):
         with pytest.raises(ValueError, match=message):

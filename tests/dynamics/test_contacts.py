@@ -11,6 +11,8 @@ from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.contact_points import SLOTS, contact_slots
 
+from .. import zoo
+
 
 def features(scene, state):
     offset, radius, mask = (torch.as_tensor(value) for value in contact_slots(scene))
@@ -42,11 +44,7 @@ def test_points_are_where_the_physics_has_them(name):
 
 
 def test_a_tilted_plane_turns_with_the_world(random_states):
-    scene = load_scene("""
-      <mujoco><worldbody><geom type="plane" size="9 9 1" pos="1 0 .2" euler="0 20 0"/>
-        <body pos="0 0 2"><freejoint/><geom type="capsule" size=".05 .3" pos=".1 0 .2"/></body>
-      </worldbody></mujoco>
-    """)
+    scene = zoo.load("plane", ('size="9 9 1"', 'size="9 9 1" pos="1 0 .2" euler="0 20 0"'))
     state = random_states(scene, 4)
     seen, mask = features(scene, state)
     turn = quaternion.normalize(torch.tensor([1.0, 0.3, -0.5, 0.2], dtype=torch.float64)).expand(4, 4)
@@ -61,11 +59,7 @@ def scene_turn(state, turn):
 
 
 def test_of_many_points_the_farthest_are_shown():
-    scene = load_scene("""
-      <mujoco><worldbody><geom type="plane" size="9 9 1"/>
-        <body pos="0 0 2"><freejoint/><geom size=".1"/><geom type="box" size=".1 .2 .3" pos=".1 0 0"/></body>
-      </worldbody></mujoco>
-    """)
+    scene = zoo.load("plane")
     assert len(scene.contact_points.node) == 9
     offset, _, mask = contact_slots(scene)
     assert mask[1].all() and (offset[1, :, 0] == 0.2).all()

@@ -19,7 +19,7 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import ParameterNames, load_scene
 from torchrl_gn.scenes.systems import find_system
 
-ALL = ("pendulum", "swimmer6", "cheetah", "zoo", "falling")
+ALL = ("pendulum", "swimmer6", "cheetah", "joints", "falling")
 
 
 def thick_swimmer():
@@ -129,7 +129,7 @@ def test_scenes_share_the_weights(scenes, make_model, random_states, random_acti
     model = make_model(scenes["swimmer6"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnseenFeatureWarning)
-        bound = [model.bind(scenes[name]) for name in ("swimmer6", "cheetah", "zoo")]
+        bound = [model.bind(scenes[name]) for name in ("swimmer6", "cheetah", "joints")]
     for one in bound[1:]:
         assert one.model is model
         assert all(a is b for a, b in zip(one.parameters(), bound[0].parameters(), strict=True))

@@ -8,18 +8,7 @@ import torch
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
 
-# An arm that turns about the vertical.
-ARM = """
-<mujoco model="arm">
-  <worldbody>
-    <body pos=".1 .2 1" euler="180 0 0">
-      <joint axis="0 0 1"/><geom type="capsule" size=".05 .2" pos=".1 0 0"/>
-      <body pos=".3 0 0"><joint name="elbow" axis="0 1 0"/><geom size=".1" pos=".2 .1 0"/></body>
-    </body>
-  </worldbody>
-  <actuator><motor joint="elbow" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
+from .. import zoo
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -77,7 +66,7 @@ def test_positions_along_invariant_axes_can_be_hidden(scenes, make_model, random
 @pytest.mark.parametrize("name", ["swimmer6", "arm"])
 def test_predictions_turn_with_the_scene(scenes, make_model, random_states, random_actions, name, dtype):
     """Turned by any angle about the axis of its yaw_frame, a scene changes in the same way, turned."""
-    scene = load_scene(ARM) if name == "arm" else scenes[name]
+    scene = zoo.load("arm") if name == "arm" else scenes[name]
     yaw_frame = scene.yaw_frame
     assert yaw_frame is not None
     bound = make_model(scene).to(dtype).bind(scene)
@@ -101,7 +90,7 @@ def test_predictions_turn_with_the_scene(scenes, make_model, random_states, rand
 
 
 def test_where_the_world_can_be_touched_it_shows_the_heading(make_model, random_states):
-    scene = load_scene(ARM.replace("<worldbody>", '<worldbody><geom type="plane" size="1 1 1"/>'))
+    scene = zoo.load("arm", ("<worldbody>", '<worldbody><geom type="plane" size="1 1 1"/>'))
     bound = make_model(scene).bind(scene)
     assert scene.yaw_frame is not None and not scene.yaw_frame.exact
     state = random_states(scene, 5)
@@ -110,7 +99,7 @@ def test_where_the_world_can_be_touched_it_shows_the_heading(make_model, random_
     turn = bound.frame.yaw_rotation(state, bound.values).rotation
     assert turn is not None
     torch.testing.assert_close(seen[:, 0, 3:7], quaternion.product(quaternion.conjugate(turn), state[:, 0, 3:7]))
-    unmoved = make_model(load_scene(ARM)).bind(load_scene(ARM))
+    unmoved = make_model(zoo.load("arm")).bind(zoo.load("arm"))
     free = unmoved.frame.see(state, unmoved.values).state
     assert torch.equal(free[:, 0], state[:, 0])
     assert torch.equal(free[:, 1:], seen[:, 1:])

@@ -13,26 +13,10 @@ from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.joint_axes import joint_axes
 
+from .. import zoo
+
 SYSTEMS = ["cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", "jaco"]
-# A free body with a universal joint, a ball, three hinges in one place, and an arm of hinges on it and on the world.
-CREATURE = """
-  <mujoco><option gravity="0 0 -1"/><worldbody>
-    <body pos="0 0 2" name="free"><freejoint/><geom size=".1"/>
-      <body pos=".2 0 0"><joint axis="0 1 0"/><joint axis="0 0 1"/><geom size=".05" pos=".1 .1 0"/>
-        <body pos=".2 0 .1"><joint type="ball"/><geom type="box" size=".05 .1 .02" pos=".1 0 0"/>
-          <body pos=".2 0 0"><joint axis="1 0 0"/><joint axis="0 1 0"/><joint axis="0 0 1"/>
-            <geom size=".05" pos="0 .1 0"/>
-          </body>
-        </body>
-      </body>
-      <body pos="-.2 0 0"><joint axis="1 1 0"/><geom size=".05" pos=".1 .1 0"/></body>
-    </body>
-    <body pos="3 0 1" euler="20 30 40"><joint axis="0 1 0" pos="-.1 0 0"/><geom size=".1" pos=".2 0 0"/>
-      <body pos=".3 0 0" euler="0 0 30"><joint axis="1 0 1"/><geom size=".1" pos=".2 .1 0"/></body>
-    </body>
-  </worldbody></mujoco>
-"""
-LINKED = [*SYSTEMS, CREATURE]
+LINKED = [*SYSTEMS, "creature"]
 
 
 def project(bound, state, delta):
@@ -57,7 +41,7 @@ def gaps(scene, state):
 
 @pytest.mark.parametrize("name", LINKED)
 def test_true_changes_are_linked_already(make_model, name):
-    scene = load_scene(name)
+    scene = zoo.load(name)
     trajectories = collect_trajectories(scene, 2, 20)
     state, after = trajectories["state"][:, :-1], trajectories["state"][:, 1:]
     assert max(gaps(scene, state)) < 1e-12
@@ -68,7 +52,7 @@ def test_true_changes_are_linked_already(make_model, name):
 
 @pytest.mark.parametrize("name", LINKED)
 def test_pinned_bodies_stay_together(make_model, random_actions, name):
-    scene = load_scene(name)
+    scene = zoo.load(name)
     trajectories = collect_trajectories(scene, 2, 20)
     state = trajectories["state"][:, -1].clone()
     moving = torch.as_tensor(scene.movable[:, :3]).double()
@@ -80,15 +64,7 @@ def test_pinned_bodies_stay_together(make_model, random_actions, name):
 
 
 def test_parallel_hinges_at_one_place_share_their_turn_in_single_precision_too(make_model, random_states):
-    scene = load_scene("""
-      <mujoco><worldbody>
-        <body><joint axis="0 0 1"/><geom size=".1" pos=".3 0 0"/>
-          <body pos=".3 .1 0"><joint axis="1 1 0" armature=".1"/><joint axis="1 1 0" armature=".1"/>
-            <geom size=".1" pos=".2 0 .1"/>
-          </body>
-        </body>
-      </worldbody></mujoco>
-    """)
+    scene = zoo.load("parallel_hinges")
     bound = make_model(scene, fitted=False).bind(scene)
     assert isinstance(bound.projection, GeneralizedProjection)
     state = collect_trajectories(scene, 20, 5, seed=0)["state"][:, -1]
@@ -121,9 +97,9 @@ def off_axis(scene, state):
     return relative, spin - (spin * axis).sum(-1, keepdim=True) * axis
 
 
-@pytest.mark.parametrize("name", ["jaco", CREATURE])
+@pytest.mark.parametrize("name", ["jaco", "creature"])
 def test_hinges_turn_about_their_axes_alone(make_model, random_actions, name):
-    scene = load_scene(name)
+    scene = zoo.load(name)
     bound = make_model(scene).bind(scene)
     assert isinstance(bound.projection, GeneralizedProjection)
     state = collect_trajectories(scene, 2, 20)["state"][:, -1]
@@ -140,10 +116,10 @@ def test_hinges_turn_about_their_axes_alone(make_model, random_actions, name):
     assert torch.linalg.cross(step, axis.expand_as(step)).abs().max() < 1e-9
 
 
-@pytest.mark.parametrize("name", ["jaco", CREATURE])
+@pytest.mark.parametrize("name", ["jaco", "creature"])
 def test_linking_by_joints_takes_noise_away(make_model, name):
     """Less is left of a random error than by projection joint anchors alone, and least squares leaves less than it was."""
-    scene = load_scene(name)
+    scene = zoo.load(name)
     bound = make_model(scene).bind(scene)
     states = collect_trajectories(scene, 4, 20)["state"]
     delta = BODY_STATE.delta(states[:, :-1], states[:, 1:])
@@ -161,7 +137,7 @@ def test_linking_by_joints_takes_noise_away(make_model, name):
 
 @pytest.mark.parametrize("name", ["cartpole", "swimmer6", "cheetah"])
 def test_in_the_plane_both_ways_are_the_same(make_model, name):
-    scene = load_scene(name)
+    scene = zoo.load(name)
     bound = make_model(scene).bind(scene)
     assert type(bound.projection) is MaximalProjection
     state = collect_trajectories(scene, 4, 20)["state"][:, -1].clone()
@@ -205,7 +181,7 @@ def test_a_linkage_moves_as_its_bodies_mean(scenes, make_model, random_actions):
 @pytest.mark.parametrize("name", LINKED)
 def test_levers_are_the_derivative_of_places(make_model, name):
     """How turning moves the bodies of a joint_anchors, against differences."""
-    scene = load_scene(name)
+    scene = zoo.load(name)
     bound = make_model(scene).bind(scene)
     state = collect_trajectories(scene, 2, 5)["state"][:, -1]
     generator = torch.Generator().manual_seed(0)

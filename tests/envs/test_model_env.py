@@ -20,6 +20,8 @@ from torchrl_gn.envs.specs import reward_of
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import PhysicalParameters, load_scene
 
+from ..sizes import SMALL
+
 
 def rollout(env: ModelEnv, start: TensorDict, actions: torch.Tensor) -> TensorDict:
     """Steps with given actions ``[*B, T, A]``."""
@@ -138,8 +140,7 @@ def test_steps_a_true_environments_tensordict(scene_env, model_env):
 
 def test_runs_a_bound_forward_model(swimmer):
     torch.manual_seed(0)
-    small = {"latent": 8, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    model = ForwardModel(ParameterNames.of(swimmer), **small)
+    model = ForwardModel(ParameterNames.of(swimmer), **SMALL)
     env = ModelEnv(model.bind(swimmer), seed=0)
     check_env_specs(env)
     true = SceneEnv(swimmer, seed=0).rollout(4, tensordict=TensorDict(batch_size=[3]))
@@ -153,8 +154,7 @@ def test_runs_a_bound_forward_model(swimmer):
 
 
 def test_samples_of_another_scene_are_refused(pendulum):
-    small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    env = ModelEnv(ForwardModel(ParameterNames.of(pendulum), **small).bind(pendulum), seed=0)
+    env = ModelEnv(ForwardModel(ParameterNames.of(pendulum), **SMALL).bind(pendulum), seed=0)
     start = env.rand_action(env.reset(TensorDict(batch_size=[2])))
     own, heavy = (
         PhysicalParameters.of(scene).tensordict().expand(2)
@@ -168,13 +168,12 @@ def test_samples_of_another_scene_are_refused(pendulum):
 
 @pytest.mark.parametrize("kind", ["parameters", "inferred", "recurrent"])
 def test_specs_name_what_else_a_model_reads(swimmer, kind):
-    small = {"latent": 8, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
     options = {
         "parameters": {},
         "inferred": {"parameters": "inferred", "inferred": (4, 4, 4)},
         "recurrent": {"core": "recurrent", "hidden_state": [4, 4, 4]},
     }
-    model = ForwardModel(ParameterNames.of(swimmer), **options[kind], **small)
+    model = ForwardModel(ParameterNames.of(swimmer), **options[kind], **SMALL)
     env = ModelEnv(model.bind(swimmer, parameters_key=None if kind == "recurrent" else "parameters"), seed=0)
     check_env_specs(env)
     assert ("hidden_state" in env.observation_spec.keys()) == (kind == "recurrent")

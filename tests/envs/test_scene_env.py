@@ -14,33 +14,8 @@ from tensordict import TensorDict
 from torchrl_gn.data import Simulator
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.rewards import make_reward
-from torchrl_gn.scenes import load_scene
 
-# Forces of 1e12 N: NaN in MuJoCo's accelerations within a few steps.
-EXPLOSIVE = """
-<mujoco model="explosive">
-  <option timestep="0.05"/>
-  <worldbody>
-    <body name="ball" pos="0 0 1">
-      <joint name="x" type="slide" axis="1 0 0"/>
-      <geom type="sphere" size=".1" mass="1e-3"/>
-    </body>
-  </worldbody>
-  <actuator><motor joint="x" gear="1e12" ctrlrange="-1 1" ctrllimited="true"/></actuator>
-</mujoco>
-"""
-
-PASSIVE = """
-<mujoco model="passive">
-  <option timestep="0.01"/>
-  <worldbody>
-    <body name="pole" pos="0 0 1">
-      <joint name="hinge" axis="0 1 0"/>
-      <geom type="capsule" fromto="0 0 0 0 0 .5" size=".02"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
+from .. import zoo
 
 
 def batch(*size: int) -> TensorDict:
@@ -159,7 +134,7 @@ def test_bad_steps_are_named(scene_env):
 
 def test_an_unstable_step_ends_the_episode_and_keeps_the_last_good_state(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    env = SceneEnv(load_scene(EXPLOSIVE), seed=0)
+    env = SceneEnv(zoo.load("cart", ('gear="1"', 'gear="1e12"')), seed=0)
     start = env.reset(batch(2))
     start["action"] = torch.tensor([[1.0], [0.0]])
     after = env.step(start)["next"]
@@ -173,7 +148,7 @@ def test_an_unstable_step_ends_the_episode_and_keeps_the_last_good_state(tmp_pat
 
 
 def test_a_scene_without_motors_steps(capfd):
-    env = SceneEnv(load_scene(PASSIVE), seed=0)
+    env = SceneEnv(zoo.load("falling"), seed=0)
     played = env.rollout(5, tensordict=batch(2))
     assert played["action"].shape == (2, 5, 0)
     assert not played["next", "done"].any()

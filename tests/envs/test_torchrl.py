@@ -19,7 +19,8 @@ from torchrl.objectives.value import TDLambdaEstimator
 
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.rewards import make_reward
-from torchrl_gn.scenes import load_scene
+
+from .. import zoo
 
 
 @pytest.fixture(autouse=True)
@@ -180,16 +181,9 @@ def test_cem_on_the_true_physics_keeps_the_pendulum_balanced(pendulum):
 def test_an_unstable_candidate_neither_ends_nor_wins_a_search():
     # Every step costs 1, so that ending an episode would pay if blowing up cost nothing.
     # MuJoCo gives up beyond 1e10 m/s^2, that is |action| > 0.5 here.
-    model = """
-    <mujoco model="touchy">
-      <option timestep="0.01"/>
-      <worldbody><body name="ball"><joint name="x" type="slide" axis="1 0 0"/>
-        <geom type="sphere" size=".1" mass="1"/></body></worldbody>
-      <actuator><motor joint="x" gear="2e10" ctrlrange="-1 1" ctrllimited="true"/></actuator>
-    </mujoco>
-    """
     torch.manual_seed(0)
-    env = SceneEnv(load_scene(model), lambda state, action, next_state, task: -torch.ones_like(action), seed=0)
+    scene = zoo.load("cart", ('gear="1"', 'gear="2e10"'))
+    env = SceneEnv(scene, lambda state, action, next_state, task: -torch.ones_like(action), seed=0)
     act = CEMPlanner(env, planning_horizon=2, optim_steps=2, num_candidates=128, top_k=5)
     played = env.rollout(2, act)
     assert played["action"].abs().max() < 0.5

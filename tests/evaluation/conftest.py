@@ -12,6 +12,8 @@ from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes import ParameterNames, load_scene
 
+from ..sizes import SMALL
+
 SYSTEMS = ("pendulum", "swimmer6", "cheetah")
 
 
@@ -62,8 +64,7 @@ def simulated(scenes) -> TensorDict:
 def swimmer(scenes, simulated) -> Predictor:
     """A small untrained model of the swimmer that knows how its states vary."""
     torch.manual_seed(0)
-    small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    bound = ForwardModel(ParameterNames.of(scenes["swimmer6"]), **small).double().bind(scenes["swimmer6"])
+    bound = ForwardModel(ParameterNames.of(scenes["swimmer6"]), **SMALL).double().bind(scenes["swimmer6"])
     bound.update_parameter_normalizers()
     state = simulated["state"]
     bound.update_dynamic_normalizers(state[:, :-1], simulated["action"], state[:, 1:])

@@ -15,8 +15,9 @@ from torchrl_gn.networks import GNBlock, GraphSize, graph_concat
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants
 
+from ..sizes import SMALL
+
 EDGES = torch.tensor([[0, 1, 0, 2], [1, 0, 1, 2]])
-SMALL = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
 
 
 @pytest.fixture

@@ -11,25 +11,15 @@ from tensordict import TensorDict
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import ParameterNames, Scene, load_scene
+from torchrl_gn.scenes import ParameterNames, Scene
 
-FALLING = """
-<mujoco model="falling">
-  <option timestep="0.01"/>
-  <worldbody>
-    <body pos="0 0 1"><freejoint/><geom type="box" size=".1 .2 .3"/></body>
-  </worldbody>
-</mujoco>
-"""
+from .. import zoo
+from ..sizes import SMALL
 
 
 @pytest.fixture(scope="session")
 def scenes() -> dict[str, Scene]:
-    return {
-        "pendulum": load_scene("pendulum"),
-        "swimmer6": load_scene("swimmer6"),
-        "falling": load_scene(FALLING),
-    }
+    return {name: zoo.load(name) for name in ("pendulum", "swimmer6", "falling")}
 
 
 def _windows(trajectories: TensorDict) -> TensorDict:
@@ -67,8 +57,7 @@ def make_loss(scenes, windows) -> Callable[..., ForwardModelLoss]:
 
     def make(name: str = "swimmer6", *, fitted: bool = True, model: dict | None = None, **options) -> ForwardModelLoss:
         torch.manual_seed(0)
-        small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-        network = ForwardModel(ParameterNames.of(scenes[name]), **(small | (model or {}))).double()
+        network = ForwardModel(ParameterNames.of(scenes[name]), **(SMALL | (model or {}))).double()
         loss = ForwardModelLoss(network.bind(scenes[name]), **options)
         if fitted:
             loss.fit_normalizers(windows[name].reshape(-1))

@@ -25,9 +25,9 @@ from torchrl_gn.objectives import (
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph, ParameterNames, load_scene
 
-pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
+from ..sizes import SMALL
 
-SMALL = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
 
 
 class Case(NamedTuple):

@@ -14,6 +14,8 @@ from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import ParameterNames, load_scene
 
+from ..sizes import SMALL
+
 COMPONENTS = BODY_STATE.names
 
 
@@ -346,9 +348,9 @@ def test_batches_that_do_not_fit_are_named(make_loss, windows):
 )
 def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
     torch.manual_seed(0)
-    scene, small = load_scene(name), {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+    scene = load_scene(name)
     data = create_dataset(tmp_path, scene, train=6, validation=1, test=1, steps=4, variants=6)
-    model = ForwardModel(ParameterNames.of(scene), **small).double()
+    model = ForwardModel(ParameterNames.of(scene), **SMALL).double()
     loss = ForwardModelLoss(model.bind(scene, parameters_key="parameters"))
     loss.fit_normalizers(trajectory_buffer(data.train, batch_size=200, seed=0).sample())
     for window in (1, 3):

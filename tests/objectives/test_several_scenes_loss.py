@@ -11,6 +11,8 @@ from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
 from torchrl_gn.scenes import ParameterNames, load_scene
 
+from ..sizes import SMALL
+
 NAMES = ("pendulum", "cartpole")  # both turn about one axis, at different speeds
 
 
@@ -18,8 +20,7 @@ NAMES = ("pendulum", "cartpole")  # both turn about one axis, at different speed
 def losses() -> list[ForwardModelLoss]:
     """Losses of two scenes that share a model."""
     torch.manual_seed(0)
-    small = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    model = ForwardModel(ParameterNames.of(load_scene("pendulum")), **small).double()
+    model = ForwardModel(ParameterNames.of(load_scene("pendulum")), **SMALL).double()
     return [ForwardModelLoss(model.bind(load_scene(name))) for name in NAMES]
 
 

@@ -19,19 +19,16 @@ from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import FreezeGoal, make_reward
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import ParameterNames, Scene, load_scene
+
+from .. import zoo
+from ..sizes import SMALL
 
 STEP, SPEED_WEIGHT, CONTROL_COST, HORIZON = 0.1, 0.1, 0.02, 12
-SMALL = {"latent": 8, "edge_hidden": [8], "node_hidden": [8], "global_hidden": [8]}
-POINT = """
-<mujoco model="cart">
-  <option timestep="0.1" gravity="0 0 0"/>
-  <worldbody>
-    <body name="point"><joint name="x" type="slide" axis="1 0 0"/><geom type="sphere" size=".1" mass="1"/></body>
-  </worldbody>
-  <actuator><motor joint="x" ctrlrange="-LIMIT LIMIT" ctrllimited="true"/></actuator>
-</mujoco>
-"""
+
+
+def cart(limit: float) -> Scene:
+    return zoo.load("cart", ("-1 1", f"-{limit} {limit}"), timestep=STEP)
 
 
 class Point(TensorDictModuleBase):
@@ -59,7 +56,7 @@ def quadratic(state, action, next_state, task):
 
 
 def point_env(limit: float) -> ModelEnv:
-    return ModelEnv(Point(load_scene(POINT.replace("LIMIT", str(limit)), timestep=STEP)), quadratic)
+    return ModelEnv(Point(cart(limit)), quadratic)
 
 
 def at(*places: float) -> TensorDict:
@@ -207,7 +204,7 @@ def test_rows_are_planned_on_their_own():
 
 def test_candidates_find_what_one_sequence_misses():
     """From the middle of two hills a single ascent may climb the lower one."""
-    scene = load_scene(POINT.replace("LIMIT", "1"), timestep=STEP)
+    scene = cart(1)
 
     def hills(state, action, next_state, task):
         x = next_state[..., 1, :1]
@@ -245,7 +242,7 @@ def test_as_many_samples_as_candidates_are_sorted_too():
 
 
 def test_an_episode_that_begins_anew_is_planned_anew(monkeypatch):
-    scene = load_scene(POINT.replace("LIMIT", "5"), timestep=STEP)
+    scene = cart(5)
     planner = GradientPlanner(ModelEnv(Point(scene), quadratic), 4, 1, warm_up=3, samples=3, seed=0)
     env = batched(SceneEnv(scene, quadratic, seed=0), 2).append_transform(StepCounter(2))
     seen = []
@@ -285,7 +282,7 @@ def test_what_is_not_finite_keeps_the_last_good_plan_and_says_so():
             state = torch.where(bad.unsqueeze(-1), torch.nan, out["next", "state"])
             return out.set(("next", "state"), state)
 
-    env = ModelEnv(Exploding(load_scene(POINT.replace("LIMIT", "2"), timestep=STEP)), quadratic)
+    env = ModelEnv(Exploding(cart(2)), quadratic)
     planner = GradientPlanner(env, 4, 2, warm_up=5, samples=3, seed=0)
     good = at(1.0, 0.5)
     with warnings.catch_warnings():
@@ -321,7 +318,7 @@ def test_a_plan_that_diverges_upwards_never_wins(what):
         reward = action.double()
         return torch.where(action > 1.5, 1e200, reward) if what == "rewards" else reward
 
-    model = Exploding(load_scene(POINT.replace("LIMIT", "2"), timestep=STEP), 1.5 if what == "predictions" else 9.0)
+    model = Exploding(cart(2), 1.5 if what == "predictions" else 9.0)
     planner = GradientPlanner(ModelEnv(model, strongest), 4, 5, warm_up=60, candidates=2, samples=6, seed=0)
     start = at(1.0, 0.5)
     for _ in range(2):
@@ -333,7 +330,7 @@ def test_a_plan_that_diverges_upwards_never_wins(what):
 
 @pytest.mark.parametrize("reward", [quadratic, lambda *step: 1e200 * (1 + quadratic(*step).square())])
 def test_where_nothing_is_finite_a_first_plan_is_to_rest_and_the_next_is_kept(reward):
-    scene = load_scene(POINT.replace("LIMIT", "2"), timestep=STEP)
+    scene = cart(2)
     env = ModelEnv(Exploding(scene, -9.0) if reward is quadratic else Point(scene), reward)
     planner = GradientPlanner(env, 4, 2, warm_up=5, candidates=2, samples=40, seed=0)
     start = at(1.0, 0.5)
@@ -427,7 +424,7 @@ def test_a_gradient_that_is_no_number_costs_an_iteration_and_no_more():
         lost = torch.tensor(len(calls) == 5) & (state[..., 1, :1] < 0)
         return quadratic(state, action, next_state, task) + torch.where(lost, 0 * action, 1.0).sqrt()
 
-    scene = load_scene(POINT.replace("LIMIT", "20"), timestep=STEP)
+    scene = cart(20)
     planner = GradientPlanner(ModelEnv(Point(scene), reward), 1, 60, warm_up=60, samples=1, seed=0)
     action = planner(at(1.0, -1.0))["action"]
     assert len(calls) > 60 and action[0] < -0.4 and action[1] == pytest.approx(-action[0].item(), rel=0.05)
@@ -463,7 +460,7 @@ def test_bad_input_is_named():
     crossed.scene = replace(env.scene, action_high=np.array([-3.0]))
     with pytest.raises(ValueError, match="action 0 between -2 and -3: action_low must not be above"):
         GradientPlanner(crossed, 3)
-    still = load_scene('<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
+    still = zoo.load("falling")
     with pytest.raises(ValueError, match="no actions to plan"):
         GradientPlanner(ModelEnv(Point(still), quadratic), 3)
     deaf = ModelEnv(Point(env.scene), lambda state, action, next_state, task: state.detach()[..., 1, :1])

@@ -23,28 +23,9 @@ from torchrl_gn.planners.reward_expansion import RewardExpansion
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import Scene, load_scene
 
-SUBSTEPS, STEP, MASS = 4, 0.01, 2.0
-POINT = f"""
-<mujoco model="point">
-  <option timestep="{STEP}" gravity="0 0 0"/>
-  <worldbody>
-    <body name="point">
-      <joint name="x" type="slide" axis="1 0 0"/>
-      <joint name="y" type="slide" axis="0 1 0"/>
-      <geom type="sphere" size=".1" mass="{MASS}"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor joint="x" ctrlrange="-LIMIT LIMIT" ctrllimited="true"/>
-    <motor joint="y" ctrlrange="-LIMIT LIMIT" ctrllimited="true"/>
-  </actuator>
-</mujoco>
-"""
-FREE_BODY = """
-<mujoco model="free">
-  <worldbody><body name="ball"><freejoint/><geom size=".1"/></body></worldbody>
-</mujoco>
-"""
+from .. import zoo
+
+SUBSTEPS, STEP, MASS = 4, 0.01, 2.0  # of zoo/point.xml
 SPEED_WEIGHT, CONTROL_COST, HORIZON = 0.1, 0.02, 25
 
 
@@ -56,7 +37,7 @@ def quadratic(state, action, next_state, task):
 
 
 def point_scene(limit: float) -> Scene:
-    return load_scene(POINT.replace("LIMIT", str(limit)), timestep=SUBSTEPS * STEP)
+    return zoo.load("point", ("-1 1", f"-{limit} {limit}"), timestep=SUBSTEPS * STEP)
 
 
 def point_env(limit: float, reward=quadratic) -> SceneEnv:
@@ -403,7 +384,7 @@ def test_refuses_what_it_cannot_plan():
     with pytest.raises(ValueError, match="no reward"):
         ILQGPlanner(SceneEnv(env.scene), 3)
     with pytest.raises(ValueError, match="no actions"):
-        ILQGPlanner(SceneEnv(load_scene(FREE_BODY), quadratic), 3)
+        ILQGPlanner(SceneEnv(zoo.load("falling"), quadratic), 3)
     unlimited = SceneEnv(env.scene, quadratic)
     unlimited.scene = replace(env.scene, action_high=np.array([np.inf, 1.0]))
     with pytest.raises(ValueError, match="without bounds"):

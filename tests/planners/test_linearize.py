@@ -12,23 +12,7 @@ from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.planners.linearize import Tangent, linearize
 from torchrl_gn.scenes import Scene, load_scene
 
-# A body that tumbles freely, with a motored arm: positions hold a quaternion.
-TUMBLER = """
-<mujoco model="tumbler">
-  <option timestep="0.005" integrator="RK4" gravity="0 0 -1"/>
-  <worldbody>
-    <body name="trunk" pos="0 0 1">
-      <freejoint/>
-      <geom type="box" size=".1 .2 .05" density="500"/>
-      <body name="arm" pos=".1 0 0">
-        <joint name="shoulder" axis="0 1 0" damping=".1"/>
-        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor joint="shoulder" ctrlrange="-1 3" ctrllimited="true"/></actuator>
-</mujoco>
-"""
+from .. import zoo
 
 
 def trajectory(scene: Scene, steps: int, seed: int = 0) -> tuple[Simulator, np.ndarray, np.ndarray]:
@@ -84,9 +68,9 @@ def fourth_order(simulator: Simulator, physics: np.ndarray, action: np.ndarray) 
     return np.stack(steps, 1), np.stack(bodies[: tangent.size], 1)
 
 
-@pytest.mark.parametrize("source", [TUMBLER, "cartpole"])
+@pytest.mark.parametrize("source", ["tumbler", "cartpole"])
 def test_runge_kutta_scenes_equal_higher_order_differences(source):
-    scene = load_scene(source)
+    scene = zoo.load(source)
     assert scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     simulator, physics, actions = trajectory(scene, 2)
     found = linearize(simulator, physics, actions, central=True)
@@ -126,7 +110,7 @@ def test_fixed_controls_change_nothing(central):
 
 
 def test_tangent_is_its_own_inverse():
-    scene = load_scene(TUMBLER)
+    scene = zoo.load("tumbler")
     tangent = Tangent(scene.model)
     start = sample_start_states(scene, 4, 0)
     change = 0.3 * np.random.default_rng(0).standard_normal((5, 4, tangent.size))

@@ -11,26 +11,7 @@ import torch
 from torchrl_gn.rewards import Balance, available_rewards, find_body, make_reward
 from torchrl_gn.scenes import load_scene
 
-# A pole with a flag welded on at a quarter turn about y.
-TWO_POLES = """
-<mujoco model="two_poles">
-  <option timestep="0.01"/>
-  <worldbody>
-    <body name="lower" pos="0 0 1">
-      <joint name="a" axis="0 1 0"/>
-      <geom type="capsule" fromto="0 0 0 0 0 .5" size=".02"/>
-      <body name="flag" pos="0 0 .5" quat="0.70710678118654752 0 0.70710678118654752 0">
-        <geom type="sphere" size=".01"/>
-      </body>
-      <body name="upper" pos="0 0 .5">
-        <joint name="b" axis="0 1 0"/>
-        <geom type="capsule" fromto="0 0 0 0 0 .5" size=".02"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor joint="a" ctrlrange="-1 1" ctrllimited="true"/></actuator>
-</mujoco>
-"""
+from .. import zoo
 
 
 @pytest.fixture(scope="module")
@@ -110,15 +91,15 @@ def test_takes_any_batch(pendulum):
 
 
 def test_sums_over_bodies_and_follows_welded_ones():
-    scene = load_scene(TWO_POLES)
+    scene = zoo.load("two_links")
     angle = torch.tensor([0.3, -0.5], dtype=torch.float64)
-    state = rotated_about_y(scene, angle, "lower")
-    lower = Balance(scene, ["lower"])(None, None, state)
-    both = Balance(scene, ["lower", "upper"])(None, None, state)
-    torch.testing.assert_close(both, lower)  # the upper node's own orientation is upright
+    state = rotated_about_y(scene, angle, "first")
+    first = Balance(scene, ["first"])(None, None, state)
+    both = Balance(scene, ["first", "second"])(None, None, state)
+    torch.testing.assert_close(both, first)  # the second node's own orientation is upright
     flag = Balance(scene, ["flag"])(None, None, state)
     torch.testing.assert_close(flag.flatten(), -(angle + math.pi / 2).abs())
-    assert find_body(scene, "flag").node == find_body(scene, "lower").node
+    assert find_body(scene, "flag").node == find_body(scene, "first").node
 
 
 def test_measures_from_a_given_target(pendulum):

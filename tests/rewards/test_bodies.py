@@ -7,40 +7,16 @@ import pytest
 import torch
 
 from torchrl_gn.rewards import Bodies, find_body, make_reward
-from torchrl_gn.scenes import KinematicTree, load_scene
+from torchrl_gn.scenes import KinematicTree
 
-# A tip welded askew to the second link of an arm that turns about three axes, on a cart.
-ARM = """
-<mujoco model="arm">
-  <option timestep="0.01"/>
-  <worldbody>
-    <body name="post" pos=".1 .2 .3"><geom size=".05"/></body>
-    <body name="cart" pos="0 0 1">
-      <joint name="slide" type="slide" axis="1 0 0"/>
-      <geom size=".1"/>
-      <body name="upper" pos=".2 0 0">
-        <joint name="a" type="ball"/>
-        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
-        <body name="lower" pos=".3 .05 0" quat=".8 .6 0 0">
-          <joint name="b" axis="0 1 0" pos="0 .02 0"/>
-          <geom type="capsule" fromto="0 0 0 .4 0 0" size=".02"/>
-          <body name="tip" pos=".4 .1 -.2" quat=".5 .5 -.5 .5"><geom size=".02"/></body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor joint="slide" ctrlrange="-1 1" ctrllimited="true"/>
-    <motor joint="b" ctrlrange="-1 1" ctrllimited="true"/>
-  </actuator>
-</mujoco>
-"""
+from .. import zoo
+
 NAMES = ("tip", "upper", "post", "lower")
 
 
 @pytest.fixture(scope="module")
 def arm(make_steps):
-    return make_steps(load_scene(ARM))
+    return make_steps(zoo.load("welded_tip"))
 
 
 def rotation(q: np.ndarray) -> np.ndarray:
@@ -93,7 +69,9 @@ def test_gradients_are_the_finite_differences(arm):
 
 
 def test_refuses_what_it_cannot_read(arm, steps):
-    with pytest.raises(ValueError, match="'arm' has no body 'hand'; it has: world, cart, upper, lower, post, tip"):
+    with pytest.raises(
+        ValueError, match="'welded_tip' has no body 'hand'; it has: world, cart, upper, lower, post, tip"
+    ):
         Bodies(arm.scene, ["tip", "hand"])
     with pytest.raises(ValueError, match="list of body names, got 'tip'"):
         Bodies(arm.scene, "tip")
@@ -101,7 +79,7 @@ def test_refuses_what_it_cannot_read(arm, steps):
         Bodies(arm.scene, [])
     with pytest.raises(ValueError, match="different ones"):
         Bodies(arm.scene, ["tip", "tip"])
-    with pytest.raises(ValueError, match=r"states of scene 'arm' must be \[\*B, 4, 13\], got \[4, 10, 13\]"):
+    with pytest.raises(ValueError, match=r"states of scene 'welded_tip' must be \[\*B, 4, 13\], got \[4, 10, 13\]"):
         Bodies(arm.scene, ["tip"]).position(steps("jaco").state)
     chain = KinematicTree("robot", ("a",), 0.1, ((0,),))
     with pytest.raises(TypeError, match="KinematicTree"):

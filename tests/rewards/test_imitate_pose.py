@@ -14,24 +14,9 @@ from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards import FreezeGoal, ImitatePose, arm_reach, make_reward
 from torchrl_gn.scenes import load_scene
 
-# Two links of 0.3 m and 0.4 m on a post 1 m high; the tip is welded 0.1 m beyond the end.
-TWO_LINKS = """
-<mujoco model="two_links">
-  <worldbody>
-    <body name="first" pos="0 0 1">
-      {root}
-      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
-      <body name="second" pos=".3 0 0">
-        <joint name="b" axis="0 1 0"/>
-        <geom type="capsule" fromto="0 0 0 .4 0 0" size=".02"/>
-        <body name="tip" pos=".5 0 0"><geom size=".01"/></body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor joint="b" ctrlrange="-1 1" ctrllimited="true"/></actuator>
-</mujoco>
-"""
-HINGE, SLIDE = '<joint name="a" axis="0 1 0"/>', '<joint name="a" type="slide" axis="1 0 0"/>'
+from .. import zoo
+
+SLIDE = ('name="a" axis="0 1 0"', 'name="a" type="slide" axis="1 0 0"')
 
 
 @pytest.fixture(scope="module")
@@ -107,12 +92,12 @@ def test_no_pose_is_beyond_the_reach_and_the_reach_is_no_larger_than_the_links(a
 
 
 def test_a_stretched_arm_reaches_as_far_as_said():
-    scene = load_scene(TWO_LINKS.format(root=HINGE))
+    scene = zoo.load("two_links")
     for name, length in (("first", 0.0), ("second", 0.3), ("tip", 0.8)):
         base, reach = arm_reach(scene, name)
         np.testing.assert_allclose(base, [0, 0, 1])
         assert reach == pytest.approx(length, abs=1e-12)
-    assert arm_reach(load_scene(TWO_LINKS.format(root=SLIDE)), "tip")[1] == math.inf
+    assert arm_reach(zoo.load("two_links", SLIDE), "tip")[1] == math.inf
 
 
 def test_targets_out_of_reach_are_refused(arm):
@@ -138,12 +123,12 @@ def test_rounded_targets_are_within_reach(poses):
 
 
 def test_what_slides_reaches_everywhere():
-    scene = load_scene(TWO_LINKS.format(root=SLIDE))
+    scene = zoo.load("two_links", SLIDE)
     goal = torch.zeros(scene.num_nodes, 13, dtype=torch.float64)
     goal[:, 3], goal[:, 0] = 1, 100.0
     ImitatePose(scene, ["tip"]).task_of(goal, goal)
     with pytest.raises(ValueError, match="'tip' 100"):
-        ImitatePose(load_scene(TWO_LINKS.format(root=HINGE)), ["tip"]).task_of(goal, goal)
+        ImitatePose(zoo.load("two_links"), ["tip"]).task_of(goal, goal)
 
 
 def test_bad_targets_and_tasks_are_named(arm):

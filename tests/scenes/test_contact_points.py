@@ -10,12 +10,13 @@ from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.contact_points import contact_slots
 
 PLANE = '<geom type="plane" size="9 9 1" pos="0 0 .2" euler="0 20 0"/>'
+WELDED = '<body pos=".3 0 0"><geom size=".1" pos=".1 .2 0"/></body>'
 
 
-def body(geom: str, plane: str = PLANE) -> str:
+def body(geom: str, plane: str = PLANE, welded: str = WELDED) -> str:
     return f"""
       <mujoco><option gravity="0 0 0"/><worldbody>{plane}
-        <body pos="0 0 2"><freejoint/>{geom}<body pos=".3 0 0"><geom size=".1" pos=".1 .2 0"/></body></body>
+        <body pos="0 0 2"><freejoint/>{geom}{welded}</body>
       </worldbody></mujoco>
     """
 
@@ -55,8 +56,8 @@ def test_a_body_touches_where_its_points_do(geom):
 
 
 def test_a_model_sees_all_sides_of_a_box():
-    box = '<body pos="0 0 2"><freejoint/><geom type="box" size=".1 .2 .3" euler="30 40 50"/></body>'
-    offset, _, there = contact_slots(load_scene(f"<mujoco><worldbody>{PLANE}{box}</worldbody></mujoco>"))
+    box = '<geom type="box" size=".1 .2 .3" euler="30 40 50"/>'
+    offset, _, there = contact_slots(load_scene(body(box, welded="")))
     assert there[1].all()
     np.testing.assert_allclose(offset[1].sum(0), 0, atol=1e-9)  # no four corners of a face, nor three of one
     assert np.linalg.matrix_rank(offset[1]) == 3

@@ -8,31 +8,9 @@ import pytest
 
 from torchrl_gn.scenes import SYSTEMS, Scene, load_scene
 
-# A welded group that is not contiguous, offsets with rotation, two joints on a body, ball and free joints.
-ODD = """
-<mujoco model="odd">
-  <option gravity="0.3 -0.2 -9" density="1.2" wind="1 0 0"/>
-  <worldbody>
-    <body name="shelf" pos="0 0 1" quat="0.8 0.6 0 0">
-      <geom type="box" size=".1 .2 .05"/>
-      <body name="arm" pos=".1 .2 .3" euler="20 30 40">
-        <joint name="a1" axis="1 0 0" damping=".3"/>
-        <joint name="a2" type="slide" axis="0 1 1" range="-1 1" stiffness="3"/>
-        <geom type="capsule" size=".03 .2" pos=".1 0 0"/>
-        <body pos="0 .1 0" euler="0 50 0">
-          <geom type="box" size=".05 .02 .1"/>
-          <body name="ball" pos=".2 0 0"><joint type="ball" armature=".02"/><geom size=".06" pos="0 .05 0"/></body>
-          <body name="late" pos="0 0 -.3" euler="10 0 0"><geom type="ellipsoid" size=".05 .1 .02"/></body>
-        </body>
-      </body>
-    </body>
-    <body pos="2 0 1"><freejoint/><geom type="box" size=".1 .2 .3"/></body>
-  </worldbody>
-  <actuator><motor name="m" joint="a1" gear="7" ctrlrange="-2 3"/></actuator>
-</mujoco>
-"""
+from .. import zoo
 
-SOURCES = {**{name: name for name in SYSTEMS}, "odd": ODD}
+SOURCES = (*SYSTEMS, "odd")
 
 
 def _column(scene: Scene, kind: str, name: str) -> np.ndarray:
@@ -54,7 +32,7 @@ def _random_state(scene: Scene, seed: int) -> mujoco.MjData:
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_frame_sensors_are_last_and_equal_object_velocity(source):
-    scene = load_scene(SOURCES[source])
+    scene = zoo.load(source)
     data = _random_state(scene, 0)
     state = data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13)
     assert scene.sensor_slice.stop == scene.model.nsensordata
@@ -69,7 +47,7 @@ def test_frame_sensors_are_last_and_equal_object_velocity(source):
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_a_step_depends_on_physics_and_control_alone(source):
-    scene = load_scene(SOURCES[source])
+    scene = zoo.load(source)
     model, full = scene.model, mujoco.mjtState.mjSTATE_FULLPHYSICS
     rng = np.random.default_rng(3)
     data, fresh = _random_state(scene, 1), mujoco.MjData(model)
@@ -87,7 +65,7 @@ def test_a_step_depends_on_physics_and_control_alone(source):
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_composite_inertias_carry_the_kinetic_energy(source):
-    scene = load_scene(SOURCES[source])
+    scene = zoo.load(source)
     data = _random_state(scene, 2)
     mujoco.mj_energyVel(scene.model, data)
     armature = 0.5 * (scene.model.dof_armature * data.qvel**2).sum()
@@ -108,7 +86,7 @@ def test_composite_inertias_carry_the_kinetic_energy(source):
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_parent_relative_frames_rebuild_the_reference_pose(source):
-    scene = load_scene(SOURCES[source])
+    scene = zoo.load(source)
     data = mujoco.MjData(scene.model)  # qpos0
     mujoco.mj_kinematics(scene.model, data)
     pos, quat = _column(scene, "nodes", "pos"), _column(scene, "nodes", "quat")
@@ -124,7 +102,7 @@ def test_parent_relative_frames_rebuild_the_reference_pose(source):
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_edge_features(source):
-    scene = load_scene(SOURCES[source])
+    scene = zoo.load(source)
     np.testing.assert_array_equal(_column(scene, "edges", "direction"), [1, -1] * (scene.num_edges // 2))
     motorized = scene.edge_action >= 0
     np.testing.assert_array_equal(_column(scene, "edges", "motorized"), motorized)
@@ -139,7 +117,7 @@ def test_edge_features(source):
 
 
 def test_global_features():
-    scene = load_scene(ODD, timestep=0.006)
+    scene = zoo.load("odd", timestep=0.006)
     assert _column(scene, "globals_", "timestep") == pytest.approx(0.006)
     np.testing.assert_array_equal(_column(scene, "globals_", "gravity"), [0.3, -0.2, -9])
     np.testing.assert_array_equal(_column(scene, "globals_", "wind"), [1, 0, 0])
@@ -150,7 +128,7 @@ def test_global_features():
 
 
 def test_odd_model_has_the_expected_graph():
-    scene = load_scene(ODD)
+    scene = zoo.load("odd")
     assert scene.node_names == ("world", "arm", "ball", "body6")
     assert scene.parent.tolist() == [-1, 0, 1, 0]
     assert scene.senders.tolist() == [0, 1, 0, 1, 1, 2, 0, 3]

@@ -11,50 +11,7 @@ import pytest
 from torchrl_gn.scenes import Scene, load_scene, static_features
 from torchrl_gn.scenes.fingerprint import physics
 
-MODEL = """
-<mujoco model="everything">
-  <compiler angle="radian"/>
-  <option timestep="0.004" gravity="0 0 -9.8" density="1.2" viscosity="0.01" wind="0.1 0 0" integrator="implicitfast"
-    solver="CG" iterations="50" tolerance="1e-7" cone="elliptic" impratio="2"><flag eulerdamp="disable"/></option>
-  <visual><headlight ambient="0.1 0.1 0.1"/></visual>
-  <asset>
-    <material name="steel" rgba="0.5 0.5 0.5 1"/>
-    <mesh name="wedge" vertex="0 0 0  0.3 0 0  0 0.2 0  0 0 0.1"/>
-    <hfield name="hills" nrow="2" ncol="3" elevation="0 0.5 1 0.2 0.1 0.7" size="1 1 0.2 0.1"/>
-  </asset>
-  <worldbody>
-    <light name="sun" pos="0 0 3"/>
-    <camera name="eye" pos="0 -3 1"/>
-    <geom name="floor" type="plane" size="2 2 0.1" friction="0.7 0.005 0.0001"/>
-    <geom name="ground" type="hfield" hfield="hills" pos="5 0 0"/>
-    <body name="cart" pos="0 0 1">
-      <joint name="slide" type="slide" axis="1 0 0" damping="0.3" armature="0.01" frictionloss="0.02" range="-1 1"/>
-      <geom name="box" type="box" size="0.1 0.2 0.05" rgba="1 0 0 1" solref="0.01 1" solimp="0.8 0.9 0.01"/>
-      <geom name="paint" type="sphere" size="0.02" mass="0" contype="0" conaffinity="0" rgba="0 1 0 1"/>
-      <site name="hook" pos="0.1 0 0"/>
-      <body name="bracket" pos="0.2 0 0"><geom name="weight" type="sphere" size="0.03" pos="0 0 0.1"/></body>
-      <body name="arm" pos="0 0 0.2" quat="0.9 0.1 0.2 0.3">
-        <joint name="hinge" axis="0 1 0" pos="0 0 0.01" stiffness="2" springref="0.3" ref="0.1"/>
-        <geom name="rod" type="capsule" fromto="0 0 0 0 0 0.5" size="0.03"/>
-        <geom name="wedge" type="mesh" mesh="wedge" pos="0.1 0 0.5"/>
-        <site name="tip" pos="0 0 0.5"/>
-      </body>
-    </body>
-  </worldbody>
-  <contact>
-    <pair geom1="paint" geom2="floor" friction="0.4 0.4 0.005 0.0001 0.0001"/>
-    <exclude body1="cart" body2="arm"/>
-  </contact>
-  <tendon>
-    <spatial name="rope" stiffness="3" damping="0.2" range="0 2"><site site="hook"/><site site="tip"/></spatial>
-  </tendon>
-  <equality><connect site1="hook" site2="tip" active="false"/></equality>
-  <actuator>
-    <position name="servo" joint="hinge" kp="5" kv="0.5" gear="2" ctrlrange="-1 1" forcerange="-3 3"/>
-  </actuator>
-  <sensor><jointpos joint="hinge"/></sensor>
-</mujoco>
-"""
+from .. import zoo
 
 PHYSICS = {
     "timestep": ('timestep="0.004"', 'timestep="0.002"'),
@@ -129,13 +86,12 @@ ELSE = {
 
 
 def edited(old: str, new: str) -> Scene:
-    assert old in MODEL
-    return load_scene(MODEL.replace(old, new), timestep=0.02)
+    return zoo.load("everything", (old, new), timestep=0.02)
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(MODEL, timestep=0.02)
+    return zoo.load("everything", timestep=0.02)
 
 
 @pytest.mark.parametrize("what", PHYSICS)
@@ -144,7 +100,7 @@ def test_other_physics_have_another(scene, what):
 
 
 def test_another_control_step_has_another(scene):
-    assert load_scene(MODEL, timestep=0.04).fingerprint() != scene.fingerprint()
+    assert zoo.load("everything", timestep=0.04).fingerprint() != scene.fingerprint()
 
 
 @pytest.mark.parametrize("what", ELSE)
@@ -159,11 +115,11 @@ def test_order_of_what_is_seen_only_does_not_matter(scene):
 
 
 @pytest.mark.parametrize(
-    "system", ["pendulum", "cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", "jaco", MODEL]
+    "system", ["pendulum", "cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", "jaco", "everything"]
 )
 def test_another_machines_rounding_does_not_matter(system):
     """Some units in the last place of everything, noise where there are zeros, and principal axes that are no one's."""
-    scene, rng = load_scene(system), np.random.default_rng(0)
+    scene, rng = zoo.load(system), np.random.default_rng(0)
     expected, model = physics(scene), scene.model
     originals = {name: value.copy() for name, value in arrays(model).items()}
     for _ in range(5):
@@ -193,20 +149,11 @@ def test_a_new_static_feature_is_not_in_it(monkeypatch, scene):
     )
     assert load_scene("cheetah").static.node_names[0] == "charm"
     assert {name: load_scene(name).fingerprint() for name in before} == before
-    assert load_scene(MODEL, timestep=0.02).fingerprint() == scene.fingerprint()
-
-
-SOFT = """
-<mujoco model="soft"><worldbody>
-  <flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.1 0.1 0.1" pos="0 0 1" dim="2" radius="0.01" mass="1">
-    <edge equality="true" damping="0.1"/>
-  </flexcomp>
-</worldbody></mujoco>
-"""
+    assert zoo.load("everything", timestep=0.02).fingerprint() == scene.fingerprint()
 
 
 def test_soft_bodies():
-    scene = load_scene(SOFT)
+    scene = zoo.load("soft")
     for old, new in (('radius="0.01"', 'radius="0.02"'), ('damping="0.1"', 'damping="0.2"'), ('mass="1"', 'mass="2"')):
-        assert load_scene(SOFT.replace(old, new)).fingerprint() != scene.fingerprint(), new
-    assert load_scene(SOFT).fingerprint() == scene.fingerprint()
+        assert zoo.load("soft", (old, new)).fingerprint() != scene.fingerprint(), new
+    assert zoo.load("soft").fingerprint() == scene.fingerprint()

@@ -6,26 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.joint_axes import joint_axes
 
-TWO_HINGES = """
-<mujoco>
-  <worldbody>
-    <body name="a" euler="10 20 30"><joint axis="1 0 0"/><geom size=".1"/>
-      <body name="b" pos="0 0 .3" euler="40 0 10">
-        <joint type="slide" axis="0 1 1"/><joint axis="1 1 0"/><joint axis="0 0 1"/><geom size=".1"/>
-        <body name="c" pos="0 .2 .1"><joint type="ball"/><geom size=".05"/></body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
+from .. import zoo
 
 
-@pytest.mark.parametrize("name", ["cartpole", "swimmer4", "cheetah", "walker2d", "jaco", TWO_HINGES])
+@pytest.mark.parametrize("name", ["cartpole", "swimmer4", "cheetah", "walker2d", "jaco", "joints", "two_hinges"])
 def test_axes_are_mujocos_in_any_pose(name):
-    scene = load_scene(name)
+    scene = zoo.load(name)
     model, data = scene.model, mujoco.MjData(scene.model)
     nodes, axes = joint_axes(scene)
     has_axis = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])

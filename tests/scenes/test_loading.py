@@ -18,27 +18,20 @@ from torchrl_gn.scenes import (
 )
 from torchrl_gn.scenes.systems.system import model_file
 
+from .. import zoo
 
-def _model(actuators: str, rest: str = "") -> str:
-    return f"""
-    <mujoco model="small"><worldbody>
-      <body name="a"><joint name="j"/><geom size=".1" pos=".2 0 0"/><site name="s"/>
-        <body name="b" pos=".5 0 0"><joint name="k"/><geom size=".1" pos=".2 0 0"/></body></body>
-    </worldbody>{rest}<actuator>{actuators}</actuator></mujoco>"""
-
-
-GOOD = _model('<motor name="m" joint="j" ctrlrange="-1 2"/>')
-_TENDON = '<tendon><fixed name="t"><joint joint="j" coef="1"/><joint joint="k" coef="2"/></fixed></tendon>'
+GOOD, MOTOR = zoo.mjcf("two_links"), '<motor name="m" joint="a" ctrlrange="-1 2"/>'
+_TENDON = '<tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="2"/></fixed></tendon>'
 
 
 def test_text_file_and_spec_give_the_same_scene(tmp_path):
-    path = tmp_path / "two_links.xml"
+    path = tmp_path / "mine.xml"
     path.write_text(GOOD)
     scenes = [load_scene(source) for source in (GOOD, path, str(path), mujoco.MjSpec.from_string(GOOD))]
-    assert [scene.name for scene in scenes] == ["small", "two_links", "two_links", "small"]
+    assert [scene.name for scene in scenes] == ["two_links", "mine", "mine", "two_links"]
     assert len({scene.fingerprint() for scene in scenes}) == 1
     assert (scenes[0].action_low[0], scenes[0].action_high[0]) == (-1, 2)
-    assert load_scene(path, name="mine").name == "mine"
+    assert load_scene(path, name="other").name == "other"
 
 
 def test_loading_leaves_a_spec_as_it_was():
@@ -53,17 +46,17 @@ def test_loading_leaves_a_spec_as_it_was():
     [
         ('<motor name="pull" tendon="t" ctrlrange="-1 1"/>', _TENDON, ["'pull'", "tendon"]),
         ('<motor name="jet" site="s" ctrlrange="-1 1"/>', "", ["'jet'", "site"]),
-        ('<adhesion name="glue" body="b" ctrlrange="0 1"/>', "", ["'glue'", "body"]),
-        ('<motor name="m" joint="j"/>', "", ["'m'", "ctrlrange"]),
+        ('<adhesion name="glue" body="second" ctrlrange="0 1"/>', "", ["'glue'", "body"]),
+        ('<motor name="m" joint="a"/>', "", ["'m'", "ctrlrange"]),
         (
-            '<motor name="m" joint="j" ctrlrange="-1 1"/><velocity name="v" joint="j" ctrlrange="-1 1"/>',
+            '<motor name="m" joint="a" ctrlrange="-1 1"/><velocity name="v" joint="a" ctrlrange="-1 1"/>',
             "",
-            ["'m'", "'v'", "'j'"],
+            ["'m'", "'v'", "'a'"],
         ),
-        ('<intvelocity name="i" joint="j" ctrlrange="-1 1" actrange="-1 1"/>', "", ["'i'", "activation"]),
-        ('<motor joint="j" ctrlrange="-1 1"/><motor tendon="t" ctrlrange="-1 1"/>', _TENDON, ["'actuator1'"]),
+        ('<intvelocity name="i" joint="a" ctrlrange="-1 1" actrange="-1 1"/>', "", ["'i'", "activation"]),
+        ('<motor joint="a" ctrlrange="-1 1"/><motor tendon="t" ctrlrange="-1 1"/>', _TENDON, ["'actuator1'"]),
         pytest.param(
-            '<motor name="late" joint="j" ctrlrange="-1 1" delay=".01" nsample="9"/>',
+            '<motor name="late" joint="a" ctrlrange="-1 1" delay=".01" nsample="9"/>',
             "",
             ["'late'", "delay"],
             marks=pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_history"), reason="needs MuJoCo 3.5"),
@@ -72,7 +65,7 @@ def test_loading_leaves_a_spec_as_it_was():
 )
 def test_refusals_name_the_element(actuators, rest, named):
     with pytest.raises(UnsupportedSceneError) as error:
-        load_scene(_model(actuators, rest))
+        zoo.load("two_links", (MOTOR, actuators), ("<actuator>", rest + "<actuator>"))
     for text in named:
         assert text in str(error.value)
 
@@ -188,8 +181,8 @@ def test_description_of_a_file_needs_no_other_file(tmp_path):
 
 def test_changed_physics_warns():
     description = load_scene(GOOD).description()
-    description["mjcf"] = description["mjcf"].replace('size=".1"', 'size=".11"', 1)
-    with pytest.warns(SceneChangedWarning, match="small"):
+    description["mjcf"] = description["mjcf"].replace('size=".01"', 'size=".011"', 1)
+    with pytest.warns(SceneChangedWarning, match="two_links"):
         scene_from_description(description)
 
 
@@ -199,10 +192,9 @@ def test_spec_scene_has_no_exact_description():
 
 
 def test_unnamed_elements_get_names():
-    text = GOOD.replace('name="b"', "").replace('name="k"', "")
-    scene = load_scene(text)
-    assert scene.node_names == ("world", "a", "body2")
-    assert scene.joint_names == ("j", "joint1")
+    scene = zoo.load("two_links", ('name="second"', ""), ('name="b"', ""))
+    assert scene.node_names == ("world", "first", "body2")
+    assert scene.joint_names == ("a", "joint1")
 
 
 @pytest.mark.skipif(not hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP"), reason="needs MuJoCo 3.4")

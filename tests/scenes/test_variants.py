@@ -23,6 +23,8 @@ from torchrl_gn.scenes import (
 )
 from torchrl_gn.scenes.physical_parameters import topology
 
+from .. import zoo
+
 LIMBS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 LINKS = ("head", *(f"segment_{i}" for i in range(5)))
 FINGERS = (1, 2, 3)
@@ -259,7 +261,7 @@ def test_what_has_no_parameters_is_refused_and_named():
             with pytest.raises(ValueError, match=f"'{system}' has no.*: pendulum, cartpole, swimmerN, cheetah, jaco"):
                 attempt()
     assert {name for name in SYSTEMS if name in TABLE} == set(SYSTEMS) - {"acrobot", "walker2d"}
-    text = '<mujoco><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>'
+    text = zoo.mjcf("pole")
     for source in (text, "robot.xml", mujoco.MjSpec.from_string(text)):
         with pytest.raises(ValueError, match="has no parameters to vary; these systems have: pendulum"):
             load_scene(source, parameters={"length": 1})

@@ -20,6 +20,8 @@ from torchrl_gn.training import Budget, OffPolicyTrainer, mean_return
 from torchrl_gn.training.optimizers import make_optimizer
 from torchrl_gn.training.trainer import Trainer
 
+from ..sizes import SMALL
+
 
 @pytest.fixture(scope="session")
 def scene() -> Scene:
@@ -35,8 +37,7 @@ def trajectories(scene) -> TensorDict:
 def make_model(scene) -> Callable[..., ForwardModel]:
     def make(seed: int = 0, **options) -> ForwardModel:
         torch.manual_seed(seed)
-        small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-        return ForwardModel(ParameterNames.of(scene), **(small | options))
+        return ForwardModel(ParameterNames.of(scene), **(SMALL | {"latent": 4} | options))
 
     return make
 
