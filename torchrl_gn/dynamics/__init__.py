@@ -1,9 +1,14 @@
-"""Forward models: weights, predictors of a scene, and their executors."""
+"""Forward models: weights, predictors of one scene, and what executes their steps."""
 
 from torchrl_gn.dynamics.export import export_step as export_step
+from torchrl_gn.dynamics.features import BodyState as BodyState
+from torchrl_gn.dynamics.features import Canonicalizer as Canonicalizer
+from torchrl_gn.dynamics.features import Contacts as Contacts
+from torchrl_gn.dynamics.features import Controls as Controls
+from torchrl_gn.dynamics.features import Feature as Feature
+from torchrl_gn.dynamics.features import JointAxes as JointAxes
 from torchrl_gn.dynamics.model import ForwardModel as ForwardModel
 from torchrl_gn.dynamics.predictor import Predictor as Predictor
-from torchrl_gn.dynamics.recurrent_predictor import RecurrentPredictor as RecurrentPredictor
 from torchrl_gn.dynamics.specialized import SpecializedPredictor as SpecializedPredictor
 from torchrl_gn.dynamics.specialized import specialize as specialize
-from torchrl_gn.dynamics.unseen_features import UnseenFeatureWarning as UnseenFeatureWarning
+from torchrl_gn.dynamics.unseen_parameters import UnseenParameterWarning as UnseenParameterWarning

@@ -11,38 +11,40 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.dynamics.predictor import Folded, Predictor
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.dynamics.specialized import SpecializedPredictor, specialize
 
 
-def export_step(bound: Predictor, path: str | os.PathLike) -> Path:
+def export_step(predictor: Predictor, path: str | os.PathLike) -> Path:
     """Write one step of a scene's forward model as a ``torch.export`` program.
 
-    Everything that the scene doesn't need is folded away first (:func:`specialize`). The file holds weights and program
-    and needs PyTorch alone::
+    The step is specialised first (:func:`specialize`). The file holds weights and program and needs PyTorch alone::
 
         step = torch.export.load("swimmer6.pt2").module()
         next_state = step(state, action)  # [B, N, 13] and [B, A], in the dtypes given here: float64 and float32
 
-    It is a snapshot: later changes of the weights don't reach it. Beside the program lies ``scene.json``, as an extra
-    file, with the names of nodes and actions and the control step.
+    It is a snapshot. An extra file ``scene.json`` names nodes and actions and the control step.
 
     Args:
-        bound: the forward model of the scene; what :func:`specialize` takes, or gives.
+        predictor: forward model of the scene, specialised or not.
         path: file to write, ``.pt2``.
 
     Returns:
         The written path.
 
     Raises:
-        TypeError: for a recurrent core, or one of the ablation study.
-        ValueError: if every sample brings physical parameters of its own.
+        TypeError: for a recurrent model.
+        ValueError: if each sample brings its own physical parameters.
     """
-    if bound.parameters_key is not None:
+    if predictor.model.core.recurrent:
+        raise TypeError("A recurrent model cannot be exported: its step also takes a hidden state.")
+    if predictor.parameters_key is not None:
         raise ValueError(
             "Samples bring physical parameters of their own; bind the model to one scene, without parameters_key."
         )
-    model = bound if isinstance(bound, SpecializedPredictor) else specialize(bound)
+    model = predictor if isinstance(predictor, SpecializedPredictor) else specialize(predictor)
     scene, device = model.scene, model.movable.device
     rest = torch.eye(model.layout.size, dtype=torch.float64, device=device)[min(3, model.layout.size - 1)]
     # Two samples: of one alone the program would be for one alone.
@@ -51,7 +53,7 @@ def export_step(bound: Predictor, path: str | os.PathLike) -> Path:
     batch = torch.export.Dim("batch")
     with torch.no_grad():
         program = torch.export.export(
-            _Step(model, model.fold()), (state, action), dynamic_shapes=({0: batch}, {0: batch})
+            _Step(model.executor().program), (state, action), dynamic_shapes=({0: batch}, {0: batch})
         )
     about = {
         "scene": scene.name,
@@ -67,13 +69,11 @@ def export_step(bound: Predictor, path: str | os.PathLike) -> Path:
 
 
 class _Step(nn.Module):
-    """One step from a snapshot, which is then a constant of the program."""
+    """One step of a program, whose tensors become constants of the exported one."""
 
-    model: SpecializedPredictor
-
-    def __init__(self, model: SpecializedPredictor, folded: Folded) -> None:
+    def __init__(self, program: StepProgram) -> None:
         super().__init__()
-        self.__dict__["model"], self.folded = model, folded  # no submodule: its weights are not exported
+        self.__dict__["step"] = program  # no submodules: its buffers are constants
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        return Predictor._advance(self.model, state, action, self.folded)[0]  # never the compiled step
+        return eager.step(self.__dict__["step"], state, action, None)[0]

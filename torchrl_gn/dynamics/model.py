@@ -1,205 +1,131 @@
-"""Forward model: one set of weights that predicts a control step of any scene."""
+"""Forward model: the weights that predict a control step of any scene."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import nn
 
-from torchrl_gn.dynamics.features.contacts import Contacts
+from torchrl_gn.dynamics.features import FEATURES, BodyState, Canonicalizer, Contacts, Controls, Feature, JointAxes
 from torchrl_gn.maths.normalizer import Normalizer
-from torchrl_gn.maths.state_layout import BODY_STATE, Component, Encoding, StateLayout
-from torchrl_gn.networks.ablated_core import AblatedCore, UnfoldedCore
-from torchrl_gn.networks.folded_gn_core import FoldedCore
-from torchrl_gn.networks.gn_block import Pool
-from torchrl_gn.networks.gn_core import GNCore
-from torchrl_gn.networks.graph import Graph, GraphSize
-from torchrl_gn.networks.incidence import Incidence
-from torchrl_gn.networks.mlp_core import FoldedMLP, MLPCore
-from torchrl_gn.networks.recurrent_core import RecurrentCore
-from torchrl_gn.scenes.parameter_names import ParameterNames
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
+from torchrl_gn.networks.core import Core
+from torchrl_gn.networks.cores import core_class
+from torchrl_gn.networks.graph import GraphSize
+from torchrl_gn.scenes import KinematicTree, ParameterNames, PhysicalParameters, Scene
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.predictor import Predictor
-    from torchrl_gn.scenes import Scene
 
-Static = Literal["none", "scene", "inferred"]
-CoreKind = Literal[
-    "gn", "recurrent", "mlp", "interaction_network", "no_edge_update", "no_node_update", "no_global_update"
-]
+ParameterSource = Literal["none", "scene", "inferred"]
 
-# Spreads below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
+# Standard deviations below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 _DYNAMIC_FLOOR = 1e-9
-# Bodies this many spreads from all that training saw are shown as if they were that far only.
-_STATIC_LIMIT = 20.0
+# Physical parameters further than this from training's, in standard deviations, are clipped to it.
+_PARAMETER_LIMIT = 20.0
 
 
 class ForwardModel(nn.Module):
-    """Graph-network forward model (paper, "Forward models", SM "Forward prediction algorithm").
+    """Weights of a forward model: features, core and normalisers (paper, "Forward models", SM "Forward prediction").
 
-    Holds everything that is learned: the core's weights and the normalisers. It
-    knows no scene; :meth:`bind` joins it to one and gives the TensorDict module
-    that predicts. Any number of scenes can be bound to the same weights.
+    Knows no scene; :meth:`bind` joins it to one and gives the :class:`~torchrl_gn.dynamics.Predictor`. Any number of
+    scenes share the same weights. :meth:`for_scene` builds one without typing a scene's facts.
 
     Args:
-        features: static features that the model reads, see :meth:`ParameterNames.of`.
-        parameters: ``"scene"`` reads the true physical parameters, ``"none"`` none of them, ``"inferred"`` a graph that
-            another network makes instead, with features as they are.
-        inferred: numbers of node, edge and global features of the inferred graph. With ``link`` nodes get six more: how
-            far joint anchors were found from where the scene has them.
-        layout: what the state's channels mean.
-        encoding: how the network sees an orientation: as the entries of its rotation
-            ``"matrix"`` or (paper) as the ``"quaternion"``.
-        integrate: predict position and orientation as what their rates do not explain
-            (trapezoidal rule); the paper predicts the whole change.
-        joint_axes: show the network each joint's axis in the frame of the positions and the control along
-            it, so that it need not learn to turn them; the paper shows the control alone.
-        contacts: show the network how far each body's points are from the plane that they can touch, and
-            how they move, so that it need not compute that; the paper shows it positions alone.
-        controls: how many controls act at a joint; several only without ``joint_axes``.
-        recenter: make the prediction independent of where a translation-invariant scene
-            is (paper: on for single systems, off when several train together).
-        positions: show the network where bodies are along axes of translation invariance. Where joints joint anchor all
-            bodies together orientations tell it too, and a network without positions is at home in scenes larger
-            than those it was trained on.
-        align: make the prediction independent of how a rotation-invariant scene is turned
-            (:attr:`Scene.yaw_frame <torchrl_gn.scenes.Scene>`); the paper does not.
-        link: keep bodies that joints joint anchor together together: of the predicted positions and
-            velocities only those of each joint_anchors as a whole are used, the rest follows
-            from the orientations and angular velocities. The paper lets bodies drift apart.
-        core: ``"gn"``, two graph networks; ``"recurrent"``, these with a hidden state
-            (:class:`~torchrl_gn.networks.RecurrentCore`); their rival ``"mlp"``, one MLP over the flattened
-            graph (paper, SM "MLP baseline architectures"); or what they are without one of their parts
-            (:class:`~torchrl_gn.networks.AblatedCore`; paper, SM Figure "Ablation study of the architecture"):
-            ``"interaction_network"``, ``"no_edge_update"``, ``"no_node_update"`` or ``"no_global_update"``.
-        skip: whether the second graph network also reads what the first read.
-        pool: whether globals see the ``"sum"`` (paper) of all nodes and edges or their ``"mean"``.
-        hidden_state: numbers of node, edge and global features that a recurrent core remembers.
-        latent: features of the graph between the two GN blocks.
-        edge_hidden: hidden sizes of the edge MLPs.
-        node_hidden: hidden sizes of the node MLPs.
-        global_hidden: hidden sizes of the global MLP.
-        mlp_hidden: hidden sizes of the rival.
-        items: numbers of nodes and edges of the only graphs that the rival can read.
-        activation: between the layers: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
+        parameter_names: physical parameters that the model reads, see :meth:`ParameterNames.of`.
+        parameters: ``"scene"`` reads the true physical parameters, ``"none"`` none of them, ``"inferred"`` a graph from
+            an inference model instead.
+        inferred: numbers of node, edge and global features of the inferred graph. With ``project`` nodes get six more:
+            the estimated anchor offsets less the scene's.
+        layout: channels of the state.
+        features: what the network sees.
+        canonicalizer: which invariances are built in.
+        integrate: predict of position and orientation only what their rates do not explain (trapezoidal rule); the
+            paper predicts the whole change.
+        project: project predictions onto the joint constraints. Paper: bodies drift apart.
+        core: name of the network, one of :data:`~torchrl_gn.networks.CORES`.
+        counts: numbers of nodes and edges, for a core that reads graphs of one size.
+        **core_options: of the core's class, for example ``hidden=64``.
 
     Raises:
-        ValueError: if an option is none of its choices, the rival lacks ``items``, or ``skip=False`` means nothing.
+        ValueError: if an option is none of its choices.
     """
 
     def __init__(
         self,
-        features: ParameterNames,
+        parameter_names: ParameterNames,
         *,
-        parameters: Static = "scene",
+        parameters: ParameterSource = "scene",
         inferred: Sequence[int] = (10, 10, 10),
         layout: StateLayout = BODY_STATE,
-        encoding: Encoding = "matrix",
+        features: Sequence[Feature] = (BodyState(), Controls(), JointAxes(), Contacts()),
+        canonicalizer: Canonicalizer | None = None,
         integrate: bool = True,
-        joint_axes: bool = True,
-        contacts: bool = True,
-        controls: int = 1,
-        recenter: bool = True,
-        positions: bool = True,
-        align: bool = True,
         project: bool = True,
-        core: CoreKind = "gn",
-        skip: bool = True,
-        pool: Pool = "sum",
-        hidden_state: Sequence[int] = (20, 20, 20),
-        latent: int = 128,
-        edge_hidden: Sequence[int] = (128, 128),
-        node_hidden: Sequence[int] = (128, 128),
-        global_hidden: Sequence[int] = (128, 128),
-        mlp_hidden: Sequence[int] = (256, 256, 256, 256, 256),
-        items: Sequence[int] | None = None,
-        activation: str = "silu",
+        core: str = "gn",
+        counts: Sequence[int] | None = None,
+        **core_options,
     ) -> None:
         super().__init__()
-        for name, value, choices in (
-            ("parameters", parameters, Static),
-            ("encoding", encoding, Encoding),
-            ("core", core, CoreKind),
-        ):
-            if value not in get_args(choices):
-                raise ValueError(f"{name}={value!r} is not known; use one of {list(get_args(choices))}.")
-        if not skip and core in ("recurrent", "mlp"):
-            raise ValueError(f"skip=False is for two graph networks; core={core!r} cannot do without. Leave skip out.")
-        self.features = features if parameters == "scene" else ParameterNames()
-        self.parameter_source, self.layout = parameters, layout
-        self.encoding: Encoding = encoding
-        self.integrate, self.joint_axes = integrate, joint_axes
-        self.contacts = contacts
-        self.recenter, self.positions, self.align, self.project = recenter, positions, align, project
-        self.options = {
-            "parameters": parameters,
-            "inferred": list(inferred),
-            "encoding": encoding,
-            "integrate": integrate,
-            "joint_axes": joint_axes,
-            "contacts": contacts,
-            "controls": controls,
-            "recenter": recenter,
-            "positions": positions,
-            "align": align,
-            "project": project,
-            "core": core,
-            "skip": skip,
-            "pool": pool,
-            "hidden_state": list(hidden_state),
-            "latent": latent,
-            "edge_hidden": list(edge_hidden),
-            "node_hidden": list(node_hidden),
-            "global_hidden": list(global_hidden),
-            "mlp_hidden": list(mlp_hidden),
-            "items": None if items is None else list(items),
-            "activation": activation,
-        }
+        if parameters not in get_args(ParameterSource):
+            choices = list(get_args(ParameterSource))
+            raise ValueError(f"parameters={parameters!r} is not known; use one of {choices}.")
+        self.parameter_source, self.layout, self.features = parameters, layout, tuple(features)
+        self.parameter_names = parameter_names if parameters == "scene" else ParameterNames()
+        self.canonicalizer = Canonicalizer() if canonicalizer is None else canonicalizer
+        self.integrate, self.project = integrate, project
+        self.core_name, self.core_options = core, core_options
 
-        encoded = layout.encoded_size(encoding) + (Contacts.size if contacts else 0)
-        names = self.features
+        def count(part: str) -> int:
+            return sum(feature.size(layout) for feature in self.features if feature.part == part)
+
+        self.dynamic_size = GraphSize(count("nodes"), count("edges"), 0)
         self.inferred_size = GraphSize(*inferred)
+        names = self.parameter_names
+        static = GraphSize(len(names.nodes), len(names.edges), len(names.globals_))
         if parameters == "inferred":
-            # Where joint anchors were found says how long bodies are.
-            self.static_size = self.inferred_size + GraphSize(6 if project else 0, 0, 0)
-        else:
-            self.static_size = GraphSize(len(names.nodes), len(names.edges), len(names.globals_))
-        self.node_normalizer = Normalizer(encoded, floor=_DYNAMIC_FLOOR)
-        if joint_axes and controls != 1:
-            raise ValueError(f"joint_axes=True takes one control at each joint, not controls={controls}.")
-        self.dynamic_size = GraphSize(encoded, 7 if joint_axes else controls, 0)
+            # The anchor offsets say how long bodies are.
+            static = self.inferred_size + GraphSize(6 if project else 0, 0, 0)
+        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=_DYNAMIC_FLOOR)
         self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=_DYNAMIC_FLOOR)
-        self.parameter_node_normalizer = Normalizer(self.static_size.nodes, limit=_STATIC_LIMIT)
-        self.parameter_edge_normalizer = Normalizer(self.static_size.edges, limit=_STATIC_LIMIT)
-        self.parameter_global_normalizer = Normalizer(self.static_size.globals_, limit=_STATIC_LIMIT)
-        # The network's output has the residual's scale; errors are weighed by the whole change's.
+        self.parameter_node_normalizer = Normalizer(static.nodes, limit=_PARAMETER_LIMIT)
+        self.parameter_edge_normalizer = Normalizer(static.edges, limit=_PARAMETER_LIMIT)
+        self.parameter_global_normalizer = Normalizer(static.globals_, limit=_PARAMETER_LIMIT)
+        # The network's output has the residual's scale; errors are weighted by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
-        in_size, out = self.dynamic_size + self.static_size, layout.delta_size
-        self.core: GNCore | RecurrentCore | MLPCore | AblatedCore
-        if core == "mlp":
-            if items is None:
-                raise ValueError("core='mlp' needs items, the numbers of nodes and edges of its scene.")
-            nodes, edges = items
-            self.core = MLPCore(in_size, out, items=(nodes, edges), hidden=mlp_hidden, activation=activation)
-            return
-        hidden = {"edge_hidden": edge_hidden, "node_hidden": node_hidden, "global_hidden": global_hidden}
-        sizes: dict[str, Any] = {"latent": latent, "activation": activation, "pool": pool, **hidden}
-        if core == "recurrent":
-            self.core = RecurrentCore(self.dynamic_size, self.static_size, out, hidden_state=hidden_state, **sizes)
-        elif core == "gn" and skip:
-            self.core = GNCore(in_size, out, **sizes)
-        else:
-            ablation = "none" if core == "gn" else core
-            self.core = AblatedCore(in_size, out, ablation=ablation, skip=skip, **sizes)
+        kind = core_class(core)
+        fixed = {"counts": counts} if kind.fixed_size else {}
+        self.core: Core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
+
+    @classmethod
+    def for_scene(
+        cls, scene: Scene | KinematicTree | Sequence[Scene], *, features: Sequence[Feature] | None = None, **options
+    ) -> ForwardModel:
+        """A model with fresh weights for a scene, or for several that share it.
+
+        Layout, controls at each joint, names of the physical parameters and the graph's size are read from the scene.
+
+        Args:
+            scene: the scene, or scenes with the same physical parameters.
+            features: what the network sees; default: all that suits the scene.
+            **options: of :class:`ForwardModel` and its core.
+        """
+        scene = scene if isinstance(scene, (Scene, KinematicTree)) else scene[0]
+        layout = joint_layout(scene.extras) if isinstance(scene, KinematicTree) else BODY_STATE
+        if features is None:
+            spatial = "orientation" in layout.names
+            features = (BodyState(), Controls(), *((JointAxes(), Contacts()) if spatial else ()))
+        chosen = [feature.resolved(scene) for feature in features]  # pyright: ignore[reportArgumentType]
+        counts = scene.num_nodes, scene.num_edges
+        return cls(ParameterNames.of(scene), layout=layout, features=chosen, counts=counts, **options)
 
     @property
     def parameter_normalizers(self) -> dict[str, Normalizer]:
-        """Normalisers of static features, by the part of the graph that has them."""
+        """Normalisers of the physical parameters, by part of the graph."""
         return {
             "nodes": self.parameter_node_normalizer,
             "edges": self.parameter_edge_normalizer,
@@ -208,19 +134,29 @@ class ForwardModel(nn.Module):
 
     @property
     def fitted(self) -> bool:
-        """Whether the normalisers of all that the model reads and predicts have seen data. Waits for the device."""
+        """Whether all normalisers that the model reads have seen data. Waits for the device."""
         read = [self.node_normalizer, self.edge_normalizer, self.residual_normalizer, self.delta_normalizer]
         if self.parameter_source == "scene":  # an inferred graph is read as it is
             read += self.parameter_normalizers.values()
         return all(normalizer.fitted for normalizer in read)
 
-    def values_of(self, scene: Scene) -> PhysicalParameters:
-        """What the model reads of a scene; zeros where it reads an inferred graph.
+    def state_columns(self) -> dict[str, slice]:
+        """Where the node features hold each component of the state; empty without :class:`BodyState`."""
+        start = 0
+        for feature in self.features:
+            if isinstance(feature, BodyState):
+                where = self.layout.encoded_slices(feature.encoding)
+                return {name: slice(start + part.start, start + part.stop) for name, part in where.items()}
+            start += feature.size(self.layout) if feature.part == "nodes" else 0
+        return {}
+
+    def parameters_of(self, scene: Scene) -> PhysicalParameters:
+        """What the model reads of a scene; zeros of an inferred graph.
 
         Raises:
-            ValueError: if the scene lacks features that the model reads.
+            ValueError: if the scene lacks parameters that the model reads.
         """
-        values = self.features.select(scene)
+        values = self.parameter_names.select(scene)
         if self.parameter_source != "inferred":
             return values
         zeros = {
@@ -234,69 +170,70 @@ class ForwardModel(nn.Module):
         scene: Scene,
         *,
         strict: bool = False,
-        plain: bool = False,
+        reference: bool = False,
         parameters_key: NestedKey | None = None,
-        static_features: ParameterNames | None = None,
+        parameter_names: ParameterNames | None = None,
     ) -> Predictor:
         """Join these weights to a scene.
 
         Args:
-            scene: any scene with the features the model reads.
-            strict: refuse, instead of warning, a scene with a value that training never saw
-                in a feature that never varied.
-            plain: evaluate the core as the paper writes it, slowly: the reference for all that is faster.
-            parameters_key: where each sample has its own physical parameters (a variant's, or inferred); None: all have the
-                scene's.
-            static_features: names of the static features that samples bring there, a data set's ``features``, from
-                which the model takes its own by name. Default: all that the scene has, as samples of this version of
-                the library bring them.
+            scene: any scene with the physical parameters that the model reads.
+            strict: refuse, instead of warning, a scene that differs in a parameter that never varied in training.
+            reference: evaluate the core by message passing, slowly: the reference of everything faster.
+            parameters_key: where each sample has its own physical parameters (a variant's, or inferred); None: all
+                have the scene's.
+            parameter_names: names of the parameters that samples bring there, a data set's ``features``. Default: all
+                that the scene has.
 
         Returns:
             TensorDict module ``state, action -> ("next", "state")`` that shares these weights.
 
         Raises:
-            ValueError: if the scene, or what samples bring, lacks features that the model reads; or with ``strict``.
+            ValueError: if the scene, or what samples bring, lacks parameters that the model reads; or with ``strict``.
         """
         from torchrl_gn.dynamics.predictor import Predictor
-        from torchrl_gn.dynamics.recurrent_predictor import RecurrentPredictor
 
-        kind = RecurrentPredictor if isinstance(self.core, RecurrentCore) else Predictor
-        options = {
-            "strict": strict,
-            "plain": plain,
-            "parameters_key": parameters_key,
-            "static_features": static_features,
-        }
-        return kind(self, scene, **options)
-
-    def fold(self, parameters: Graph, incidence: Incidence) -> FoldedCore | FoldedMLP | UnfoldedCore:
-        """The core for one scene, differentiable in the weights.
-
-        Args:
-            parameters: normalised static graph.
-            incidence: of the scene, and which of its nodes are predicted: those that move.
-        """
-        return self.core.fold(self.dynamic_size, incidence, parameters)
-
-    def forward(self, dynamic: Graph, folded: FoldedCore | FoldedMLP | UnfoldedCore) -> Tensor:
-        """Predicted residual change, in SI units.
-
-        Args:
-            dynamic: normalised dynamic graph ``[*B, ...]``.
-            folded: what :meth:`fold` gave for the scene.
-
-        Returns:
-            ``[*B, N, delta_size]``, for predicted nodes.
-        """
-        return self.residual_normalizer.inverse(folded.predict(dynamic))
+        options = {"parameters_key": parameters_key, "parameter_names": parameter_names}
+        return Predictor(self, scene, strict=strict, reference=reference, **options)
 
     def description(self) -> dict:
-        """Everything needed to build this model again, as plain JSON-able values."""
-        return {"features": asdict(self.features), "layout": asdict(self.layout), "options": self.options}
+        """Plain, JSON-able values from which :meth:`from_description` builds this model again."""
+        names = {kind: name for name, kind in FEATURES.items()}
+        if unknown := [type(feature).__name__ for feature in self.features if type(feature) not in names]:
+            raise ValueError(f"Features {unknown} have no name for a checkpoint: add them to FEATURES.")
+        return {
+            "parameter_names": asdict(self.parameter_names),
+            "parameters": self.parameter_source,
+            "inferred": list(asdict(self.inferred_size).values()),
+            "layout": asdict(self.layout),
+            "features": [{"feature": names[type(feature)], **feature.options()} for feature in self.features],
+            "canonicalizer": asdict(self.canonicalizer),
+            "integrate": self.integrate,
+            "project": self.project,
+            "core": self.core_name,
+            "counts": None if self.core.counts is None else list(self.core.counts),
+            "core_options": _plain(self.core_options),
+        }
 
     @classmethod
     def from_description(cls, description: dict) -> ForwardModel:
-        """Build the model that :meth:`description` described, with fresh weights."""
-        features = ParameterNames.from_names(description["features"])
-        layout = StateLayout(tuple(Component(**component) for component in description["layout"]["components"]))
-        return cls(features, layout=layout, **description["options"])
+        """Build the model of a :meth:`description`, with fresh weights."""
+        rest = dict(description)
+        features = []
+        for each in rest.pop("features"):
+            options = dict(each)
+            features.append(FEATURES[options.pop("feature")](**options))
+        layout = StateLayout(tuple(Component(**component) for component in rest.pop("layout")["components"]))
+        return cls(
+            ParameterNames.from_names(rest.pop("parameter_names")),
+            layout=layout,
+            features=features,
+            canonicalizer=Canonicalizer(**rest.pop("canonicalizer")),
+            **rest.pop("core_options"),
+            **rest,
+        )
+
+
+def _plain(options: dict) -> dict:
+    """The same options with lists in place of tuples, as JSON has them."""
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in options.items()}

@@ -1,4 +1,4 @@
-"""The numbers that a model reads of its scene, and of samples that bring their own."""
+"""The physical parameters that a predictor reads."""
 
 from __future__ import annotations
 
@@ -13,23 +13,22 @@ from torchrl_gn.scenes.parameter_names import ParameterNames, take_columns
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 if TYPE_CHECKING:
+    from torchrl_gn.dynamics.model import ForwardModel
     from torchrl_gn.scenes import Scene
 
 _PARTS = ("nodes", "edges", "globals_")
-_PINS = ("parent_anchor", "child_anchor")
+_ANCHORS = ("parent_anchor", "child_anchor")
 
 
 class ParameterReader(Float64Buffers):
-    """What a bound model reads of lengths, masses, ...: its scene's, its samples', or what was inferred of them.
+    """Physical parameters that a predictor reads: its scene's, its samples', or inferred ones.
 
     Args:
-        own: the scene's, as the model reads them.
-        kind: the model's option ``parameters``: ``"scene"``, ``"none"`` or ``"inferred"``.
-        key: where samples bring their own; None: they are the scene's.
-        linked: whether the model links bodies, for which it needs their joint anchors.
+        model: what is read.
         scene: the scene.
-        reads: names of the static features that the model reads.
-        brought: names of those that samples bring; None: all that the scene has.
+        key: where samples bring their own; None: all have the scene's.
+        project: whether joint anchors are read, for the constraint projection.
+        brought: names of the parameters that samples bring; None: all that the scene has.
 
     Raises:
         ValueError: if samples do not bring what the model reads.
@@ -37,24 +36,24 @@ class ParameterReader(Float64Buffers):
 
     def __init__(
         self,
-        own: PhysicalParameters,
-        kind: str,
+        model: ForwardModel,
+        scene: Scene,
         key: NestedKey | None,
         *,
-        linked: bool,
-        scene: Scene,
-        reads: ParameterNames,
+        project: bool,
         brought: ParameterNames | None = None,
     ) -> None:
         super().__init__()
-        self.kind, self.key, self.scene = kind, key, scene
-        self.inferred = (*_PARTS, *_PINS) if linked else _PARTS
-        self.constants(own._asdict())
-        self.brought = (ParameterNames.of(scene) if brought is None else brought) if kind == "scene" else reads
+        self.source, self.key, self.scene = model.parameter_source, key, scene
+        self.inferred = (*_PARTS, *_ANCHORS) if project else _PARTS
+        self.constants(model.parameters_of(scene)._asdict())
+        reads = model.parameter_names
+        everything = ParameterNames.of(scene) if brought is None else brought
+        self.brought = everything if self.source == "scene" else reads
         if missing := reads.missing_in(self.brought):
             raise ValueError(
-                f"The model reads the static features {missing}, which samples of {scene.name!r} do not bring. Collect"
-                " them anew, or build the model with the features of their data set."
+                f"The model reads the parameters {missing}, which samples of {scene.name!r} do not bring. Collect them"
+                " anew, or build the model with the parameters of their data set."
             )
         # Where both have the same columns, nothing is gathered.
         self.columns = None if reads == self.brought else tuple(f"{part}_columns" for part in _PARTS)
@@ -68,14 +67,14 @@ class ParameterReader(Float64Buffers):
         return PhysicalParameters(*(getattr(self, name) for name in PhysicalParameters._fields))
 
     def entries(self) -> TensorDict:
-        """What a sample of the scene itself brings, without batch; zeros of an inferred graph."""
-        if self.kind == "inferred":
+        """Entry of a sample of the scene itself, without batch; zeros of an inferred graph."""
+        if self.source == "inferred":
             return self.own.tensordict().select(*self.inferred)
         return self._brought_by(self.scene).tensordict().to(self.own.nodes.device)
 
     def of(self, scene: Scene, values: PhysicalParameters) -> TensorDict:
-        """What a sample of a variant brings, without batch; zeros, the model's ``values``, of an inferred graph."""
-        brought = self._brought_by(scene) if self.kind == "scene" else values
+        """Entry of a sample of a variant, without batch; the model's zero ``values`` of an inferred graph."""
+        brought = self._brought_by(scene) if self.source == "scene" else values
         return brought.tensordict().to(self.own.nodes.device)
 
     def _brought_by(self, scene: Scene) -> PhysicalParameters:
@@ -84,30 +83,30 @@ class ParameterReader(Float64Buffers):
         return self.brought.select(scene)
 
     def read(self, parameters: TensorDictBase | None) -> PhysicalParameters:
-        """Numbers that samples bring, or the scene's own.
+        """Parameters that samples bring, or the scene's own.
 
         Raises:
-            ValueError: if the model infers its static graph and they are true parameters, or joint anchors are missing.
+            ValueError: if true parameters are given to a model of inferred ones, or joint anchors are missing.
         """
         if parameters is None:
             return self.own
-        if self.kind == "inferred":
+        if self.source == "inferred":
             given, wanted = set(map(str, parameters.keys())), set(self.inferred)
             if given - wanted:
                 raise ValueError(
                     f"The model reads an inferred static graph; {sorted(given - wanted)} are true"
                     " parameters, which it must not see. Give what an inference model wrote."
                 )
-            if not set(_PINS) & wanted <= given:
+            if not set(_ANCHORS) & wanted <= given:
                 raise ValueError(
-                    f"The model links bodies where an inference model finds their joint anchors; {sorted(wanted - given)} are"
-                    " missing. Give what this model's own inference model wrote."
+                    "The model projects onto joint anchors that an inference model estimates;"
+                    f" {sorted(wanted - given)} are missing. Give what this model's own inference model wrote."
                 )
         return PhysicalParameters.read(self._selected(parameters), self.own)
 
     def _selected(self, parameters: TensorDictBase) -> TensorDictBase:
-        """Of the static features that samples bring those that the model reads."""
-        if self.kind != "scene":
+        """Columns that the model reads of the samples' static features."""
+        if self.source != "scene":
             return parameters
         selected = parameters
         for index, part in enumerate(_PARTS):
@@ -117,8 +116,8 @@ class ParameterReader(Float64Buffers):
             if given.shape[-1] != len(names):
                 raise ValueError(
                     f"Samples have {given.shape[-1]} static features in {part!r}, not the {len(names)} of scene"
-                    f" {self.scene.name!r}. Of a data set made with others give their names:"
-                    " bind(..., static_features=dataset.features)."
+                    f" {self.scene.name!r}. If their data set has others, give their names:"
+                    " bind(..., parameter_names=dataset.features)."
                 )
             if self.columns is not None:
                 selected = parameters.copy() if selected is parameters else selected
@@ -126,9 +125,9 @@ class ParameterReader(Float64Buffers):
         return selected
 
     def find(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """The physical parameters that samples bring; None where they are the scene's own.
+        """Physical parameters that samples bring; None where they are the scene's own.
 
-        Of a model that does not read the true physical parameters nothing of the samples' own scenes gets here.
+        None also if the model reads no true parameters.
 
         Raises:
             KeyError: if the model reads them and they are missing.
@@ -136,7 +135,7 @@ class ParameterReader(Float64Buffers):
         """
         parameters = tensordict.get("parameters" if self.key is None else self.key, None)
         if self.key is not None:
-            if self.kind == "none":
+            if self.source == "none":
                 return None
             if parameters is None:
                 raise KeyError(
@@ -160,6 +159,6 @@ class ParameterReader(Float64Buffers):
             if alike and bool((given - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
                 continue
             raise ValueError(
-                f"Samples have other static {name!r} than scene {self.scene.name!r}, which the model is bound to."
+                f"Samples have other parameters {name!r} than scene {self.scene.name!r}, which the model is bound to."
                 " Bind it with parameters_key='parameters' to predict variants of the scene."
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,67 +11,54 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
-from torchrl_gn.dynamics.constraints.generalized_coordinates import make_projection
-from torchrl_gn.dynamics.features.canonical_state import Canonicalizer, CanonicalState
+from torchrl_gn.dynamics.constraints import make_projection
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.executors.eager import EagerExecutor
+from torchrl_gn.dynamics.executors.executor import Executor
+from torchrl_gn.dynamics.features.controls import ControlInputs
+from torchrl_gn.dynamics.normalization import static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
+from torchrl_gn.dynamics.program import InputScaling, OutputScaling, StepProgram
 from torchrl_gn.dynamics.shapes import check_shapes
-from torchrl_gn.dynamics.unseen_features import check_seen
-from torchrl_gn.finite import require_finite
-from torchrl_gn.maths import quaternion
-from torchrl_gn.networks.graph import Graph, graph_concat
+from torchrl_gn.dynamics.unseen_parameters import warn_of_unseen
+from torchrl_gn.networks.core import UnfoldedCore
+from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.model import ForwardModel
-    from torchrl_gn.networks.ablated_core import UnfoldedCore
-    from torchrl_gn.networks.folded_gn_core import FoldedCore
-    from torchrl_gn.networks.mlp_core import FoldedMLP
     from torchrl_gn.scenes import ParameterNames, Scene
-
-
-class Folded(NamedTuple):
-    """What many predictions of the same bodies share.
-
-    Attributes:
-        core: the network with all that is constant folded; None where it is evaluated plainly.
-        values: the numbers of the scene, or of every sample's.
-    """
-
-    core: FoldedCore | FoldedMLP | UnfoldedCore | None
-    values: PhysicalParameters
 
 
 class Predictor(TensorDictModuleBase):
     """Predict the next state of one scene with a forward model's shared weights.
 
-    Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes
-    ``("next", "state")`` ``[*B, N, 13]`` in the dtype of ``state``. The network
-    sees recentred, normalised values in its own dtype, so float64 states keep
-    their precision with a float32 network. Differentiable in states, actions and
-    weights. Made by :meth:`ForwardModel.bind`.
+    Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes ``("next", "state")`` in the dtype of ``state``.
+    The network sees recentred, normalised values in its own dtype, so float64 states keep their precision with a
+    float32 network. Differentiable in states, actions and weights. Made by :meth:`ForwardModel.bind`.
 
-    With a ``parameters_key`` every sample may be another variant of the scene (lengths, masses, ...):
-    the module then also reads a TensorDict of the entries of
-    :class:`~torchrl_gn.scenes.physical_parameters.PhysicalParameters`, as :meth:`parameters_of` gives them or an
-    inference model writes them. Without one, samples that bring other values are refused. A model with
-    ``parameters="none"`` or ``"inferred"`` never reads a sample's true values, nor does anything around
-    its network: bodies are linked where an inference model has found their joint anchors, and without one not at all.
+    With a ``parameters_key`` each sample may be another variant of the scene: the module then also reads a TensorDict
+    of the entries of :class:`~torchrl_gn.scenes.PhysicalParameters` there, as :meth:`parameters_of` gives them or an
+    inference model writes them. Without one, samples with other parameters are refused. A model with
+    ``parameters="none"`` or ``"inferred"`` never reads a sample's true parameters.
+
+    A recurrent model also reads ``hidden_state``, a TensorDict ``[*B]`` of ``nodes``, ``edges`` and ``globals_``, and
+    writes ``("next", "hidden_state")``; without one it starts from the initial hidden state.
 
     Args:
         model: the shared weights.
         scene: the scene to predict.
-        strict: raise, instead of warning, on features that training never saw vary.
-        plain: evaluate the core as the paper writes it, by message passing, edge by edge. The same
-            function, slowly: what everything faster is compared with.
+        strict: raise, instead of warning, on parameters that never varied in training and differ here.
+        reference: evaluate the core by message passing, slowly.
         state_key: where to read the state.
         action_key: where to read the action.
-        parameters_key: where to read each sample's physical parameters; None: they are the scene's.
-        static_features: names of the static features that samples bring there; None: all that the scene has.
+        parameters_key: where to read each sample's physical parameters; None: all have the scene's.
+        parameter_names: names of the parameters that samples bring there; None: all that the scene has.
 
     Raises:
-        ValueError: if the scene lacks features that the model reads, or is a variant whose parameters must be hidden
-            from it, or with ``strict``.
+        ValueError: if the scene lacks parameters that the model reads, has another size than its core reads, or is a
+            variant whose parameters must be hidden from the model; or with ``strict``.
     """
 
     model: ForwardModel
@@ -83,63 +70,63 @@ class Predictor(TensorDictModuleBase):
         scene: Scene,
         *,
         strict: bool = False,
-        plain: bool = False,
+        reference: bool = False,
         state_key: NestedKey = "state",
         action_key: NestedKey = "action",
         parameters_key: NestedKey | None = None,
-        static_features: ParameterNames | None = None,
+        parameter_names: ParameterNames | None = None,
     ) -> None:
         super().__init__()
         self.parameters_key = parameters_key
-        self.in_keys: list[NestedKey] = [state_key, action_key]
-        if parameters_key is not None:
-            self.in_keys.append(parameters_key)
-        self.out_keys: list[NestedKey] = [unravel_key(("next", state_key))]
-        items = model.options["items"]
-        if items is not None and tuple(items) != (scene.num_nodes, scene.num_edges):
-            raise ValueError(
-                f"The model is an MLP for graphs of {items[0]} nodes and {items[1]} edges; scene {scene.name!r} has"
-                f" {scene.num_nodes} and {scene.num_edges}. Train another, or a graph network."
-            )
-        if model.parameter_source != "scene" and "parameters" in getattr(scene, "origin", ()):
-            raise ValueError(
-                f"The model must not see true parameters (static={model.static!r}), and {scene.name!r} is a variant,"
-                " whose bodies it would link by their true lengths. Bind it to the standard scene."
-            )
+        hidden_keys = ["hidden_state"] if model.core.recurrent else []
+        parameters_keys = [] if parameters_key is None else [parameters_key]
+        self.in_keys: list[NestedKey] = [state_key, action_key, *parameters_keys, *hidden_keys]
+        self.out_keys: list[NestedKey] = [unravel_key(("next", key)) for key in (state_key, *hidden_keys)]
+        _check_scene(model, scene)
         self.model, self.scene, self.layout = model, scene, model.layout
-        self.timestep, self.plain, self.strict = float(scene.timestep), plain, strict
+        self.strict, self.reference = strict, reference
 
         ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
         self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
         self.incidence = Incidence(torch.stack(ends).long(), scene.num_nodes, predicted)
-        self.frame = Canonicalizer(scene, model)
-        # Of bodies that turn about one place there is nothing to link.
-        pinned = bool((scene.movable[:, :3].any(1) & (scene.joint_anchors.root != np.arange(scene.num_nodes))).any())
-        # Pins are where lengths say, which are hidden from a model of variants that does not read them.
+        self.canonicalizer = model.canonicalizer.bind(scene, model.layout)
+        self.controls = ControlInputs(scene)
+        self.features = nn.ModuleDict({"nodes": nn.ModuleList(), "edges": nn.ModuleList()})
+        for feature in model.features:
+            bound = feature.bind(scene, model.layout, self.canonicalizer)
+            self.features[feature.part].append(bound)  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
+        # Bodies that rotate about one fixed point have nothing to project.
+        joined = scene.joint_anchors.root != np.arange(scene.num_nodes)
+        constrained = bool((scene.movable[:, :3].any(1) & joined).any())
+        # Anchors follow from lengths, which are hidden from a model of variants that does not read them.
         hidden = parameters_key is not None and model.parameter_source == "none"
-        self.projection = make_projection(scene) if model.project and pinned and not hidden else None
-        self.anchor_scale = scene.joint_anchors.anchor_scale
-        self.statics = ParameterReader(
-            model.values_of(scene),
-            model.parameter_source,
-            parameters_key,
-            linked=self.projection is not None,
-            scene=scene,
-            reads=model.features,
-            brought=static_features,
+        self.projection = make_projection(scene) if model.project and constrained and not hidden else None
+        self.parameter_reader = ParameterReader(
+            model, scene, parameters_key, project=self.projection is not None, brought=parameter_names
         )
         self.to(model.residual_normalizer.mean.device)
-        check_seen(self, self.values, scene.name, stacklevel=4)
+        warn_of_unseen(self, self.scene_parameters, scene.name, stacklevel=4)
 
     @property
-    def values(self) -> PhysicalParameters:
-        """The scene's own numbers, without batch."""
-        return self.statics.own
+    def scene_parameters(self) -> PhysicalParameters:
+        """The scene's physical parameters, without batch."""
+        return self.parameter_reader.own
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Dtype of the network."""
+        # Not of parameters(): under TorchRL's losses weights may be plain tensors.
+        return next(each.weight for each in self.model.core.modules() if isinstance(each, nn.Linear)).dtype
+
+    @property
+    def fixed_batch(self) -> bool:
+        """Whether another batch size costs a compilation."""
+        return False
 
     def own_parameters(self) -> TensorDict:
-        """What a sample of the scene itself has at the ``parameters_key``, without batch; zeros of an inferred graph."""
-        return self.statics.entries()
+        """Entry of a sample of the scene itself at the ``parameters_key``, without batch; zeros of an inferred graph."""
+        return self.parameter_reader.entries()
 
     def parameters_of(self, scene: Scene) -> TensorDict:
         """Physical parameters of a variant of this scene, to give samples at the ``parameters_key``.
@@ -147,8 +134,8 @@ class Predictor(TensorDictModuleBase):
         Stack those of several variants for a batch.
 
         Raises:
-            ValueError: if it is another scene (other bodies, joints, motors or control step), or as :meth:`bind
-                <ForwardModel.bind>` with ``strict``; without, that warns.
+            ValueError: if it is another scene (other bodies, joints, motors or control step); with ``strict`` as
+                :meth:`ForwardModel.bind`.
         """
         here, there = topology(self.scene), topology(scene)
         differs = [what for what in here if here[what] != there[what]]
@@ -157,50 +144,98 @@ class Predictor(TensorDictModuleBase):
                 f"Scene {scene.name!r} is no variant of {self.scene.name!r}: {', '.join(differs)} differ."
                 " Bind the model to it instead."
             )
-        values = self.model.values_of(scene)
-        check_seen(self, values, scene.name, stacklevel=3)
-        return self.statics.of(scene, values)
-
-    @property
-    def network_dtype(self) -> torch.dtype:
-        """Dtype that the network computes in."""
-        # Not of parameters(): under TorchRL's losses weights may be plain tensors.
-        return next(each.weight for each in self.model.core.modules() if isinstance(each, nn.Linear)).dtype
-
-    @dispatch()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the predicted next state into ``tensordict`` and return it."""
-        state, action = (tensordict[key] for key in self.in_keys[:2])
-        tensordict.set(self.out_keys[0], self.step(state, action, self.parameters_in(tensordict)))
-        return tensordict
+        values = self.model.parameters_of(scene)
+        warn_of_unseen(self, values, scene.name, stacklevel=3)
+        return self.parameter_reader.of(scene, values)
 
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """The physical parameters that samples bring; None where they are the scene's own.
-
-        Of a model that does not read the true physical parameters nothing of the samples' own scenes gets here.
+        """Physical parameters that samples bring; None where they are the scene's own or the model reads none.
 
         Raises:
             KeyError: if the model reads them and they are missing.
             ValueError: if the model does not read them and they are not its scene's.
         """
-        return self.statics.find(tensordict)
+        return self.parameter_reader.find(tensordict)
 
-    def step(self, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> Tensor:
-        """Next state.
+    def initial_hidden_state(self) -> TensorDict | None:
+        """Initial hidden state of a recurrent model, without batch; None of others."""
+        if not self.model.core.recurrent:
+            return None
+        return self.model.core.start(static_graph(self, self.scene_parameters)).tensordict()
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the predicted next state into ``tensordict`` and return it."""
+        state, action = (tensordict[key] for key in self.in_keys[:2])
+        hidden = tensordict.get("hidden_state", None) if self.model.core.recurrent else None
+        after, hidden = self.step(state, action, self.parameters_in(tensordict), hidden)
+        tensordict.set(self.out_keys[0], after)
+        return tensordict if hidden is None else tensordict.set(self.out_keys[1], hidden)
+
+    def program(self, parameters: TensorDictBase | None = None, *, reference: bool = False) -> StepProgram:
+        """The step as it is now, differentiable in the weights.
+
+        Args:
+            parameters: physical parameters of each sample, or without batch; default: the scene's.
+            reference: do not fold the core.
+        """
+        model, values = self.model, self.parameter_reader.read(parameters)
+        static, unfolded = static_graph(self, values), self.reference or reference
+        return StepProgram(
+            **self.constants(),
+            parameters=values,
+            nodes=InputScaling.of(model.node_normalizer),
+            edges=InputScaling.of(model.edge_normalizer),
+            recurrent=model.core if model.core.recurrent else None,
+            static=static if model.core.recurrent else None,
+            core=UnfoldedCore(model.core, static) if unfolded else model.core.fold(self.incidence, static),
+            output=OutputScaling.of(model.residual_normalizer),
+            change_std=model.delta_normalizer.std,
+            dtype=self.dtype,
+        )
+
+    def constants(self) -> dict:
+        """Those parts of a program that follow from the scene alone."""
+        return {
+            "layout": self.layout,
+            "timestep": float(self.scene.timestep) if self.model.integrate else None,
+            "movable": self.movable,
+            "edge_index": self.incidence.edge_index,
+            "canonicalizer": self.canonicalizer,
+            "controls": self.controls,
+            "node_features": self.features["nodes"],
+            "edge_features": self.features["edges"],
+            "projection": self.projection,
+        }
+
+    def executor(self, parameters: TensorDictBase | None = None) -> Executor:
+        """What runs the step, for one or many steps of the same samples."""
+        return EagerExecutor(self.program(parameters))
+
+    def step(
+        self,
+        state: Tensor,
+        action: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDict | None]:
+        """Next state, and the hidden state of a recurrent model.
 
         Args:
             state: ``[*B, N, 13]``.
             action: ``[*B, A]``.
-            parameters: physical parameters of every sample, or without batch; by default the scene's.
+            parameters: physical parameters of each sample, or without batch; default: the scene's.
+            hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
 
         Returns:
-            ``[*B, N, 13]``.
+            ``[*B, N, 13]``, and the hidden state after the step, None of a feed-forward model.
 
         Raises:
             ValueError: if a shape does not fit the scene.
         """
         check_shapes(self.scene, state, action, parameters)
-        return self._advance(state, action, self.fold(parameters))[0]
+        after, hidden = self.executor(parameters).step(state, action, self._graph(hidden_state))
+        return after, None if hidden is None else hidden.tensordict()
 
     def rollout(
         self,
@@ -208,177 +243,86 @@ class Predictor(TensorDictModuleBase):
         actions: Tensor,
         parameters: TensorDictBase | None = None,
         hidden_state: TensorDictBase | None = None,
-    ) -> Tensor:
+    ) -> tuple[Tensor, TensorDict | None]:
         """States from a start state under a sequence of actions.
 
         Args:
             state: ``[*B, N, 13]`` start states.
             actions: ``[*B, T, A]``; ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``.
-            parameters: physical parameters of every rollout, or without batch; by default the scene's.
-            hidden_state: what a recurrent model remembers of the states before the start; by default there were none.
+            parameters: physical parameters of each rollout, or without batch; default: the scene's.
+            hidden_state: ``[*B]`` hidden state of a recurrent model before the start; default: the initial one.
 
         Returns:
-            ``[*B, T + 1, N, 13]``; the first is the start state itself.
+            ``[*B, T + 1, N, 13]``, the first being the start state, and the hidden state at the end.
 
         Raises:
             ValueError: if a shape does not fit the scene.
         """
-        return self.rollout_and_hidden_state(state, actions, parameters, hidden_state)[0]
-
-    def rollout_and_hidden_state(
-        self,
-        state: Tensor,
-        actions: Tensor,
-        parameters: TensorDictBase | None = None,
-        hidden_state: TensorDictBase | None = None,
-    ) -> tuple[Tensor, TensorDictBase | None]:
-        """As :meth:`rollout`, with what a recurrent model remembers at its end, to go on from; others remember None."""
         for action in actions.unbind(-2)[:1]:
             check_shapes(self.scene, state, action, parameters)
-        states, folded = [state], self.fold(parameters)
+        states, hidden, executor = [state], self._graph(hidden_state), self.executor(parameters)
         for action in actions.unbind(-2):
-            state, hidden_state = self._advance(state, action, folded, hidden_state)
+            state, hidden = executor.step(state, action, hidden)
             states.append(state)
-        return torch.stack(states, dim=-3), hidden_state
+        return torch.stack(states, dim=-3), None if hidden is None else hidden.tensordict()
 
-    def _advance(
-        self, state: Tensor, action: Tensor, folded: Folded, hidden_state: TensorDictBase | None = None
-    ) -> tuple[Tensor, TensorDictBase | None]:
-        """Next state, and what a recurrent model remembers after it; shapes are not checked."""
-        return self.layout.apply(state, self._delta(state, action, folded)), None
-
-    def fold(self, parameters: TensorDictBase | None = None) -> Folded:
-        """What predictions of the same bodies share, to pass to :meth:`delta` for many steps.
+    def teacher_forced(
+        self, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDict | None]:
+        """Predict each next state from true states; a recurrent model's hidden state runs through them.
 
         Args:
-            parameters: physical parameters of every sample, by default the scene's.
-        """
-        values = self.statics.read(parameters)
-        core = None if self.plain else self.model.fold(self.static_graph(values), self.incidence)
-        return Folded(core, values)
+            states: ``[*B, T, N, 13]``.
+            actions: ``[*B, T, A]``.
+            parameters: physical parameters of each sequence, or without batch; default: the scene's.
 
-    def delta(self, state: Tensor, action: Tensor, folded: Folded | None = None) -> Tensor:
-        """Predicted change of the state ``[*B, N, 12]``, exactly zero in fixed components."""
-        check_shapes(self.scene, state, action)
-        return self._delta(state, action, folded or self.fold())
-
-    def delta_and_hidden_state(
-        self, state: Tensor, action: Tensor, folded: Folded | None = None, hidden_state: TensorDictBase | None = None
-    ) -> tuple[Tensor, TensorDictBase | None]:
-        """As :meth:`delta`, with what a recurrent model remembers; this one remembers nothing."""
-        return self.delta(state, action, folded), None
-
-    def _delta(self, state: Tensor, action: Tensor, folded: Folded) -> Tensor:
-        seen = self.frame.see(state, folded.values)
-        return self._settled(state, self._residual(seen, action, folded), seen, folded.values)
-
-    def _settled(self, state: Tensor, residual: Tensor, seen: CanonicalState, values: PhysicalParameters) -> Tensor:
-        """Change of the state ``[*B, N, 12]`` from what the network predicts, in the world frame."""
-        residual = residual.to(state.dtype)
-        if seen.turn is not None:
-            residual = self.layout.rotate_delta(residual, *seen.turn)
-        if self.model.integrate:
-            residual = self.layout.integrate(state, residual, self.timestep)
-        delta = residual * self.movable
-        if self.projection is not None:
-            # Where nothing was turned the network's matrices are the world's.
-            matrices = seen.matrices if seen.turn is None else self.frame.matrices(state)
-            assert matrices is not None
-            delta = self.projection(state, matrices, delta, self.model.delta_normalizer.std, values)
-        return delta
-
-    def _residual(self, seen: CanonicalState, action: Tensor, folded: Folded) -> Tensor:
-        """What the network predicts ``[*B, N, 12]``, in the local frame."""
-        dynamic = self._dynamic_graph(seen, action, folded.values)
-        if folded.core is not None:
-            return self.model(dynamic, folded.core)
-        normalized = self.model.core(graph_concat(dynamic, self.static_graph(folded.values))).nodes
-        return self.model.residual_normalizer.inverse(normalized)
-
-    def dynamic_graph(self, state: Tensor, action: Tensor, values: PhysicalParameters | None = None) -> Graph:
-        """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
-        check_shapes(self.scene, state, action)
-        values = values or self.values
-        return self._dynamic_graph(self.frame.see(state, values), action, values)
-
-    def _dynamic_graph(self, seen: CanonicalState, action: Tensor, values: PhysicalParameters) -> Graph:
-        dtype, model = self.network_dtype, self.model
-        encoded, controls = self.frame.features(seen, action, values)
-        globals_ = encoded.new_zeros((*encoded.shape[:-2], 0), dtype=dtype)
-        nodes, edges = model.node_normalizer(encoded, dtype), model.edge_normalizer(controls, dtype)
-        return Graph(nodes, edges, globals_, self.incidence.edge_index)
-
-    def static_graph(self, values: PhysicalParameters | None = None, dtype: torch.dtype | None = None) -> Graph:
-        """Normalised static graph, of the scene by default (no batch), in the network's dtype by default."""
-        values, dtype = values or self.values, dtype or self.network_dtype
-        if self.model.parameter_source == "inferred":  # comes from a network already
-            nodes, edges, globals_ = (part.to(dtype) for part in values[:3])
-            if self.model.project:
-                usual = self.values
-                off = torch.cat(
-                    (values.parent_anchor - usual.parent_anchor, values.child_anchor - usual.child_anchor), dim=-1
-                )
-                off = (off / self.anchor_scale).to(dtype).expand(*nodes.shape[:-1], 6)
-                nodes = torch.cat((nodes, off), dim=-1)
-        else:
-            normalizers = self.model.parameter_normalizers.items()
-            nodes, edges, globals_ = (normalizer(getattr(values, part), dtype) for part, normalizer in normalizers)
-        return Graph(nodes, edges, globals_, self.incidence.edge_index)
-
-    def update_parameter_normalizers(self, parameters: TensorDictBase | None = None) -> None:
-        """Take physical parameters, by default this scene's, into the model's statistics: once, before training.
-
-        Inferred ones have none.
+        Returns:
+            ``[*B, T, N, 13]`` states after each of them, and the hidden state after the last.
 
         Raises:
-            ValueError: if one is not finite; no statistic is changed.
+            ValueError: if there is no state, or a shape does not fit the scene.
         """
-        if parameters is not None:
-            require_finite(parameters, "parameters")
-        if self.model.parameter_source == "inferred":
-            return  # comes from a network already
-        values = self.statics.read(parameters)
-        for part, normalizer in self.model.parameter_normalizers.items():
-            normalizer.update(getattr(values, part))
+        if states.shape[-3] == 0:
+            raise ValueError("There is no state to predict from.")
+        check_shapes(self.scene, states[..., 0, :, :], actions[..., 0, :], parameters)
+        if not self.model.core.recurrent:
+            if parameters is not None and parameters.ndim:
+                parameters = parameters.unsqueeze(-1).expand(actions.shape[:-1])
+            return self.step(states, actions, parameters)
+        hidden, predictions, executor = None, [], self.executor(parameters)
+        for state, action in zip(states.unbind(-3), actions.unbind(-2), strict=True):
+            predicted, hidden = executor.step(state, action, hidden)
+            predictions.append(predicted)
+        assert hidden is not None
+        return torch.stack(predictions, dim=-3), hidden.tensordict()
 
-    def update_dynamic_normalizers(
-        self, state: Tensor, action: Tensor, next_state: Tensor, parameters: TensorDictBase | None = None
-    ) -> None:
-        """Take transitions into the model's statistics (paper, "One step of the training algorithm").
-
-        Args:
-            state: ``[*B, N, 13]``, with the input noise that training adds.
-            action: ``[*B, A]``.
-            next_state: ``[*B, N, 13]``, clean.
-            parameters: physical parameters of every sample, by default the scene's.
+    def delta(self, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> Tensor:
+        """Predicted change ``[*B, N, 12]``, zero in fixed components; of a recurrent model from the initial hidden state.
 
         Raises:
-            ValueError: if a shape does not fit or a number is not finite; no statistic is changed.
+            ValueError: if a shape does not fit the scene.
         """
         check_shapes(self.scene, state, action, parameters)
-        for what, given in (
-            ("state", state),
-            ("action", action),
-            ("next state", next_state),
-            ("parameters", parameters),
-        ):
-            if given is not None:
-                require_finite(given, what)
-        values = self.statics.read(parameters)
-        encoded, controls = self.frame.features(self.frame.see(state, values), action, values)
-        self.model.node_normalizer.update(encoded)
-        self.model.edge_normalizer.update(controls)
-        self.model.delta_normalizer.update(self.layout.delta(state, next_state), self.movable)
-        self.model.residual_normalizer.update(self.residual(state, next_state, values), self.movable)
+        return eager.delta(self.executor(parameters).program, state, action)[0]
 
-    def residual(self, state: Tensor, next_state: Tensor, values: PhysicalParameters | None = None) -> Tensor:
-        """What the network should have predicted of a transition ``[*B, N, 12]``, in the local frame, in SI units."""
-        delta = self.layout.delta(state, next_state)
-        residual = self.layout.residual(state, delta, self.timestep) if self.model.integrate else delta
-        turn = self.frame.yaw_rotation(state, values or self.values)
-        if turn is None:
-            return residual
-        return self.layout.rotate_delta(residual, quaternion.conjugate(turn.rotation), turn.matrix.mT)
+    def _graph(self, hidden_state: TensorDictBase | None) -> Graph | None:
+        if hidden_state is None:
+            return None
+        return Graph(*(hidden_state[part] for part in ("nodes", "edges", "globals_")), self.incidence.edge_index)
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"
+
+
+def _check_scene(model: ForwardModel, scene: Scene) -> None:
+    counts = model.core.counts
+    if counts is not None and counts != (scene.num_nodes, scene.num_edges):
+        raise ValueError(
+            f"The model reads graphs of {counts[0]} nodes and {counts[1]} edges alone; scene {scene.name!r} has"
+            f" {scene.num_nodes} and {scene.num_edges}. Train another, or a graph network."
+        )
+    if model.parameter_source != "scene" and "parameters" in getattr(scene, "origin", ()):
+        raise ValueError(
+            f"The model must not see true parameters (parameters={model.parameter_source!r}), and {scene.name!r} is a"
+            " variant, whose joint anchors would show its lengths. Bind the model to the standard scene."
+        )

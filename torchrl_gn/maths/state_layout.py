@@ -193,7 +193,7 @@ class StateLayout:
                 parts.append(timestep * (rate + 0.5 * change))
         return torch.cat(parts, dim=-1)
 
-    def turn(self, state: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
+    def rotate(self, state: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
         """State as seen when all of space is turned about the origin.
 
         Args:
@@ -219,7 +219,7 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def rotate_delta(self, delta: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
-        """State change ``[*B, N, delta_size]`` as seen when all of space is turned, see :meth:`turn`."""
+        """State change ``[*B, N, delta_size]`` as seen when all of space is turned, see :meth:`rotate`."""
         self._check_spatial()
         matrix = (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
         vectors = delta.reshape(*delta.shape[:-2], delta.shape[-2] * len(self.components), 3)
@@ -229,7 +229,7 @@ class StateLayout:
         for component in self.components:
             if component.kind == "circle" or component.delta_size != 3:
                 raise ValueError(
-                    f"Component {component.name!r} is no vector or rotation in space and cannot be turned."
+                    f"Component {component.name!r} is no vector or rotation in space and cannot be rotated."
                 )
 
     def encode(self, state: Tensor, encoding: Encoding = "matrix", matrices: Tensor | None = None) -> Tensor:

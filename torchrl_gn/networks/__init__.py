@@ -1,6 +1,8 @@
 """Graph networks: the GN block, and the cores built from it."""
 
-from torchrl_gn.networks.ablated_core import AblatedCore as AblatedCore
+from torchrl_gn.networks.core import Core as Core
+from torchrl_gn.networks.core import UnfoldedCore as UnfoldedCore
+from torchrl_gn.networks.cores import CORES as CORES
 from torchrl_gn.networks.gn_block import GNBlock as GNBlock
 from torchrl_gn.networks.gn_core import GNCore as GNCore
 from torchrl_gn.networks.graph import Graph as Graph

@@ -4,76 +4,71 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torch import nn
-
-from torchrl_gn.networks.folded_gn_core import FoldedCore, fold_core
+from torchrl_gn.networks.core import Core, layer_sizes
+from torchrl_gn.networks.fold_gn_core import fold_gn_core
+from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.gn_block import GNBlock, Pool
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
 from torchrl_gn.networks.incidence import Incidence
 
 
-class GNCore(nn.Module):
+class GNCore(Core):
     r"""Two GN blocks, :math:`G^* = GN_2(concat(G, GN_1(G)))` (paper, "Forward models").
 
-    The first block's globals let all nodes and edges communicate.
+    The globals of the first block let all nodes and edges communicate. The second block has no global update: only
+    nodes are predicted.
 
     Args:
-        in_size: features of the input graph.
-        out_nodes: features of every output node. Only nodes are predicted, so the second
-            block has no global update.
-        latent: edge, node and global features of the graph between the blocks, and edge
-            features inside the second.
-        edge_hidden: hidden sizes of both edge MLPs.
-        node_hidden: hidden sizes of both node MLPs.
+        dynamic: features of the dynamic graph.
+        static: features of the static graph.
+        out_nodes: features of every output node.
+        hidden: width of the hidden layers of every MLP, or their sizes.
+        layers: hidden layers of every MLP, if ``hidden`` is one width.
+        latent: features of the graph between the blocks, and edge features inside the second; default: the width of
+            the last hidden layer.
+        edge_hidden: hidden sizes of the edge MLPs; default ``hidden``.
+        node_hidden: hidden sizes of the node MLPs.
         global_hidden: hidden sizes of the global MLP.
-        activation: between the layers of all MLPs.
+        activation: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
         pool: as of :class:`GNBlock`.
 
     Raises:
-        ValueError: if an MLP has no hidden layer, or the activation or ``pool`` is not known.
+        ValueError: if an MLP has no hidden layer, or ``activation`` or ``pool`` is not known.
     """
 
     def __init__(
         self,
-        in_size: GraphSize,
+        dynamic: GraphSize,
+        static: GraphSize,
         out_nodes: int,
         *,
-        latent: int = 128,
-        edge_hidden: Sequence[int] = (128, 128),
-        node_hidden: Sequence[int] = (128, 128),
-        global_hidden: Sequence[int] = (128, 128),
-        activation: str = "relu",
+        hidden: int | Sequence[int] = 128,
+        layers: int = 2,
+        latent: int | None = None,
+        edge_hidden: Sequence[int] | None = None,
+        node_hidden: Sequence[int] | None = None,
+        global_hidden: Sequence[int] | None = None,
+        activation: str = "silu",
         pool: Pool = "sum",
     ) -> None:
-        super().__init__()
+        super().__init__(dynamic)
         self.activation = activation
-        if not (edge_hidden and node_hidden and global_hidden):
+        usual = layer_sizes(hidden, layers)
+        edge, node, last = (usual if each is None else each for each in (edge_hidden, node_hidden, global_hidden))
+        if not (edge and node and last):
             raise ValueError(
-                "Every MLP of the core needs a hidden layer, got"
-                f" edge_hidden={edge_hidden}, node_hidden={node_hidden}, global_hidden={global_hidden}."
+                f"Every MLP of the core needs a hidden layer, got edges {edge}, nodes {node}, globals {last}."
             )
-        between = GraphSize(latent, latent, latent)
-        self.first = GNBlock(
-            in_size,
-            between,
-            edge_hidden=edge_hidden,
-            node_hidden=node_hidden,
-            global_hidden=global_hidden,
-            activation=activation,
-            pool=pool,
-        )
-        self.second = GNBlock(
-            in_size + between,
-            GraphSize(out_nodes, latent, 0),
-            edge_hidden=edge_hidden,
-            node_hidden=node_hidden,
-            activation=activation,
-        )
+        latent = usual[-1] if latent is None else latent
+        sizes = {"edge_hidden": edge, "node_hidden": node}
+        graph, between = dynamic + static, GraphSize(latent, latent, latent)
+        self.first = GNBlock(graph, between, **sizes, global_hidden=last, activation=activation, pool=pool)
+        self.second = GNBlock(graph + between, GraphSize(out_nodes, latent, 0), **sizes, activation=activation)
 
     def forward(self, graph: Graph) -> Graph:
-        """Graph with ``in_size`` features in, graph with ``out_nodes`` node features out."""
+        """Graph with dynamic and static features in, graph with ``out_nodes`` node features out."""
         return self.second(graph_concat(graph, self.first(graph)))
 
-    def fold(self, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedCore:
-        """The same function for graphs of one topology with all that is constant folded, see :func:`fold_core`."""
-        return fold_core(self, size, incidence, static)
+    def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore:
+        """The same function for one scene with all constants folded, see :func:`fold_gn_core`."""
+        return fold_gn_core(self, self.dynamic, incidence, static)

@@ -12,10 +12,9 @@ Rows = Tensor | slice
 
 
 class Incidence(Float64Buffers):
-    """What a folded core (:func:`~torchrl_gn.networks.folded_gn_core.fold_core`) needs to know of a graph but its features.
+    """Edges of one topology as small matrices of zeros and ones, and which nodes are predicted.
 
-    Gathering at edges and summing at nodes are products with small matrices of zeros and ones. They are made once for
-    a scene, for every later fold.
+    Folded cores gather at edges and sum at nodes by products with them.
 
     Args:
         edge_index: ``[2, E]`` senders above receivers.

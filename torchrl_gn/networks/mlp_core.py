@@ -10,58 +10,70 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.modules import MLP
 
-from torchrl_gn.networks.folded_gn_core import Columns
+from torchrl_gn.networks.core import Columns, Core, layer_sizes
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.networks.linear import ACTIVATIONS, activation_class
 
 
-class MLPCore(nn.Module):
+class MLPCore(Core):
     """One MLP in place of the graph networks (paper, SM "MLP baseline architectures").
 
-    All features of all nodes, edges and globals side by side in, the features of all nodes
-    out: it is tied to graphs of one size, and has to learn each body's motion apart.
+    Reads all features of all nodes, edges and globals side by side and gives the features of all nodes, so it is tied
+    to graphs of one size.
 
     Args:
-        in_size: features of the input graph.
+        dynamic: features of the dynamic graph.
+        static: features of the static graph.
         out_nodes: features of every output node.
-        items: numbers of nodes and edges of the graphs.
-        hidden: hidden sizes.
+        counts: numbers of nodes and edges of the graphs.
+        hidden: width of the hidden layers, or their sizes.
+        layers: number of hidden layers, if ``hidden`` is one width.
         activation: between the layers.
 
     Raises:
-        ValueError: if there is no hidden layer, or the activation is not known.
+        ValueError: if ``counts`` is missing, there is no hidden layer, or the activation is not known.
     """
+
+    fixed_size = True
 
     def __init__(
         self,
-        in_size: GraphSize,
+        dynamic: GraphSize,
+        static: GraphSize,
         out_nodes: int,
         *,
-        items: tuple[int, int],
-        hidden: Sequence[int],
-        activation: str = "relu",
+        counts: Sequence[int] | None = None,
+        hidden: int | Sequence[int] = 256,
+        layers: int = 5,
+        activation: str = "silu",
     ) -> None:
-        super().__init__()
-        if not hidden:
+        super().__init__(dynamic)
+        if counts is None:
+            raise ValueError("An MLP core needs counts, the numbers of nodes and edges of its graphs; see for_scene.")
+        cells = layer_sizes(hidden, layers)
+        if not cells:
             raise ValueError("The MLP needs a hidden layer.")
-        self.in_size, self.out_nodes, self.items, self.activation = in_size, out_nodes, items, activation
-        inputs = items[0] * in_size.nodes + items[1] * in_size.edges + in_size.globals_
-        self.mlp = MLP(
-            inputs, items[0] * out_nodes, num_cells=list(hidden), activation_class=activation_class(activation)
-        )
+        nodes, edges = counts
+        self.counts = nodes, edges
+        self.graph_size, self.out_nodes, self.activation = dynamic + static, out_nodes, activation
+        inputs = nodes * self.graph_size.nodes + edges * self.graph_size.edges + self.graph_size.globals_
+        self.mlp = MLP(inputs, nodes * out_nodes, num_cells=cells, activation_class=activation_class(activation))
 
     def forward(self, graph: Graph) -> Graph:
-        """Graph with ``in_size`` features in, graph with ``out_nodes`` node features out."""
+        """Graph with dynamic and static features in, graph with ``out_nodes`` node features out."""
         out = self.mlp(torch.cat(_flat(graph), dim=-1))
         empty = out[..., :0]
-        return Graph(out.unflatten(-1, (self.items[0], -1)), empty.unsqueeze(-2), empty, graph.edge_index)
+        assert self.counts is not None
+        return Graph(out.unflatten(-1, (self.counts[0], -1)), empty.unsqueeze(-2), empty, graph.edge_index)
 
-    def fold(self, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedMLP:
-        """Everything constant in a table; arguments as of :func:`~torchrl_gn.networks.folded_gn_core.fold_core`."""
+    def fold(self, incidence: Incidence, static: Graph) -> FoldedMLP:
+        """The same function for one scene with all constants in a table."""
+        assert self.counts is not None
         first, *hidden, last = (layer for layer in self.mlp if isinstance(layer, nn.Linear))
-        nodes, edges = self.items
-        here, every = (size.nodes, size.edges), (self.in_size.nodes, self.in_size.edges)
+        nodes, edges = self.counts
+        size, graph = self.dynamic, self.graph_size
+        here, every = (size.nodes, size.edges), (graph.nodes, graph.edges)
         device = first.weight.device
         dynamic, constant, start = [], [], 0
         for count, own, full in zip((nodes, edges), here, every, strict=True):
@@ -69,7 +81,7 @@ class MLPCore(nn.Module):
             dynamic.append(columns[:, :own].flatten())
             constant.append(columns[:, own:].flatten())
             start += count * full
-        columns = torch.arange(start, start + self.in_size.globals_, device=device)
+        columns = torch.arange(start, start + graph.globals_, device=device)
         dynamic.append(columns[: size.globals_])
         constant.append(columns[size.globals_ :])
         table = F.linear(torch.cat(_broadcast(_flat(static)), -1), first.weight[:, torch.cat(constant)], first.bias)
@@ -84,7 +96,7 @@ class MLPCore(nn.Module):
                 last.bias[rows].unflatten(0, (-1, self.out_nodes)),
             ),
             predicted=predicted,
-            items=self.items,
+            counts=self.counts,
             activation=self.activation,
         )
 
@@ -99,7 +111,7 @@ class FoldedMLP:
         hidden: weight and bias of each further hidden layer.
         out: weight ``[P, F_out, h]`` and bias ``[P, F_out]``.
         predicted: ``[P]`` nodes that are predicted.
-        items: numbers of nodes and edges.
+        counts: numbers of nodes and edges.
         activation: after every hidden layer.
     """
 
@@ -108,7 +120,7 @@ class FoldedMLP:
     hidden: tuple[tuple[Tensor, Tensor], ...]
     out: tuple[Tensor, Tensor]
     predicted: Tensor
-    items: tuple[int, int]
+    counts: tuple[int, int]
     activation: str
 
     def predict(self, dynamic: Graph) -> Tensor:
@@ -119,13 +131,13 @@ class FoldedMLP:
             hidden = act(F.linear(hidden, weight, bias))
         weight, bias = self.out
         out = F.linear(hidden, weight.flatten(0, 1), bias.flatten()).unflatten(-1, bias.shape)
-        full = out.new_zeros(*out.shape[:-2], self.items[0], out.shape[-1])
+        full = out.new_zeros(*out.shape[:-2], self.counts[0], out.shape[-1])
         return full.index_copy(-2, self.predicted, out)
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> FoldedMLP:
-        """This MLP with fewer and rescaled features, as ``FoldedCore.reduced``."""
+        """This MLP with fewer and rescaled features, see :class:`~torchrl_gn.networks.core.ReducibleCore`."""
         parts = list(self.weights)
-        for index, (columns, count) in enumerate(zip((nodes, edges), self.items, strict=True)):
+        for index, (columns, count) in enumerate(zip((nodes, edges), self.counts, strict=True)):
             kept, factor = columns
             parts[index] = (parts[index].unflatten(1, (count, -1))[:, :, kept] * factor).flatten(1)
         weight, bias = self.out

@@ -1,4 +1,4 @@
-"""Recurrent core: GRUs that remember, before the graph networks."""
+"""Recurrent core: GRUs over nodes, edges and globals before the graph networks."""
 
 from __future__ import annotations
 
@@ -7,23 +7,24 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from torchrl_gn.networks.folded_gn_core import FoldedCore
+from torchrl_gn.networks.core import Core
+from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
 from torchrl_gn.networks.incidence import Incidence
 
 
-class RecurrentCore(nn.Module):
+class RecurrentCore(Core):
     """Three GRUs, over nodes, edges and globals, before the graph networks (paper, "Forward models").
 
-    What they remember joins the input graph of a :class:`GNCore`. Paper: one GN block on what the GRUs give alone,
-    20 features of each; that would squeeze the present state through 20 numbers.
+    Their hidden state joins the input graph of a :class:`GNCore`. Paper: one GN block reads the hidden state alone,
+    20 features each.
 
     Args:
         dynamic: features of the dynamic graph.
-        static: features of the static graph, which does not change and is not remembered.
+        static: features of the static graph.
         out_nodes: features of every output node.
-        hidden_state: features of the remembered nodes, edges and globals.
+        hidden_state: features of the hidden nodes, edges and globals.
         **sizes: of :class:`GNCore`.
     """
 
@@ -36,34 +37,30 @@ class RecurrentCore(nn.Module):
         hidden_state: Sequence[int] = (20, 20, 20),
         **sizes,
     ) -> None:
-        super().__init__()
-        self.memory_size = GraphSize(*hidden_state)
-        self.nodes = nn.GRUCell(dynamic.nodes + static.nodes, self.memory_size.nodes)
-        self.edges = nn.GRUCell(dynamic.edges + static.edges, self.memory_size.edges)
-        self.globals_ = nn.GRUCell(dynamic.globals_ + static.globals_, self.memory_size.globals_)
-        self.core = GNCore(dynamic + self.memory_size + static, out_nodes, **sizes)
+        size, graph = GraphSize(*hidden_state), dynamic + static
+        super().__init__(dynamic, hidden_size=size)
+        self.nodes = nn.GRUCell(graph.nodes, size.nodes)
+        self.edges = nn.GRUCell(graph.edges, size.edges)
+        self.globals_ = nn.GRUCell(graph.globals_, size.globals_)
+        self.core = GNCore(dynamic + size, static, out_nodes, **sizes)
 
-    def start(self, dynamic: Graph) -> Graph:
-        """Memory of nothing, for a batch like that of a dynamic graph ``[*B, ...]``."""
-        return dynamic.zeros(self.memory_size)
-
-    def remember(self, dynamic: Graph, static: Graph, hidden_state: Graph) -> Graph:
-        """Memory after one more dynamic graph."""
+    def update(self, dynamic: Graph, static: Graph, hidden: Graph) -> Graph:
+        """Hidden state after one more dynamic graph."""
         graph = graph_concat(dynamic, static)
         return Graph(
-            _each(self.nodes, graph.nodes, hidden_state.nodes),
-            _each(self.edges, graph.edges, hidden_state.edges),
-            _each(self.globals_, graph.globals_, hidden_state.globals_),
+            _each(self.nodes, graph.nodes, hidden.nodes),
+            _each(self.edges, graph.edges, hidden.edges),
+            _each(self.globals_, graph.globals_, hidden.globals_),
             dynamic.edge_index,
         )
 
     def forward(self, graph: Graph) -> Graph:
-        """Dynamic, remembered and static features side by side in, ``out_nodes`` node features out."""
+        """Dynamic, hidden and static features side by side in, ``out_nodes`` node features out."""
         return self.core(graph)
 
-    def fold(self, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedCore:
-        """The graph networks with all that is constant folded, of dynamic and remembered features."""
-        return self.core.fold(size + self.memory_size, incidence, static)
+    def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore:
+        """The graph networks with all constants folded, of dynamic and hidden features."""
+        return self.core.fold(incidence, static)
 
 
 def _each(cell: nn.GRUCell, features: Tensor, hidden: Tensor) -> Tensor:

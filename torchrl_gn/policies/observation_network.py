@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, Literal, TypeVar, cast
+from typing import Literal, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -12,8 +12,9 @@ from torch.nn import functional as F
 
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.networks.core import UnfoldedCore
 from torchrl_gn.networks.gn_core import GNCore
-from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
+from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.networks.mlp_core import MLPCore
 from torchrl_gn.scenes import ObservationGraph
@@ -25,12 +26,12 @@ _FLOOR = 1e-6
 
 
 class ObservationNetwork(nn.Module):
-    """Two graph networks, or their rival, from flat observations to features of every node.
+    """Two graph networks, or their baseline, from flat observations to features of every node.
 
     The first linear layers see normalised observations, arranged as the :class:`~torchrl_gn.scenes.ObservationGraph`
     says, with the actions at their joints' edges, a feature 1 or -1 for the direction of an edge, and which node is
     which if the graph shows identities. Everything constant is folded away at each call
-    (:func:`~torchrl_gn.networks.folded_gn_core.fold_core`), exactly and differentiably in the weights.
+    (:func:`~torchrl_gn.networks.fold_gn_core.fold_gn_core`), exactly and differentiably in the weights.
 
     Args:
         graph: where observations and actions belong.
@@ -39,7 +40,7 @@ class ObservationNetwork(nn.Module):
         core: ``"gn"``, or ``"mlp"``, one MLP over the flattened graph.
         latent: features between the two graph networks.
         hidden: hidden sizes of all their MLPs.
-        mlp_hidden: hidden sizes of the rival.
+        mlp_hidden: hidden sizes of the MLP.
         activation: between the layers.
         plain: evaluate the core as the paper writes it, by message passing: the same function, slowly.
 
@@ -67,14 +68,14 @@ class ObservationNetwork(nn.Module):
         self.node_normalizer = Normalizer(self.size.nodes, floor=_FLOOR)
         self.edge_normalizer = Normalizer(self.size.edges, floor=_FLOOR)
         self.global_normalizer = Normalizer(self.size.globals_, floor=_FLOOR)
-        in_size = self.size + GraphSize(graph.num_nodes if graph.identity else 0, 1, 0)
+        static = GraphSize(graph.num_nodes if graph.identity else 0, 1, 0)
         self.core: GNCore | MLPCore
         if core == "gn":
-            sizes: dict[str, Any] = {"edge_hidden": hidden, "node_hidden": hidden, "global_hidden": hidden}
-            self.core = GNCore(in_size, out_nodes, latent=latent, activation=activation, **sizes)
+            self.core = GNCore(self.size, static, out_nodes, latent=latent, activation=activation, hidden=hidden)
         elif core == "mlp":
-            items = graph.num_nodes, graph.num_edges
-            self.core = MLPCore(in_size, out_nodes, items=items, hidden=mlp_hidden, activation=activation)
+            counts = graph.num_nodes, graph.num_edges
+            sizes = {"counts": counts, "hidden": mlp_hidden, "activation": activation}
+            self.core = MLPCore(self.size, static, out_nodes, **sizes)
         else:
             raise ValueError(f"core={core!r} is not known; use 'gn' or 'mlp'.")
         self.graph, self.places = graph, _Places(graph)
@@ -171,10 +172,9 @@ class ObservationNetwork(nn.Module):
 
     def forward(self, observation: Tensor, action: Tensor | None = None) -> Tensor:
         """Features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if they are seen, actions ``[*B, A]``."""
-        dynamic, parameters = self.dynamic_graph(observation, action), self.static_graph()
-        if self.plain:
-            return self.core(graph_concat(dynamic, parameters)).nodes
-        return self.core.fold(self.size, self.places.incidence, parameters).predict(dynamic)
+        dynamic, static = self.dynamic_graph(observation, action), self.static_graph()
+        folded = UnfoldedCore(self.core, static) if self.plain else self.core.fold(self.places.incidence, static)
+        return folded.predict(dynamic)
 
 
 def sharing_weights(module: M) -> M:

@@ -1,4 +1,4 @@
-"""Predicted changes that keep bodies together where joints joint anchor them together."""
+"""Projection of predicted changes onto the joint constraints, in maximal coordinates."""
 
 from __future__ import annotations
 
@@ -19,158 +19,160 @@ if TYPE_CHECKING:
 
 
 class MaximalProjection(Float64Buffers):
-    """Settle what is predicted for bodies that are joined together.
+    """Project predicted changes onto the constraints of hinges and balls.
 
-    The network predicts every body on its own, but a joint anchor is at one place, and moves at one speed,
-    on both bodies that it joins. Of all changes that keep every joint anchor together the nearest
-    to the prediction is taken, in units of how much each component varies: one Gauss-Newton step of
-    least squares on orientations and angular velocities. Positions and velocities follow from the
-    joints exactly, but for those of each joint_anchors as a whole, which are the mean of its bodies' (or
-    stay the root's where it cannot move).
+    The network predicts each body on its own, but a joint anchor has one position and one velocity on both bodies that
+    it joins. Of all changes that keep the anchors together this takes the nearest to the prediction, in standard
+    deviations of each component: one Gauss-Newton step in the orientations and angular velocities. Positions and
+    velocities follow from the joints, except those of each joined group as a whole, which are the mean of its bodies'
+    (or stay the root's where it cannot move).
 
-    Paper: bodies are predicted alone and drift apart.
+    Paper: bodies are predicted alone and drift relative.
 
     Args:
         scene: whose joints these are (:attr:`Scene.joint_anchors <torchrl_gn.scenes.Scene>`).
     """
 
     parent: Tensor
-    sums: Tensor
-    apart: Tensor
-    turning: Tensor
-    lever_arms: Tensor
-    placed: Tensor
-    levers: Tensor
-    spread: Tensor
+    accumulate: Tensor
+    relative: Tensor
+    rotating: Tensor
+    scatter: Tensor
     movable: Tensor
+    used_offsets: Tensor
+    moved_rows: Tensor
+    offset_jacobian: Tensor
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
-        joint_anchors = scene.joint_anchors
-        together = joint_anchors.root[:, None] == joint_anchors.root
-        mean, root = together / together.sum(1, keepdims=True), np.eye(scene.num_nodes)[joint_anchors.root]
-        root_moves = scene.movable[joint_anchors.root, :3]
-        # Where a joint_anchors as a whole is: the mean opinion of its bodies, or its root's where that cannot move.
+        joints, count = scene.joint_anchors, scene.num_nodes
+        group = joints.root[:, None] == joints.root
+        mean, root = group / group.sum(1, keepdims=True), np.eye(count)[joints.root]
+        root_moves = scene.movable[joints.root, :3]
+        # Where a joined group as a whole is: the mean of its bodies' predictions, or its root where that cannot move.
         whole = np.where(root_moves[:, None, :], mean[:, :, None], root[:, :, None])  # [N, N, 3]
+        rotates = scene.movable[:, 9:].ravel()
         values = {
-            "parent": joint_anchors.parent,
-            # Both act on all coordinates of all bodies in a row, [3 N].
-            "sums": np.kron(joint_anchors.ancestors, np.eye(3)),
-            "apart": np.eye(3 * scene.num_nodes) - _each_coordinate(whole),
-            "turning": scene.movable[:, 9:].ravel().nonzero()[0],
-            "spread": np.eye(3 * scene.num_nodes)[:, scene.movable[:, 9:].ravel()],
+            "parent": joints.parent,
+            # These two act on all coordinates of all bodies in a row, [3 N].
+            "accumulate": np.kron(joints.ancestors, np.eye(3)),
+            "relative": np.eye(3 * count) - _each_coordinate(whole),
+            "rotating": rotates.nonzero()[0],
+            "scatter": np.eye(3 * count)[:, rotates],
             "movable": scene.movable,
         }
         self.constants(values)
-        # Of all arms and places those that turning can move: in the plane less than half of the products.
-        levers = self._levers(*(torch.as_tensor(part).double() for part in (joint_anchors.ancestors, mean, root_moves)))
-        used = levers.any(2)
-        self.constants({"lever_arms": used.any(1).nonzero().flatten(), "placed": used.any(0).nonzero().flatten()})
-        self.constants({"levers": levers[self.lever_arms][:, self.placed].flatten(1)})
+        # Keep the non-zero rows and columns: planar scenes need under half.
+        parts = (torch.as_tensor(part).double() for part in (joints.ancestors, mean, root_moves))
+        jacobian = self._offset_jacobian(*parts)
+        used = jacobian.any(2)
+        self.constants({"used_offsets": used.any(1).nonzero().flatten(), "moved_rows": used.any(0).nonzero().flatten()})
+        self.constants({"offset_jacobian": jacobian[self.used_offsets][:, self.moved_rows].flatten(1)})
 
     def forward(
-        self, state: Tensor, matrices: Tensor, delta: Tensor, std: Tensor, values: PhysicalParameters
+        self, state: Tensor, matrices: Tensor, delta: Tensor, std: Tensor, parameters: PhysicalParameters
     ) -> Tensor:
-        """The nearest change that keeps joint anchors together.
+        """Nearest change that keeps the joint anchors together.
 
         Args:
             state: ``[*B, N, 13]``.
-            matrices: ``[*B, N, 3, 3]`` of the orientations in it.
+            matrices: ``[*B, N, 3, 3]`` of its orientations.
             delta: ``[*B, N, 12]`` predicted change.
-            std: ``[12]`` how much each channel of a change varies.
-            values: numbers of the scene; read are where the joint anchors are.
+            std: ``[12]`` standard deviation of each component of a change.
+            parameters: physical parameters; the anchor offsets are read.
 
         Returns:
-            ``[*B, N, 12]``, zero in fixed components; ``delta`` itself where nothing is apart.
+            ``[*B, N, 12]``, zero in fixed components; ``delta`` itself if it satisfies the constraints.
         """
         at, to = BODY_STATE.slices, BODY_STATE.delta_slices
-        turn, spin = delta[..., to["orientation"]], delta[..., to["angular_velocity"]]
+        rotation, spin = delta[..., to["orientation"]], delta[..., to["angular_velocity"]]
         # Positions and velocities [*B, 2, 3 N].
         here = torch.stack((state[..., at["position"]], state[..., at["linear_velocity"]]), dim=-3).flatten(-2)
         change = torch.stack((delta[..., to["position"]], delta[..., to["linear_velocity"]]), dim=-3).flatten(-2)
-        moved, before = here + change, self.anchors(matrices, values)
+        predicted, before = here + change, self.offsets(matrices, parameters)
 
-        anchors, along = self.pins(state, before, turn, spin)
-        moves = self.moves(anchors)
-        misses = self._gap(moved, along)[..., self.placed].mT
-        ratio = position_weight(std).to(state.dtype)
-        pull = ratio * moves.mT
-        normal = pull @ moves + torch.eye(moves.shape[-1], dtype=state.dtype, device=state.device)
-        # At least the identity: never singular, so nothing needs to be checked.
-        solved, _ = torch.linalg.solve_ex(normal, pull @ misses)
-        better = (self.spread.to(state.dtype) @ solved).unflatten(-2, (-1, 3))  # [*B, N, 3, 2]
-        turn, spin = turn + better[..., 0], spin + better[..., 1]
+        offsets, implied = self.forward_kinematics(state, before, rotation, spin)
+        jacobian = self.jacobian(offsets)
+        residual = self._residual(predicted, implied)[..., self.moved_rows].mT
+        weighted = position_weight(std).to(state.dtype) * jacobian.mT
+        normal = weighted @ jacobian + torch.eye(jacobian.shape[-1], dtype=state.dtype, device=state.device)
+        # At least the identity: never singular.
+        solved, _ = torch.linalg.solve_ex(normal, weighted @ residual)
+        step = (self.scatter.to(state.dtype) @ solved).unflatten(-2, (-1, 3))  # [*B, N, 3, 2]
+        rotation, spin = rotation + step[..., 0], spin + step[..., 1]
 
-        _, along = self.pins(state, before, turn, spin)
-        shift, push = (change - self._gap(moved, along)).unflatten(-1, (-1, 3)).unbind(-3)
-        return torch.cat((shift, turn, push, spin), dim=-1) * self.movable
+        _, implied = self.forward_kinematics(state, before, rotation, spin)
+        position, velocity = (change - self._residual(predicted, implied)).unflatten(-1, (-1, 3)).unbind(-3)
+        return torch.cat((position, rotation, velocity, spin), dim=-1) * self.movable
 
-    def anchors(self, matrices: Tensor, values: PhysicalParameters) -> Tensor:
-        """From each joint anchor's upper and lower body to it, ``[*B, 2, N, 3]``, in the world frame."""
-        anchors = torch.stack((values.parent_anchor, values.child_anchor), dim=-3).to(matrices.dtype)
+    def offsets(self, matrices: Tensor, parameters: PhysicalParameters) -> Tensor:
+        """Offsets of each joint anchor from its parent and its child, ``[*B, 2, N, 3]``, in the world frame."""
+        offsets = torch.stack((parameters.parent_anchor, parameters.child_anchor), dim=-3).to(matrices.dtype)
         both = torch.stack((matrices[..., self.parent, :, :], matrices), dim=-4)
-        return (both @ anchors.unsqueeze(-1)).squeeze(-1)
+        return (both @ offsets.unsqueeze(-1)).squeeze(-1)
 
-    def moves(self, anchors: Tensor) -> Tensor:
-        """``[*B, R, L]``: how turning moves bodies relative to their joint_anchors as a whole, linear in the arms.
+    def jacobian(self, offsets: Tensor) -> Tensor:
+        """``[*B, R, L]``: body positions relative to their group, by the ``L`` movable rotations.
 
         Args:
-            arms: ``[*B, 2, N, 3]``.
+            offsets: ``[*B, 2, N, 3]`` anchor offsets, in which it is linear.
 
         Returns:
-            For the ``R`` of the ``3 N`` coordinates that turning moves (``placed``).
+            For the ``R`` of the ``3 N`` coordinates that rotations move.
         """
-        used = anchors.flatten(-3)[..., self.lever_arms]
-        return (used @ self.levers.to(anchors.dtype)).unflatten(-1, (-1, len(self.turning)))
+        used = offsets.flatten(-3)[..., self.used_offsets]
+        return (used @ self.offset_jacobian.to(offsets.dtype)).unflatten(-1, (-1, len(self.rotating)))
 
-    def pins(self, state: Tensor, anchors: Tensor, turn: Tensor, spin: Tensor) -> tuple[Tensor, Tensor]:
-        """Where joint anchors put the bodies after a change of orientations and angular velocities.
+    def forward_kinematics(
+        self, state: Tensor, offsets: Tensor, rotation: Tensor, spin: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Body positions and velocities that the joints imply after a change of orientations and angular velocities.
 
         Args:
             state: ``[*B, N, 13]``.
-            arms: ``[*B, 2, N, 3]`` before the change.
-            turn: ``[*B, N, 3]`` rotation vectors.
+            offsets: ``[*B, 2, N, 3]`` anchor offsets before the change.
+            rotation: ``[*B, N, 3]`` rotation vectors.
             spin: ``[*B, N, 3]`` changes of angular velocity.
 
         Returns:
-            Arms after it, and places and speeds ``[*B, 2, 3 N]`` relative to each joint_anchors's root.
+            Anchor offsets after it, and positions and velocities ``[*B, 2, 3 N]`` relative to each group's root.
         """
-        speed = state[..., BODY_STATE.slices["angular_velocity"]] + spin
-        both = torch.cat((turn, speed), dim=-1)
-        turn, speed = torch.stack((both[..., self.parent, :], both), dim=-3).split(3, dim=-1)
-        anchors = quaternion.rotate_by(turn, anchors)
-        return anchors, self._along(torch.stack((anchors, torch.linalg.cross(speed, anchors)), dim=-4))
+        angular = state[..., BODY_STATE.slices["angular_velocity"]] + spin
+        both = torch.cat((rotation, angular), dim=-1)
+        rotation, angular = torch.stack((both[..., self.parent, :], both), dim=-3).split(3, dim=-1)
+        offsets = quaternion.rotate_by(rotation, offsets)
+        return offsets, self._accumulated(torch.stack((offsets, torch.linalg.cross(angular, offsets)), dim=-4))
 
-    def _along(self, pins: Tensor) -> Tensor:
-        """Sums ``[*B, 3 N]`` from each joint_anchors's root of what joint anchors ``[*B, 2, N, 3]`` add, upper less lower body."""
-        upper, lower = pins.unbind(-3)
-        return F.linear((upper - lower).flatten(-2), self.sums.to(pins.dtype))
+    def _accumulated(self, parts: Tensor) -> Tensor:
+        """Sums ``[*B, 3 N]`` of parent less child parts ``[*B, 2, N, 3]`` over each node's ancestors."""
+        parent, child = parts.unbind(-3)
+        return F.linear((parent - child).flatten(-2), self.accumulate.to(parts.dtype))
 
-    def _gap(self, moved: Tensor, along: Tensor) -> Tensor:
-        """How far predicted places or speeds ``[*B, 3 N]`` are from where their linkages have them."""
-        return F.linear(moved - along, self.apart.to(moved.dtype))  # the difference: opinions of the root's
+    def _residual(self, predicted: Tensor, implied: Tensor) -> Tensor:
+        """Predicted less implied positions or velocities ``[*B, 3 N]``, relative to their group as a whole."""
+        return F.linear(predicted - implied, self.relative.to(predicted.dtype))
 
-    def _levers(self, ancestors: Tensor, mean: Tensor, root_moves: Tensor) -> Tensor:
-        """``[6 N, 3 N, L]``: velocities of bodies about their joint_anchors's own for each movable angular velocity, by arm."""
+    def _offset_jacobian(self, ancestors: Tensor, mean: Tensor, root_moves: Tensor) -> Tensor:
+        """``[6 N, 3 N, L]``: velocities of bodies relative to their group by angular velocity, per anchor offset."""
         count = len(self.parent)
         upper, lower = torch.eye(6 * count, dtype=torch.float64).view(-1, 2, count, 3).unbind(1)
         upper, lower = _cross(upper).unsqueeze(-3), _cross(lower).unsqueeze(-3)  # [6 N, N, 1, 3, 3]
         parents, own = F.one_hot(self.parent, count).double(), torch.eye(count, dtype=torch.float64)
-        # Node i moves with every joint anchor j on its way to the root: by parent's spin x upper less own spin x lower.
-        pins = own[..., None, None] * lower - parents[..., None, None] * upper
-        bodies = torch.einsum("ij,...jkab->...iakb", ancestors, pins)
+        # Each anchor j among node i's ancestors adds: parent's spin x parent offset less own spin x child offset.
+        each = own[..., None, None] * lower - parents[..., None, None] * upper
+        bodies = torch.einsum("ij,...jkab->...iakb", ancestors, each)
         means = torch.einsum("ij,...jakb->...iakb", mean, bodies)
         bodies = bodies - root_moves[:, :, None, None] * means
-        return bodies.flatten(-2).flatten(-3, -2)[..., self.turning]
+        return bodies.flatten(-2).flatten(-3, -2)[..., self.rotating]
 
 
 def position_weight(std: Tensor) -> Tensor:
-    """What a squared metre weighs against a squared radian."""
+    """Weight of a squared metre against a squared radian."""
     return std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)
 
 
 def _each_coordinate(matrices: np.ndarray) -> np.ndarray:
-    """``[3 N, 3 N]`` that acts on each of three coordinates with its own of matrices ``[N, N, 3]``."""
+    """``[3 N, 3 N]`` that act on each coordinate with its own matrix of ``[N, N, 3]``."""
     count = len(matrices)
     return np.einsum("ijc,cd->icjd", matrices, np.eye(3)).reshape(3 * count, 3 * count)
 

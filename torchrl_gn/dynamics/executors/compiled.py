@@ -1,4 +1,4 @@
-"""One prediction step and its gradient, compiled."""
+"""Run a step program through ``torch.compile``."""
 
 from __future__ import annotations
 
@@ -11,65 +11,118 @@ from typing import Any
 import torch
 from torch import Tensor
 
-Step = Callable[[Tensor, Tensor], Tensor]
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.networks.core import UnfoldedCore
+from torchrl_gn.networks.graph import Graph
+from torchrl_gn.networks.snapshot import copy_into
 
 
-class CompiledStep:
-    """``step(state, action) -> next_state`` through ``torch.compile``, once for every shape and dtype.
+class CompiledExecutor:
+    """Compile the step and its gradient, at the first call with every new shape and dtype.
 
-    The gradient is compiled too, as one function that computes the step again and pulls the
-    gradient back through it: activations are never stored, so memory does not grow with the
-    network over long rollouts.
+    The gradient is one function that computes the step again and pulls the gradient back through it: activations are
+    never stored, so memory does not grow with the network over long rollouts. Differentiable once, in state, action and
+    hidden state; never in weights.
 
     Args:
-        step: what to compile; differentiable by :func:`torch.func.vjp`.
-        stamp: value that changes when the function does. A gradient through a step whose function
-            has changed since is refused.
+        program: the step.
 
     Raises:
         FileNotFoundError: without a C++ compiler on a CPU.
+        RuntimeError: with a torch before 2.13.
+        TypeError: of a core that is evaluated by message passing.
     """
 
-    def __init__(self, step: Step, stamp: Callable[[], int]) -> None:
-        self.stamp = stamp
+    fixed_batch = True
+    """Whether another batch size costs a compilation."""
 
-        def pull(state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-            return torch.func.vjp(step, state, action)[1](gradient)
+    def __init__(self, program: StepProgram) -> None:
+        check_torch()
+        if program.movable.device.type == "cpu":
+            check_compiler()
+        if isinstance(program.core, UnfoldedCore):
+            kind = type(program.core.core).__name__
+            raise TypeError(f"{kind} has no fold() and is evaluated by message passing: use executor='eager'.")
+        self.version = 0
+        self._load(program)
 
-        self._step, self._pull = _compile(step), _compile(pull)
+    def _load(self, program: StepProgram) -> None:
+        self.program = program
 
-    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
-        """Next state, differentiable once in state and action."""
-        if torch.is_grad_enabled() and (state.requires_grad or action.requires_grad):
-            return _Differentiable.apply(self, state, action)
-        return self._run(self._step, state, action)
+        if program.recurrent is None:
 
-    @staticmethod
-    def _run(function: Callable, *inputs: Tensor) -> Any:
-        # torch.compile compiles anew for inputs with other strides, or of which a gradient is wanted.
-        with torch.no_grad():
-            return function(*(tensor.detach().contiguous() for tensor in inputs))
+            def step(state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+                return (eager.step(program, state, action, None)[0],)
+
+            def pull(state: Tensor, action: Tensor, *gradients: Tensor) -> tuple[Tensor, ...]:
+                return torch.func.vjp(step, state, action)[1](gradients)
+        else:
+
+            def step(state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor):
+                hidden = Graph(nodes, edges, globals_, program.edge_index)
+                after, hidden = eager.step(program, state, action, hidden)
+                assert hidden is not None
+                return after, hidden.nodes, hidden.edges, hidden.globals_
+
+            def pull(state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor, *gradients: Tensor):
+                return torch.func.vjp(step, state, action, nodes, edges, globals_)[1](gradients)
+
+        self.run, self.pull = _compile(step), _compile(pull)
+
+    def update(self, program: StepProgram) -> None:
+        """Take another program: without compiling again if only its numbers differ."""
+        self.version += 1
+        if not copy_into(self.program, program):
+            self._load(program)
+
+    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        """Next state ``[*B, N, 13]`` and hidden state of a state and an action ``[*B, A]``."""
+        inputs = [state, action]
+        recurrent = self.program.recurrent
+        if recurrent is not None:
+            hidden = self._start(state) if hidden is None else hidden
+            inputs += [hidden.nodes, hidden.edges, hidden.globals_]
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+            after, *rest = _Differentiable.apply(self, *inputs)
+        else:
+            after, *rest = detached(self.run, *inputs)
+        return after, Graph(*rest, self.program.edge_index) if rest else None
+
+    def _start(self, state: Tensor) -> Graph:
+        assert self.program.recurrent is not None
+        size, edges = self.program.recurrent.hidden_size, self.program.edge_index.shape[1]
+        *batch, count, _ = state.shape
+        shapes = ((*batch, count, size.nodes), (*batch, edges, size.edges), (*batch, size.globals_))
+        parts = (state.new_zeros(shape, dtype=self.program.dtype) for shape in shapes)
+        return Graph(*parts, self.program.edge_index)
+
+
+def detached(function: Callable, *inputs: Tensor) -> Any:
+    """Call compiled code: it is compiled anew for inputs with other strides, or of which a gradient is wanted."""
+    with torch.no_grad():
+        return function(*(tensor.detach().contiguous() for tensor in inputs))
 
 
 class _Differentiable(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, compiled: CompiledStep, state: Tensor, action: Tensor) -> Tensor:
-        ctx.compiled, ctx.stamp = compiled, compiled.stamp()
-        ctx.save_for_backward(state, action)
-        return compiled._run(compiled._step, state, action)
+    def forward(ctx, executor: CompiledExecutor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.executor, ctx.version = executor, executor.version
+        ctx.save_for_backward(*inputs)
+        return detached(executor.run, *inputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        if ctx.stamp != ctx.compiled.stamp():
+    def backward(ctx, *gradients: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        if ctx.version != ctx.executor.version:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
-        return None, *ctx.compiled._run(ctx.compiled._pull, *ctx.saved_tensors, gradient)
+        return None, *detached(ctx.executor.pull, *ctx.saved_tensors, *gradients)
 
 
 def _compile(function: Callable) -> Callable:
-    # Small linear systems are solved through Python's fallback; the user need not know.
-    logging.getLogger("torch._inductor.ir").addFilter(_is_news)
-    options: dict[str, Any] = {"guard_filter_fn": partial(_guards_of_inputs, inspect.signature(function).parameters)}
+    # Small linear systems are solved through Python's fallback, of which the compiler warns.
+    logging.getLogger("torch._inductor.ir").addFilter(_is_worth_showing)
+    options: dict[str, Any] = {"guard_filter_fn": partial(_input_guards, inspect.signature(function).parameters)}
     if not torch.cuda.is_available():
         # The kernels of a small graph take less time than calling them from Python.
         options["cpp_wrapper"] = True
@@ -77,34 +130,32 @@ def _compile(function: Callable) -> Callable:
     return torch.compile(function, fullgraph=True, dynamic=False, options=options, **limits)
 
 
-def _guards_of_inputs(inputs: Collection[str], guards: Sequence[Any]) -> list[bool]:
-    """Which of what was true when compiling is checked at each call: shapes, dtypes and devices of the inputs.
+def _input_guards(inputs: Collection[str], guards: Sequence[Any]) -> list[bool]:
+    """Check at each call only shapes, dtypes and devices of the inputs.
 
-    All else that the function reads belongs to one model and one snapshot; to look through it takes longer than a
-    step of a small graph.
+    All else that the function reads belongs to one program; checking it takes longer than a step of a small graph.
     """
     return [guard.guard_type == "TENSOR_MATCH" and guard.name in inputs for guard in guards]
 
 
-def _is_news(record: logging.LogRecord) -> bool:
+def _is_worth_showing(record: logging.LogRecord) -> bool:
     return "missing a c-shim implementation" not in record.getMessage()
 
 
 def check_torch() -> None:
     """Refuse to compile with a torch that is too old.
 
-    Of a step only the inputs are guarded, so two models of equal shapes must not share compiled code, as they do
-    without ``isolate_recompiles``. Such a torch cannot compile TorchRL's losses either (tried with 2.7).
+    Only inputs are guarded, so two programs of equal shapes must not share compiled code: ``isolate_recompiles``.
 
     Raises:
         RuntimeError: if it is too old.
     """
     if "isolate_recompiles" not in inspect.signature(torch.compile).parameters:
-        raise RuntimeError(f"compile=True needs torch 2.13 or newer, not {torch.__version__}: leave compile out.")
+        raise RuntimeError(f"compiling needs torch 2.13 or newer, not {torch.__version__}: use executor='eager'.")
 
 
 def check_compiler() -> None:
-    """Refuse to compile for a CPU without a C++ compiler, before anything is waited for.
+    """Refuse to compile for a CPU without a C++ compiler, before anything is computed.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -115,4 +166,4 @@ def check_compiler() -> None:
     try:
         get_cpp_compiler()
     except InvalidCxxCompiler as error:
-        raise FileNotFoundError("compile=True needs a C++ compiler: install g++, or leave compile out.") from error
+        raise FileNotFoundError("compiling needs a C++ compiler: install g++, or use executor='eager'.") from error

@@ -1,1 +1,22 @@
-"""What the network sees of a state."""
+"""What the network sees of a state: one feature a file.
+
+A feature of your own subclasses :class:`~torchrl_gn.dynamics.features.feature.Feature`; add it to :data:`FEATURES`
+before a checkpoint names it.
+"""
+
+from torchrl_gn.dynamics.features.body_state import BodyState as BodyState
+from torchrl_gn.dynamics.features.canonical_state import Canonicalizer as Canonicalizer
+from torchrl_gn.dynamics.features.canonical_state import CanonicalState as CanonicalState
+from torchrl_gn.dynamics.features.contacts import Contacts as Contacts
+from torchrl_gn.dynamics.features.controls import Controls as Controls
+from torchrl_gn.dynamics.features.feature import Feature as Feature
+from torchrl_gn.dynamics.features.feature import StepInputs as StepInputs
+from torchrl_gn.dynamics.features.joint_axes import JointAxes as JointAxes
+
+FEATURES: dict[str, type[Feature]] = {
+    "body_state": BodyState,
+    "contacts": Contacts,
+    "controls": Controls,
+    "joint_axes": JointAxes,
+}
+"""Features by the names that checkpoints have for them."""

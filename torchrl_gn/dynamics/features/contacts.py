@@ -1,35 +1,54 @@
-"""What a body is about to touch, as features of its node."""
+"""Distances from a plane fixed in the world as features of each body."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.maths.float64_buffers import Float64Buffers
-from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
 from torchrl_gn.scenes.contact_points import SLOTS, contact_slots
 
 if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
     from torchrl_gn.scenes import Scene
 
-_NEAR = 0.02  # metres: within this of the plane distances are shown finely
+_NEAR = 0.02  # metres: up to this distance from the plane the fine feature varies
 
 
-class Contacts(Float64Buffers):
-    """Distances and velocities of the points that can touch the scene's plane.
+@dataclass(frozen=True)
+class Contacts(Feature):
+    """Distances and velocities of the points that can touch the scene's plane
+    (:attr:`Scene.contact_points <torchrl_gn.scenes.Scene>`).
 
-    A contact force sets in within millimetres of a body that moves metres. To find that from
-    positions and rotations a network has to compute distances to a thousandth; here they are
-    computed for it. Paper: the network sees positions and rotations alone.
-
-    Args:
-        scene: whose points these are (:attr:`Scene.contact_points <torchrl_gn.scenes.Scene>`).
+    A contact force sets in within millimetres of a body that moves metres; the network need not compute the distance.
+    Paper: it sees positions and rotations alone.
     """
 
-    size = 6 * SLOTS
+    part: ClassVar[Literal["nodes", "edges"]] = "nodes"
+
+    def size(self, layout: StateLayout) -> int:
+        return 6 * SLOTS
+
+    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        if layout != BODY_STATE:
+            raise ValueError(
+                f"Contacts needs states of bodies; scene {scene.name!r} has others: leave the feature out."
+            )
+        return BoundContacts(scene)
+
+
+class BoundContacts(Float64Buffers):
+    """Contact features of one scene.
+
+    Args:
+        scene: the scene.
+    """
 
     mask: Tensor
     normal: Tensor
@@ -48,29 +67,25 @@ class Contacts(Float64Buffers):
         }
         self.constants(values)
 
-    def forward(self, state: Tensor, matrices: Tensor, offset: Tensor, radius: Tensor) -> Tensor:
-        """Features of every node.
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """Features ``[*B, N, 24]``; 0 where there is no point.
 
-        Args:
-            state: ``[*B, N, 13]``, the world first: the plane is fixed to it.
-            matrices: ``[*B, N, 3, 3]`` of the orientations in it.
-            offset: ``[N, 4, 3]`` or ``[*B, N, 4, 3]`` points in the nodes' frames, metres.
-            radius: ``[N, 4]`` or ``[*B, N, 4]``.
-
-        Returns:
-            ``[*B, N, 24]``: for every point its distance from the plane, the same finely where it is
-            small, where it will be a control step on, and its velocity; 0 where there is no point.
+        For each of four points: its distance from the plane (metres), the same and that of the next step clipped to
+        2 cm and scaled to 1, and its velocity (m/s).
         """
+        state, matrices, _ = inputs.canonical
         if not self.any:
-            return state.new_zeros((*state.shape[:-1], self.size))
+            return state.new_zeros((*state.shape[:-1], 6 * SLOTS))
+        assert matrices is not None
+        offset, radius = inputs.parameters.contact_offset, inputs.parameters.contact_radius
         at = BODY_STATE.slices
         position, velocity = state[..., at["position"]], state[..., at["linear_velocity"]]
         plane = torch.stack((self.normal, self.origin)).to(state.dtype) @ matrices[..., :1, :, :].mT  # [*B, 1, 2, 3]
         normal, origin = plane[..., :1, :], plane[..., 1, :] + position[..., :1, :]
-        arm = offset.to(state.dtype) @ matrices.mT  # [*B, N, 4, 3]
-        spin = state[..., at["angular_velocity"]].unsqueeze(-2).expand_as(arm)
-        moving = velocity.unsqueeze(-2) + torch.linalg.cross(spin, arm)
-        away = ((position - origin).unsqueeze(-2) + arm) * normal
+        point = offset.to(state.dtype) @ matrices.mT  # [*B, N, 4, 3]
+        spin = state[..., at["angular_velocity"]].unsqueeze(-2).expand_as(point)
+        moving = velocity.unsqueeze(-2) + torch.linalg.cross(spin, point)
+        away = ((position - origin).unsqueeze(-2) + point) * normal
         distance = away.sum(-1) - radius.to(state.dtype)
         soon = distance + self.timestep * (moving * normal).sum(-1)
         fine = [(value / _NEAR).clamp(-1, 1) for value in (distance, soon)]

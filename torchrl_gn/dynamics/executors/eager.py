@@ -1,0 +1,89 @@
+"""Run a step program with torch operations, on any device and in any dtype."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics.features.canonical_state import CanonicalState
+from torchrl_gn.dynamics.features.feature import StepInputs
+from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.networks.graph import Graph, graph_concat
+
+
+class EagerExecutor:
+    """Interpret a program operation by operation; differentiable in all that the program is.
+
+    Args:
+        program: the step.
+    """
+
+    fixed_batch = False
+    """Whether another batch size costs a compilation."""
+
+    def __init__(self, program: StepProgram) -> None:
+        self.program = program
+
+    def update(self, program: StepProgram) -> None:
+        """Take another program."""
+        self.program = program
+
+    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        """Next state ``[*B, N, 13]`` and hidden state of a state and an action ``[*B, A]``."""
+        return step(self.program, state, action, hidden)
+
+
+def features(program: StepProgram, canonical: CanonicalState, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised."""
+    inputs = StepInputs(canonical, program.controls(action), program.parameters)
+    nodes, edges = (
+        torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+        for parts in ([feature(inputs) for feature in of] for of in (program.node_features, program.edge_features))
+    )
+    return nodes, edges
+
+
+def dynamic_graph(program: StepProgram, canonical: CanonicalState, action: Tensor) -> Graph:
+    """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
+    nodes, edges = features(program, canonical, action)
+    globals_ = nodes.new_zeros((*nodes.shape[:-2], 0), dtype=program.dtype)
+    nodes, edges = program.nodes(nodes, program.dtype), program.edges(edges, program.dtype)
+    return Graph(nodes, edges, globals_, program.edge_index)
+
+
+def delta(
+    program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+) -> tuple[Tensor, Graph | None]:
+    """Predicted change ``[*B, N, 12]``, zero in fixed components, and the next hidden state.
+
+    Args:
+        program: the step.
+        state: ``[*B, N, 13]``.
+        action: ``[*B, A]``.
+        hidden: hidden state of a recurrent model; default: the initial one.
+    """
+    canonical = program.canonicalizer(state, program.parameters)
+    graph = dynamic_graph(program, canonical, action)
+    if program.recurrent is not None:
+        assert program.static is not None
+        before = program.recurrent.start(graph) if hidden is None else hidden
+        hidden = program.recurrent.update(graph, program.static, before)
+        graph = graph_concat(graph, hidden)
+    residual = program.output(program.core.predict(graph), state.dtype)
+    if canonical.rotation is not None:
+        residual = program.layout.rotate_delta(residual, *canonical.rotation)
+    if program.timestep is not None:
+        residual = program.layout.integrate(state, residual, program.timestep)
+    change = residual * program.movable
+    if program.projection is not None:
+        # Without a rotation the canonical state's matrices are the world's.
+        matrices = canonical.matrices if canonical.rotation is None else program.canonicalizer.matrices(state)
+        assert matrices is not None
+        change = program.projection(state, matrices, change, program.change_std, program.parameters)
+    return change, hidden
+
+
+def step(program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None) -> tuple[Tensor, Graph | None]:
+    """Next state ``[*B, N, 13]`` and hidden state."""
+    change, hidden = delta(program, state, action, hidden)
+    return program.layout.apply(state, change), hidden

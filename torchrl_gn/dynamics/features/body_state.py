@@ -1,0 +1,71 @@
+"""The canonical state as features of its node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.state_layout import Encoding, StateLayout
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
+    from torchrl_gn.scenes import Scene
+
+
+@dataclass(frozen=True)
+class BodyState(Feature):
+    """Encoded canonical state of each body.
+
+    Attributes:
+        encoding: an orientation as its rotation ``"matrix"`` or (paper) as the ``"quaternion"``.
+        positions: show positions along axes of translation invariance. A network without them transfers to scenes
+            larger than those it was trained on.
+
+    Raises:
+        ValueError: if ``encoding`` is not known.
+    """
+
+    part: ClassVar[Literal["nodes", "edges"]] = "nodes"
+
+    encoding: Encoding = "matrix"
+    positions: bool = True
+
+    def __post_init__(self) -> None:
+        if self.encoding not in get_args(Encoding):
+            raise ValueError(f"encoding={self.encoding!r} is not known; use one of {list(get_args(Encoding))}.")
+
+    def size(self, layout: StateLayout) -> int:
+        return layout.encoded_size(self.encoding)
+
+    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        return _Bound(self, scene, layout, canonicalizer)
+
+
+class _Bound(Float64Buffers):
+    visible: Tensor
+
+    def __init__(
+        self, options: BodyState, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer
+    ) -> None:
+        super().__init__()
+        self.layout, self.encoding = layout, options.encoding
+        invariant = torch.as_tensor(scene.translation_invariant)
+        # In a scene that rotates about an axis, both others must be invariant to be hidden at every yaw.
+        yaw = canonicalizer.yaw_frame
+        across = invariant if yaw is None else torch.arange(3) != yaw.axis
+        self.hides = bool(not options.positions and invariant.any() and invariant[across].all())
+        if self.hides:
+            visible = torch.ones(scene.num_nodes, layout.size)
+            visible[:, layout.slices["position"]] -= canonicalizer.shifted
+            self.constants({"visible": visible})
+
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """Features ``[*B, N, F]``."""
+        state, matrices, _ = inputs.canonical
+        shown = state * self.visible.to(state.dtype) if self.hides else state
+        return self.layout.encode(shown, self.encoding, matrices)

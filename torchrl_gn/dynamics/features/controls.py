@@ -1,0 +1,86 @@
+"""The controls as features of their joints' edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.state_layout import StateLayout
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
+    from torchrl_gn.scenes import Scene
+
+
+@dataclass(frozen=True)
+class Controls(Feature):
+    """Controls that act at each edge's joint.
+
+    Attributes:
+        per_joint: most controls that act at one joint; None: as in the scene.
+    """
+
+    part: ClassVar[Literal["nodes", "edges"]] = "edges"
+
+    per_joint: int | None = None
+
+    def resolved(self, scene: Scene) -> Controls:
+        return self if self.per_joint is not None else replace(self, per_joint=_controls_per_joint(scene))
+
+    def size(self, layout: StateLayout) -> int:
+        return 1 if self.per_joint is None else self.per_joint
+
+    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        there, here = _controls_per_joint(scene), self.size(layout)
+        if there != here:
+            raise ValueError(
+                f"The model reads {here} controls at each joint, scene {scene.name!r} has {there}: build the model with"
+                " ForwardModel.for_scene."
+            )
+        return _Bound()
+
+
+class _Bound(nn.Module):
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """Features ``[*B, E, C]``."""
+        return inputs.controls
+
+
+def _controls_per_joint(scene: Scene) -> int:
+    return 1 if scene.edge_action.ndim == 1 else int(scene.edge_action.shape[1])
+
+
+class ControlInputs(Float64Buffers):
+    """Actions at the edges of the joints that they act on, for one scene.
+
+    Args:
+        scene: the scene.
+    """
+
+    action_low: Tensor
+    action_high: Tensor
+    edge_action: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        edge_action = torch.as_tensor(scene.edge_action).long()
+        edge_action = edge_action.unsqueeze(-1) if edge_action.ndim == 1 else edge_action  # [E, C]
+        values = {
+            "action_low": torch.as_tensor(scene.action_low),
+            "action_high": torch.as_tensor(scene.action_high),
+            # A column of zeros behind the actions stands for joints without actuator.
+            "edge_action": torch.where(edge_action < 0, scene.num_actions, edge_action),
+        }
+        self.constants(values)
+
+    def forward(self, action: Tensor) -> Tensor:
+        """Controls ``[*B, E, C]`` of actions ``[*B, A]``, clipped to the actuators' limits as MuJoCo clips them."""
+        # 0 * action: an infinite action gives NaN and not the limit.
+        action = action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype)) + 0 * action
+        padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
+        return padded[..., self.edge_action]

@@ -1,0 +1,56 @@
+"""Input features of a forward model's network."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+
+from torch import Tensor, nn
+
+from torchrl_gn.maths.state_layout import StateLayout
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer, CanonicalState
+    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+
+class StepInputs(NamedTuple):
+    """What features are computed from.
+
+    Attributes:
+        canonical: the canonical state.
+        controls: ``[*B, E, C]`` controls at each edge's joint, clipped to the actuators' limits.
+        parameters: physical parameters of the scene, or of each sample.
+    """
+
+    canonical: CanonicalState
+    controls: Tensor
+    parameters: PhysicalParameters
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Features of every node or edge (base class): options here, constants of a scene in what :meth:`bind` returns.
+
+    Attributes:
+        part: whether nodes or edges get the features.
+    """
+
+    part: ClassVar[Literal["nodes", "edges"]]
+
+    def resolved(self, scene: Scene) -> Feature:
+        """The same feature with its open options read from a scene."""
+        return self
+
+    def size(self, layout: StateLayout) -> int:
+        """Number of features of each node or edge."""
+        raise NotImplementedError
+
+    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        """Module from :class:`StepInputs` to features ``[*B, N, size]`` or ``[*B, E, size]``, for one scene."""
+        raise NotImplementedError
+
+    def options(self) -> dict:
+        """Its options as plain values."""
+        return asdict(self)

@@ -1,0 +1,55 @@
+"""Joint axes as features of their edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.scenes.joint_axes import joint_axes
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
+    from torchrl_gn.scenes import Scene
+
+
+@dataclass(frozen=True)
+class JointAxes(Feature):
+    """Each joint's axis in the canonical frame, and the control along it.
+
+    The network need not learn to rotate them. Paper: it sees the control alone.
+    """
+
+    part: ClassVar[Literal["nodes", "edges"]] = "edges"
+
+    def size(self, layout: StateLayout) -> int:
+        return 6
+
+    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        if "orientation" not in layout.names or scene.edge_action.ndim != 1:
+            raise ValueError(
+                f"JointAxes needs states with orientations and one control at each joint; scene {scene.name!r} has"
+                " others: leave the feature out."
+            )
+        return _Bound(scene)
+
+
+class _Bound(Float64Buffers):
+    joint_node: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.constants({"joint_node": torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2)})
+
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """Features ``[*B, E, 6]``."""
+        matrices = inputs.canonical.matrices
+        assert matrices is not None
+        axis = inputs.parameters.joint_axis.to(matrices.dtype).unsqueeze(-1)
+        axes = (matrices[..., self.joint_node, :, :] @ axis).squeeze(-1)
+        return torch.cat((axes, inputs.controls * axes), dim=-1)

@@ -1,0 +1,105 @@
+"""Normalised graphs of a predictor's scene, and the statistics that normalise them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.shapes import check_shapes
+from torchrl_gn.finite import require_finite
+from torchrl_gn.maths import quaternion
+from torchrl_gn.networks.graph import Graph
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.predictor import Predictor
+
+
+def static_graph(predictor: Predictor, parameters: PhysicalParameters, dtype: torch.dtype | None = None) -> Graph:
+    """Normalised static graph of physical parameters, in the network's dtype by default."""
+    model, dtype = predictor.model, dtype or predictor.dtype
+    if model.parameter_source == "inferred":  # comes from a network already
+        nodes, edges, globals_ = (part.to(dtype) for part in parameters[:3])
+        if model.project:
+            own = predictor.scene_parameters
+            change = (parameters.parent_anchor - own.parent_anchor, parameters.child_anchor - own.child_anchor)
+            offsets = (torch.cat(change, dim=-1) / predictor.scene.joint_anchors.anchor_scale).to(dtype)
+            nodes = torch.cat((nodes, offsets.expand(*nodes.shape[:-1], 6)), dim=-1)
+    else:
+        normalizers = model.parameter_normalizers.items()
+        nodes, edges, globals_ = (normalizer(getattr(parameters, part), dtype) for part, normalizer in normalizers)
+    return Graph(nodes, edges, globals_, predictor.incidence.edge_index)
+
+
+def dynamic_graph(predictor: Predictor, state: Tensor, action: Tensor) -> Graph:
+    """Normalised dynamic graph ``[*B, ...]`` of states and actions, in the network's dtype.
+
+    Raises:
+        ValueError: if a shape does not fit the scene.
+    """
+    check_shapes(predictor.scene, state, action)
+    program = predictor.program(reference=True)
+    return eager.dynamic_graph(program, program.canonicalizer(state, program.parameters), action)
+
+
+def residual(
+    predictor: Predictor, state: Tensor, next_state: Tensor, parameters: PhysicalParameters | None = None
+) -> Tensor:
+    """Target of the network for transitions: change ``[*B, N, 12]`` in the yaw frame, less what the rates explain."""
+    layout, frame = predictor.layout, predictor.canonicalizer
+    change = layout.delta(state, next_state)
+    if predictor.model.integrate:
+        change = layout.residual(state, change, float(predictor.scene.timestep))
+    rotation = frame.yaw_rotation(state, parameters or predictor.scene_parameters)
+    if rotation is None:
+        return change
+    return layout.rotate_delta(change, quaternion.conjugate(rotation.quaternion), rotation.matrix.mT)
+
+
+def update_parameter_normalizers(predictor: Predictor, parameters: TensorDictBase | None = None) -> None:
+    """Take physical parameters, by default the scene's, into the model's statistics: once, before training.
+
+    An inferred graph has no statistics.
+
+    Raises:
+        ValueError: if one is not finite; no statistic is changed.
+    """
+    if parameters is not None:
+        require_finite(parameters, "parameters")
+    if predictor.model.parameter_source == "inferred":
+        return
+    values = predictor.parameter_reader.read(parameters)
+    for part, normalizer in predictor.model.parameter_normalizers.items():
+        normalizer.update(getattr(values, part))
+
+
+def update_dynamic_normalizers(
+    predictor: Predictor, state: Tensor, action: Tensor, next_state: Tensor, parameters: TensorDictBase | None = None
+) -> None:
+    """Take transitions into the model's statistics (paper, "One step of the training algorithm").
+
+    Args:
+        predictor: of the scene.
+        state: ``[*B, N, 13]``, with the input noise that training adds.
+        action: ``[*B, A]``.
+        next_state: ``[*B, N, 13]``, clean.
+        parameters: physical parameters of each sample, by default the scene's.
+
+    Raises:
+        ValueError: if a shape does not fit or a number is not finite; no statistic is changed.
+    """
+    check_shapes(predictor.scene, state, action, parameters)
+    given = {"state": state, "action": action, "next state": next_state, "parameters": parameters}
+    for what, value in given.items():
+        if value is not None:
+            require_finite(value, what)
+    model, movable, program = predictor.model, predictor.movable, predictor.program(parameters, reference=True)
+    nodes, edges = eager.features(program, program.canonicalizer(state, program.parameters), action)
+    model.node_normalizer.update(nodes)
+    model.edge_normalizer.update(edges)
+    model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)
+    model.residual_normalizer.update(residual(predictor, state, next_state, program.parameters), movable)

@@ -1,0 +1,145 @@
+"""The description of one scene's prediction step: what every executor runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_gn.dynamics.constraints import MaximalProjection
+from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
+from torchrl_gn.dynamics.features.controls import ControlInputs
+from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.networks.core import Core, FoldedCore
+from torchrl_gn.networks.graph import Graph
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+
+class InputScaling(NamedTuple):
+    """How a part of the graph enters the network: columns, less mean, times scale.
+
+    Attributes:
+        columns: ``[F']`` columns that are read; None: all.
+        mean: ``[F']`` float64.
+        scale: ``[F']`` float64; None: folded into the core.
+    """
+
+    columns: Tensor | None
+    mean: Tensor
+    scale: Tensor | None
+
+    @classmethod
+    def of(cls, normalizer: Normalizer) -> InputScaling:
+        """All columns, scaled as a normaliser scales them."""
+        return cls(None, normalizer.mean, normalizer.inverse_std)
+
+    @classmethod
+    def folded(cls, normalizer: Normalizer) -> InputScaling:
+        """Columns that varied in training; their scale goes into the core."""
+        columns = (~normalizer.constant).nonzero().flatten()
+        return cls(columns, normalizer.mean[columns], None)
+
+    def __call__(self, features: Tensor, dtype: torch.dtype) -> Tensor:
+        """Scaled features ``[..., F']`` in the network's dtype."""
+        # The mean is subtracted first: large numbers cancel before they are rounded.
+        kept = features if self.columns is None else features[..., self.columns]
+        centered = kept - self.mean.to(features.dtype)
+        return (centered if self.scale is None else centered * self.scale.to(features.dtype)).to(dtype)
+
+
+class OutputScaling(NamedTuple):
+    """How the network's output becomes a residual change in SI units.
+
+    Attributes:
+        runs: columns of the change, in order: slices of the output, or of ``mean`` for components that never varied;
+            None: the output has all components, to be scaled.
+        mean: ``[12]`` float64.
+        std: ``[12]`` float64; None: folded into the core.
+    """
+
+    runs: tuple[tuple[bool, slice], ...] | None
+    mean: Tensor
+    std: Tensor | None
+
+    @classmethod
+    def of(cls, normalizer: Normalizer) -> OutputScaling:
+        """All components, scaled back as a normaliser scales them."""
+        return cls(None, normalizer.mean, normalizer.std)
+
+    @classmethod
+    def folded(cls, normalizer: Normalizer, rows: Tensor) -> OutputScaling:
+        """Components ``rows`` from the output, in SI units; the others keep their mean."""
+        return cls(_runs(rows.tolist(), normalizer.size), normalizer.mean, None)
+
+    def __call__(self, predicted: Tensor, dtype: torch.dtype) -> Tensor:
+        """Residual ``[*B, N, 12]`` in ``dtype``."""
+        if self.runs is None:
+            assert self.std is not None
+            return (predicted * self.std.to(predicted.dtype) + self.mean.to(predicted.dtype)).to(dtype)
+        predicted = predicted.to(dtype)
+        constant = self.mean.to(dtype).expand(*predicted.shape[:-1], -1)
+        return torch.cat([(predicted if varies else constant)[..., where] for varies, where in self.runs], dim=-1)
+
+
+@dataclass(frozen=True)
+class StepProgram:
+    """One scene's prediction step: state maths, folded network, constraint projection.
+
+    Made by :meth:`Predictor.program` and run by the executors in :mod:`~torchrl_gn.dynamics.executors`. Constants of
+    the scene are modules with buffers; a program of a specialised predictor shares no memory with the weights.
+
+    Attributes:
+        layout: channels of the state.
+        timestep: control step, seconds; None: the whole change is predicted.
+        movable: ``[N, 12]`` movable-component mask.
+        edge_index: ``[2, E]``.
+        parameters: physical parameters of the scene, or of each sample.
+        canonicalizer: to the canonical state and back.
+        controls: actions to edges.
+        node_features: modules from :class:`StepInputs` to node features.
+        edge_features: modules to edge features.
+        nodes: scaling of the node features.
+        edges: scaling of the edge features.
+        recurrent: core whose hidden state is updated; None of a feed-forward model.
+        static: normalised static graph, which the hidden state reads.
+        core: the folded network.
+        output: scaling of its output.
+        projection: onto the joint constraints; None without.
+        change_std: ``[12]`` standard deviations of a change, weights of the projection.
+        dtype: of the network.
+    """
+
+    layout: StateLayout
+    timestep: float | None
+    movable: Tensor
+    edge_index: Tensor
+    parameters: PhysicalParameters
+    canonicalizer: BoundCanonicalizer
+    controls: ControlInputs
+    node_features: nn.ModuleList
+    edge_features: nn.ModuleList
+    nodes: InputScaling
+    edges: InputScaling
+    recurrent: Core | None
+    static: Graph | None
+    core: FoldedCore
+    output: OutputScaling
+    projection: MaximalProjection | None
+    change_std: Tensor
+    dtype: torch.dtype
+
+
+def _runs(rows: list[int], size: int) -> tuple[tuple[bool, slice], ...]:
+    """Where to take a full row of ``size`` from: adjacent kept ``rows``, or their constants."""
+    runs: list[tuple[bool, slice]] = []
+    for column in range(size):
+        kept = column in rows
+        place = rows.index(column) if kept else column
+        if runs and runs[-1][0] == kept and runs[-1][1].stop == place:
+            runs[-1] = (kept, slice(runs[-1][1].start, place + 1))
+        else:
+            runs.append((kept, slice(place, place + 1)))
+    return tuple(runs)

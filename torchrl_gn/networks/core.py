@@ -1,0 +1,111 @@
+"""What a forward model asks of its network: the core."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from torch import Tensor, nn
+
+from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
+from torchrl_gn.networks.incidence import Incidence
+
+
+class FoldedCore(Protocol):
+    """A core for graphs of one topology and one static graph."""
+
+    def predict(self, dynamic: Graph) -> Tensor:
+        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``."""
+        ...
+
+
+Columns = tuple[Tensor, Tensor]
+"""Indices of columns to keep, and a factor for each."""
+
+
+@runtime_checkable
+class ReducibleCore(FoldedCore, Protocol):
+    """A folded core that can drop and rescale features."""
+
+    def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> ReducibleCore:
+        """The same core with fewer, rescaled features.
+
+        Args:
+            nodes: dynamic node features to keep.
+            edges: dynamic edge features to keep.
+            out: output features to keep.
+            shift: added to the scaled output.
+        """
+        ...
+
+
+class Core(nn.Module):
+    """Network of a forward model: graph in, node features out (base class).
+
+    A subclass implements :meth:`forward`, and :meth:`fold` if it can be evaluated faster for one topology and one
+    static graph. A recurrent core sets ``hidden_size`` and implements :meth:`update`. Its constructor takes
+    ``(dynamic, static, out_nodes, *, counts, **options)``.
+
+    Attributes:
+        dynamic: features of the dynamic graph.
+        hidden_size: features of the hidden state; zeros for a feed-forward core.
+        counts: ``(N, E)`` nodes and edges of the only graphs that it reads; None: any.
+    """
+
+    fixed_size = False
+    """Whether the core reads graphs of one size only."""
+
+    def __init__(self, dynamic: GraphSize, *, hidden_size: GraphSize | None = None) -> None:
+        super().__init__()
+        self.dynamic = dynamic
+        self.hidden_size = hidden_size or GraphSize(0, 0, 0)
+        self.counts: tuple[int, int] | None = None
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether it has a hidden state."""
+        return self.hidden_size != GraphSize(0, 0, 0)
+
+    def forward(self, graph: Graph) -> Graph:
+        """Dynamic, hidden and static features side by side in, ``out_nodes`` node features out."""
+        raise NotImplementedError
+
+    def start(self, dynamic: Graph) -> Graph:
+        """Initial hidden state, zeros, for the batch of a dynamic graph ``[*B, ...]``."""
+        return dynamic.zeros(self.hidden_size)
+
+    def update(self, dynamic: Graph, static: Graph, hidden: Graph) -> Graph:
+        """Hidden state after one more dynamic graph."""
+        return hidden
+
+    def fold(self, incidence: Incidence, static: Graph) -> FoldedCore:
+        """The core for one topology and one static graph, differentiable in the weights.
+
+        Args:
+            incidence: edges of the graph, and which nodes are predicted.
+            static: normalised static graph, with or without batch.
+        """
+        return UnfoldedCore(self, static)
+
+
+def layer_sizes(hidden: int | Sequence[int], layers: int) -> list[int]:
+    """Sizes of an MLP's hidden layers: ``layers`` of one width, or those that are given."""
+    return [hidden] * layers if isinstance(hidden, int) else [int(size) for size in hidden]
+
+
+@dataclass(frozen=True)
+class UnfoldedCore:
+    """A core evaluated by message passing, edge by edge: the reference for every folded core.
+
+    Attributes:
+        core: the core.
+        static: normalised static graph.
+    """
+
+    core: Core
+    static: Graph
+
+    def predict(self, dynamic: Graph) -> Tensor:
+        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``."""
+        return self.core(graph_concat(dynamic, self.static)).nodes

@@ -1,0 +1,22 @@
+"""Cores by name: what a forward model's ``core=`` and its checkpoints name."""
+
+from __future__ import annotations
+
+from torchrl_gn.networks.core import Core
+from torchrl_gn.networks.gn_core import GNCore
+from torchrl_gn.networks.mlp_core import MLPCore
+from torchrl_gn.networks.recurrent_core import RecurrentCore
+
+CORES: dict[str, type[Core]] = {"gn": GNCore, "mlp": MLPCore, "recurrent": RecurrentCore}
+"""Add a core of your own here, before a model or a checkpoint names it."""
+
+
+def core_class(name: str) -> type[Core]:
+    """The core of a name.
+
+    Raises:
+        ValueError: if it is none of :data:`CORES`.
+    """
+    if name not in CORES:
+        raise ValueError(f"core={name!r} is not known; use one of {list(CORES)}, or add yours to CORES.")
+    return CORES[name]
