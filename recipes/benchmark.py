@@ -6,7 +6,7 @@ Every contestant predicts the same rollouts (starts and random controls of the d
 a finely stepped MuJoCo: GN forward models of several sizes and MLPs, trained here for `minutes` each (or
 `checkpoints=[FOLDER,...]`), evaluated plain, specialised (with `fast_matmul`) and, where this processor is fast at
 it, in bfloat16; and MuJoCo at its own and at coarser time steps and solver settings. Errors are relative to the
-constant prediction, over equal simulated time. Run time is wall time per simulated second of one trajectory, on
+persistence baseline, over equal simulated time. Run time is wall time per simulated second of one trajectory, on
 `threads` threads, at every batch size: medians, all contestants in turn.
 A contestant is on the Pareto front of a batch size if nothing is both faster and more accurate.
 
@@ -135,7 +135,7 @@ def physical(cfg: DictConfig, scene: Scene) -> list[Contestant]:
 
 
 def relative_error(prediction: Tensor, truth: Tensor, scene: Scene) -> float:
-    """Mean over components of squared error by that of the constant prediction; infinite if it diverged."""
+    """Mean over components of squared error by that of the persistence baseline; infinite if it diverged."""
     nodes = torch.as_tensor(scene.predicted)
     prediction, truth = prediction[:, 1:, nodes], truth[:, :, nodes]
     if not bool(torch.isfinite(prediction).all()):

@@ -29,7 +29,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_gn.data import Simulator, collect_trajectories, sample_start_states, spline_controls, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor, UnseenFeatureWarning, specialize
+from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor, UnseenParameterWarning, specialize
 from torchrl_gn.evaluation import guarded_rollout, kinetic_energy
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
@@ -169,7 +169,7 @@ def corners(exact: Predictor, count: int, seed: int) -> TensorDictBase:
     chosen = np.random.default_rng(seed).integers(2, size=(count, len(ends)))
     variants = make_variants(system, ends[np.arange(len(ends)), chosen], timestep=exact.scene.timestep)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnseenFeatureWarning)  # far outside of what was trained on, on purpose
+        warnings.simplefilter("ignore", UnseenParameterWarning)  # far outside of what was trained on, on purpose
         return cast(TensorDictBase, torch.stack([exact.parameters_of(variant) for variant in variants]))
 
 

@@ -138,9 +138,9 @@ def _advice(seconds: dict[str, tuple[float, float]], threads: int, compiler: boo
     products = product_speeds()
     lines = ["specialize(model) for prediction, evaluation and planning"]
     lines.append(
-        "specialize(model, compile=True) for few states at a time and for planning"
+        "specialize(model, executor='compiled') for few states at a time and for planning"
         if compiler
-        else "install g++ for compile=True: 5 to 8 times faster steps of few states"
+        else "install g++ for executor='compiled': 5 to 8 times faster steps of few states"
     )
     slower = products.slowdown(torch.bfloat16)
     lines.append(

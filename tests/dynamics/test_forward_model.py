@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
-from torchrl_gn.dynamics import ForwardModel, Predictor, UnseenFeatureWarning, specialize
+from torchrl_gn.dynamics import ForwardModel, Predictor, UnseenParameterWarning, specialize
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths import BODY_STATE, Component, StateLayout
 from torchrl_gn.objectives import ForwardModelLoss
@@ -128,7 +128,7 @@ def test_an_untrained_model_predicts_what_the_rates_alone_do(scenes, make_model,
 def test_scenes_share_the_weights(scenes, make_model, random_states, random_actions):
     model = make_model(scenes["swimmer6"])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnseenFeatureWarning)
+        warnings.simplefilter("ignore", UnseenParameterWarning)
         bound = [model.bind(scenes[name]) for name in ("swimmer6", "cheetah", "joints")]
     for one in bound[1:]:
         assert one.model is model
@@ -144,17 +144,17 @@ def test_values_that_training_never_saw_are_named(scenes, make_model):
     scene = scenes["swimmer6"]
     model = make_model(scene)
     with warnings.catch_warnings():
-        warnings.simplefilter("error", UnseenFeatureWarning)
+        warnings.simplefilter("error", UnseenParameterWarning)
         model.bind(scene)
         model.bind(scene, strict=True)
         make_model(scene, fitted=False).bind(thick_swimmer())  # no training yet, nothing to compare
-    with pytest.warns(UnseenFeatureWarning, match="'thick' has values that the model never saw.*viscosity") as caught:
+    with pytest.warns(UnseenParameterWarning, match="'thick' has values that the model never saw.*viscosity") as caught:
         model.bind(thick_swimmer())
     assert caught[0].filename == __file__
     assert "density" not in str(caught[0].message)
     with pytest.raises(ValueError, match="viscosity"):
         model.bind(thick_swimmer(), strict=True)
-    with pytest.warns(UnseenFeatureWarning, match=r"jnt_type\[FREE\].*density.*state change 2"):
+    with pytest.warns(UnseenParameterWarning, match=r"jnt_type\[FREE\].*density.*state change 2"):
         model.bind(scenes["falling"])
 
 
@@ -164,21 +164,21 @@ def test_variants_with_values_that_training_never_saw_are_named(scenes, make_mod
         model.bind(scenes["swimmer6"], strict=strict, parameters_key="parameters") for strict in (False, True)
     )
     for module in (bound, specialize(bound)):
-        with pytest.warns(UnseenFeatureWarning, match="'thick' has values .*viscosity") as caught:
+        with pytest.warns(UnseenParameterWarning, match="'thick' has values .*viscosity") as caught:
             module.parameters_of(thick_swimmer())
         assert caught[0].filename == __file__
     for module in (strict, specialize(strict)):
         with pytest.raises(ValueError, match="viscosity"):
             module.parameters_of(thick_swimmer())
         module.parameters_of(scenes["swimmer6"])
-    with pytest.warns(UnseenFeatureWarning):
+    with pytest.warns(UnseenParameterWarning):
         fit(model, thick_swimmer())
     strict.parameters_of(thick_swimmer())
 
 
 def test_a_feature_that_varied_in_training_is_not_unseen(scenes, make_model, fit):
     model = make_model(scenes["swimmer6"])
-    with pytest.warns(UnseenFeatureWarning):
+    with pytest.warns(UnseenParameterWarning):
         fit(model, thick_swimmer())
     model.bind(scenes["swimmer6"], strict=True)
     model.bind(thick_swimmer(), strict=True)

@@ -202,7 +202,7 @@ def test_a_model_env_of_variants(variants, samples, model, folds):
     torch.testing.assert_close(played["next", "state"], expected[:, 1:])
 
 
-@pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenFeatureWarning")
+@pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenParameterWarning")
 def test_an_inferred_graph_is_read_as_it_is_and_gets_gradients(variants, samples):
     torch.manual_seed(0)
     scene = variants[0]

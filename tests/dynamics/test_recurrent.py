@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel, RecurrentPredictor, specialize
+from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.evaluation import evaluate_errors, guarded_rollout
 from torchrl_gn.objectives import ForwardModelLoss
@@ -16,7 +16,7 @@ from torchrl_gn.scenes import ParameterNames, load_scene
 
 
 @pytest.fixture
-def bound(make_model) -> RecurrentPredictor:
+def bound(make_model) -> Predictor:
     scene = load_scene("swimmer3")
     model = make_model(scene, core="recurrent", hidden_state=(3, 4, 5)).double()
     # GRUs begin with small weights; larger ones make what is remembered visible.
@@ -25,7 +25,7 @@ def bound(make_model) -> RecurrentPredictor:
             for weight in cell.parameters():
                 weight.mul_(3)
     bound = model.bind(scene)
-    assert isinstance(bound, RecurrentPredictor)
+    assert isinstance(bound, Predictor)
     return bound
 
 

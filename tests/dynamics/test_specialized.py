@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_gn.dynamics import ForwardModel, UnseenFeatureWarning, specialize
+from torchrl_gn.dynamics import ForwardModel, UnseenParameterWarning, specialize
 from torchrl_gn.dynamics.executors.compiled import CompiledStep, check_compiler
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.evaluation import rollout
@@ -284,7 +284,7 @@ def test_the_table_names_what_was_skipped(scenes, make_model):
 def test_no_second_warning(scenes, make_model):
     model = make_model(scenes["swimmer6"])
     other = load_scene("swimmer6", timestep=0.01)
-    with pytest.warns(UnseenFeatureWarning):
+    with pytest.warns(UnseenParameterWarning):
         bound = model.bind(other)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

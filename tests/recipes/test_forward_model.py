@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import UnseenFeatureWarning
+from torchrl_gn.dynamics import UnseenParameterWarning
 from torchrl_gn.pretrained import load_pretrained
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_checkpoint
@@ -131,7 +131,7 @@ def test_a_model_goes_on_from_another_with_episodes_as_half_of_its_data(tmp_path
 
 def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path, call):
     options = (f"checkpoint={interrupted}", "sequences=5", f"run_dir={tmp_path}")
-    with pytest.warns(UnseenFeatureWarning, match="cartpole"):
+    with pytest.warns(UnseenParameterWarning, match="cartpole"):
         code, _, errors = call(*options, "system=cartpole", recipe="evaluate")
     assert code == 0, errors
     assert "one_step_error" in json.loads((tmp_path / "metrics.json").read_text())

@@ -1,5 +1,6 @@
 """Forward models: weights, predictors of one scene, and what executes their steps."""
 
+from torchrl_gn.dynamics.as_predictor import as_predictor as as_predictor
 from torchrl_gn.dynamics.export import export_step as export_step
 from torchrl_gn.dynamics.features import BodyState as BodyState
 from torchrl_gn.dynamics.features import Canonicalizer as Canonicalizer

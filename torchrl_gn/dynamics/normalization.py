@@ -60,6 +60,26 @@ def residual(
     return layout.rotate_delta(change, quaternion.conjugate(rotation.quaternion), rotation.matrix.mT)
 
 
+def in_range(predictor: Predictor, states: Tensor, limit: float) -> Tensor:
+    """Which states ``[*B, N, 13]`` are finite and in the range of the model's training, ``[*B]``.
+
+    In range: every body's distance from its scene's centre, and its speeds, are below ``limit`` times the root mean
+    square of training. Lengths of vectors, so the yaw does not matter.
+    """
+    normalizer, layout = predictor.model.node_normalizer, predictor.layout
+    good = states.isfinite().flatten(-2).all(-1)
+    states = predictor.canonicalizer.recentered(states)
+    second_moment = normalizer.mean.square() + normalizer.std.square()
+    columns = predictor.model.state_columns()
+    for component in layout.components:
+        if component.kind == "add" and component.name in columns:
+            square = second_moment[columns[component.name]].sum()
+            # Without statistics, as before training, there is nothing to compare with.
+            largest = torch.where(square > 0, limit**2 * square, torch.inf)
+            good &= (states[..., layout.slices[component.name]].square().sum(-1) <= largest).all(-1)
+    return good
+
+
 def update_parameter_normalizers(predictor: Predictor, parameters: TensorDictBase | None = None) -> None:
     """Take physical parameters, by default the scene's, into the model's statistics: once, before training.
 

@@ -16,7 +16,7 @@ from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.eager import EagerExecutor
 from torchrl_gn.dynamics.executors.executor import Executor
 from torchrl_gn.dynamics.features.controls import ControlInputs
-from torchrl_gn.dynamics.normalization import static_graph
+from torchrl_gn.dynamics.normalization import in_range, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.program import InputScaling, OutputScaling, StepProgram
 from torchrl_gn.dynamics.shapes import check_shapes
@@ -157,6 +157,14 @@ class Predictor(TensorDictModuleBase):
         """
         return self.parameter_reader.find(tensordict)
 
+    def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        """Hidden state that samples bring to a recurrent model; None: the initial one."""
+        return tensordict.get("hidden_state", None) if self.model.core.recurrent else None
+
+    def in_range(self, states: Tensor, limit: float) -> Tensor:
+        """Which states ``[*B, N, 13]`` are finite and within ``limit`` times training's range, ``[*B]``."""
+        return in_range(self, states, limit)
+
     def initial_hidden_state(self) -> TensorDict | None:
         """Initial hidden state of a recurrent model, without batch; None of others."""
         if not self.model.core.recurrent:
@@ -167,8 +175,7 @@ class Predictor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the predicted next state into ``tensordict`` and return it."""
         state, action = (tensordict[key] for key in self.in_keys[:2])
-        hidden = tensordict.get("hidden_state", None) if self.model.core.recurrent else None
-        after, hidden = self.step(state, action, self.parameters_in(tensordict), hidden)
+        after, hidden = self.step(state, action, self.parameters_in(tensordict), self.hidden_state_in(tensordict))
         tensordict.set(self.out_keys[0], after)
         return tensordict if hidden is None else tensordict.set(self.out_keys[1], hidden)
 

@@ -14,7 +14,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.dynamics import as_predictor
 from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, reward_of, set_specs, step_reward
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.finite import require_finite
@@ -92,8 +92,8 @@ class ModelEnv(ModelBasedEnvBase):
         self.starts = StartSampler(self.scene, start_states, seed)
         self._simulator: Simulator | None = None
         set_specs(self, self.scene, physics=False)
-        if self._static_key is not None:
-            self.state_spec[self._static_key] = self._spec_of(cast(Any, model).own_parameters())
+        if self._parameters_key is not None:
+            self.state_spec[self._parameters_key] = self._spec_of(cast(Any, model).own_parameters())
         if "hidden_state" in inputs:
             for spec in (self.observation_spec, self.state_spec):
                 spec["hidden_state"] = self._spec_of(cast(Any, model).initial_hidden_state())
@@ -106,7 +106,7 @@ class ModelEnv(ModelBasedEnvBase):
         return Composite(specs, device=self.device)
 
     @property
-    def _static_key(self) -> NestedKey | None:
+    def _parameters_key(self) -> NestedKey | None:
         return getattr(self.world_model, "parameters_key", None)
 
     @property
@@ -127,7 +127,7 @@ class ModelEnv(ModelBasedEnvBase):
             if self._simulator is not None:
                 state = self._simulator.observe(state)
         reset = TensorDict({"state": state}, batch_size=shape)
-        key = self._static_key
+        key = self._parameters_key
         if key is not None:
             parameters = tensordict.get(key, None)
             if parameters is None:
@@ -185,18 +185,9 @@ class ModelEnv(ModelBasedEnvBase):
                 f" {list(tensordict.shape)} and H at least 1, got {list(actions.shape)}"
             )
         state = read(tensordict, "state", self._state_shape, self)
-        model = cast(object, self.world_model)
-        if isinstance(model, Predictor):
-            hidden_state = cast("TensorDictBase | None", tensordict.get("hidden_state", None))
-            states, _ = model.rollout_and_hidden_state(state, actions, model.parameters_in(tensordict), hidden_state)
-        else:
-            entries, each = tensordict.select(*self.world_model.in_keys, strict=False), [state]
-            for action in actions.unbind(-2):
-                # The model writes into its input: give it a shallow copy.
-                predicted = self.world_model(entries.copy().set("action", action)).get("next")
-                each.append(cast(Tensor, predicted.get("state")))
-                entries = entries.copy().update(predicted)
-            states = torch.stack(each, dim=-3)
+        model = as_predictor(cast(TensorDictModuleBase, self.world_model))
+        inputs = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
+        states, _ = model.rollout(state, actions, *inputs)  # pyright: ignore[reportArgumentType]
         task = cast("Tensor | None", tensordict.get("task", None))
         if task is not None:
             batch = tensordict.ndim

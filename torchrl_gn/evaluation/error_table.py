@@ -15,7 +15,7 @@ class PredictionError:
 
     Attributes:
         name: for example ``"rollout_error_100"``.
-        components: squared error of each component relative to the constant prediction,
+        components: squared error of each component relative to the persistence baseline,
             1 for a model that predicts no change; infinite if a prediction diverged.
         squared: mean squared error of each component, left-out ones included: m^2,
             rad^2, (m/s)^2, (rad/s)^2.
@@ -60,7 +60,7 @@ class ErrorTable:
         """Flat names and plain numbers, ready for a logger or a JSON file.
 
         For every error ``E``: ``E`` (total), ``E/<component>``, ``E/baseline/<component>`` (mean
-        square of the constant prediction), ``E/diverged`` (sequences), and
+        square of the persistence baseline), ``E/diverged`` (sequences), and
         ``E/left_out/<component>`` = 1 in place of ``E/<component>`` for a component that is left out.
         """
         metrics: dict[str, float] = {}
@@ -83,11 +83,11 @@ class ErrorTable:
                 for error in self.errors.values()
             )
             rows.append((component.replace("_", " "), *values))
-        rows.append(("constant prediction", *(_number(1.0) for _ in self.errors)))
+        rows.append(("persistence baseline", *(_number(1.0) for _ in self.errors)))
         return rows
 
     def to_table(self) -> str:
-        """Errors relative to the constant prediction as lines of text, one column an error."""
+        """Errors relative to the persistence baseline as lines of text, one column an error."""
         return "\n".join([*_aligned(self.rows()), *self._divergences()])
 
     def _divergences(self) -> list[str]:
@@ -111,7 +111,7 @@ def summary(tables: Mapping[str, ErrorTable]) -> str:
     titles = (name.replace("_error", "").replace("_", " ") for name in first.errors)
     rows = [("relative squared error", *titles)]
     rows += [(label, *(_number(table[name].total) for name in first.errors)) for label, table in tables.items()]
-    rows.append(("constant prediction", *(_number(1.0) for _ in first.errors)))
+    rows.append(("persistence baseline", *(_number(1.0) for _ in first.errors)))
     notes = [f"{label}, {line}" for label, table in tables.items() for line in table._divergences()]
     return "\n".join([*_aligned(rows), *notes])
 

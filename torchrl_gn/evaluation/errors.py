@@ -1,4 +1,4 @@
-"""One-step and rollout errors relative to the constant prediction.
+"""One-step and rollout errors relative to the persistence baseline.
 
 Paper, "Prediction performance evaluation": squared errors of position,
 orientation, linear and angular velocity, each divided by that of predicting no
@@ -19,9 +19,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.dynamics import Predictor, RecurrentPredictor
+from torchrl_gn.dynamics import as_predictor
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
-from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout, predict
+from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
@@ -70,7 +70,7 @@ def evaluate_errors(
     *,
     horizons: Sequence[int] = HORIZONS,
     one_step: bool = True,
-    warm_up: int = 0,
+    burn_in: int = 0,
     batch_size: int = 1000,
     keep: int = 0,
     scene: Scene | None = None,
@@ -91,13 +91,13 @@ def evaluate_errors(
     model's, and leaving the sequence out would flatter it. It is counted, and no more time is spent on it.
 
     Args:
-        model: bound forward model (``in_keys`` state and action, ``out_keys`` next state).
+        model: reads state and action at its first two ``in_keys``, writes the next state at its first ``out_keys``.
         trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]``, ``"action"`` ``[M, T, A]`` and, if
             the model reads them, physical parameters ``[M]`` at its ``parameters_key``; may lie on disk (memory-mapped).
         horizons: lengths of the rollouts to measure, at most ``T``.
         one_step: whether to measure the one-step error, which takes a prediction of every step.
-        warm_up: steps at the begin of every trajectory that are not predicted, but given to a recurrent model to
-            remember; all else starts behind them, for any model.
+        burn_in: steps at the start of every trajectory that are not evaluated; a recurrent model's hidden state runs
+            through them.
         batch_size: number of states that the model gets in one call.
         keep: number of predicted rollouts to return in the table.
         scene: which nodes count and which components are movable; default ``model.scene``.
@@ -118,16 +118,17 @@ def evaluate_errors(
     states, actions = trajectories.get("state"), trajectories.get("action")
     if horizons and horizons[0] < 1:
         raise ValueError(f"Horizons must be at least 1 step, got {horizons[0]}.")
-    if warm_up < 0:
-        raise ValueError(f"warm_up={warm_up} must not be negative.")
-    _check(states, actions, [warm_up + horizon for horizon in horizons], batch_size, scene, layout)
-    steps, horizon = actions.shape[1] - warm_up, max(horizons, default=0)
+    if burn_in < 0:
+        raise ValueError(f"burn_in={burn_in} must not be negative.")
+    _check(states, actions, [burn_in + horizon for horizon in horizons], batch_size, scene, layout)
+    steps, horizon = actions.shape[1] - burn_in, max(horizons, default=0)
     if device is None:
         device = next(itertools.chain(model.parameters(), model.buffers()), states).device
     predicted = torch.as_tensor(scene.predicted, device=device)
     single = _Sums(1, layout, predicted)
     rollouts = _Sums(horizon, layout, predicted)
-    parameters = model.parameters_in(trajectories) if isinstance(model, Predictor) else None
+    predictor = as_predictor(model)
+    parameters = predictor.parameters_in(trajectories)
     if parameters is not None:
         require_finite(parameters, "parameters of the trajectories")
     kept: list[Tensor] = []
@@ -135,46 +136,35 @@ def evaluate_errors(
     with torch.no_grad(), _evaluation_mode(model):
         size = max(1, batch_size // steps)
         for state, action, own in _batches(states, actions, parameters, size, device, layout) if one_step else ():
-            prediction = _single_steps(model, state[:, :-1], action, own)[:, warm_up:].flatten(0, 1)
-            flat, truth = state[:, warm_up:-1].flatten(0, 1), state[:, warm_up + 1 :].flatten(0, 1)
+            prediction = predictor.teacher_forced(state[:, :-1], action, own)[0][:, burn_in:].flatten(0, 1)
+            flat, truth = state[:, burn_in:-1].flatten(0, 1), state[:, burn_in + 1 :].flatten(0, 1)
             valid = single.add(0, prediction, truth, flat)
             single.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
         for state, action, own in _batches(states, actions, parameters, batch_size, device, layout) if horizons else ():
             wanted, hidden_state = max(0, min(keep - sum(map(len, kept)), len(state))), None
-            if warm_up and isinstance(model, RecurrentPredictor):
-                _, hidden_state = model.observe(state[:, :warm_up], action[:, :warm_up], own)
-            state, action = state[:, warm_up:], action[:, warm_up:]
+            if burn_in:
+                _, hidden_state = predictor.teacher_forced(state[:, :burn_in], action[:, :burn_in], own)
+            state, action = state[:, burn_in:], action[:, burn_in:]
             guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own, hidden_state=hidden_state)
             kept.append(_add_rollouts(guarded, state, rollouts, wanted))
 
-    dead = _dead_components(scene, layout)
+    fixed = _fixed_components(scene, layout)
     errors = {}
     if one_step:
-        errors["one_step_error"] = single.error("one_step_error", 1, len(states), steps, dead)
+        errors["one_step_error"] = single.error("one_step_error", 1, len(states), steps, fixed)
     for length in horizons:
         name = f"rollout_error_{length}"
-        errors[name] = rollouts.error(name, length, len(states), length, dead)
+        errors[name] = rollouts.error(name, length, len(states), length, fixed)
     return ErrorTable(errors, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])))
 
 
-def _single_steps(
-    model: TensorDictModuleBase, states: Tensor, actions: Tensor, parameters: TensorDictBase | None
-) -> Tensor:
-    """Prediction from each of the states ``[B, T, N, 13]``; a recurrent model remembers those before it."""
-    if isinstance(model, RecurrentPredictor):
-        return model.observe(states, actions, parameters)[0]
-    batch = actions.shape[:2]
-    each = None if parameters is None else parameters.unsqueeze(1).expand(batch).reshape(-1)
-    return predict(model, states.flatten(0, 1), actions.flatten(0, 1), each).unflatten(0, batch)
-
-
 class _Sums:
-    """Streaming sums of squared errors: of the model and of the constant prediction, step by step."""
+    """Streaming sums of squared errors: of the model and of the persistence baseline, step by step."""
 
     def __init__(self, steps: int, layout: StateLayout, predicted: Tensor) -> None:
         self.layout, self.predicted = layout, predicted
         self.model = torch.zeros(steps, len(layout.names), dtype=torch.float64, device=predicted.device)
-        self.constant = torch.zeros_like(self.model)
+        self.persistence = torch.zeros_like(self.model)
         self.diverged = [0] * steps  # sequences that have diverged by this step
 
     def add(self, step: int, prediction: Tensor, truth: Tensor, initial: Tensor, alive: Tensor | None = None) -> Tensor:
@@ -185,7 +175,7 @@ class _Sums:
         if alive is not None:
             valid &= alive
         self.model[step] += torch.where(valid[:, None], squared, torch.inf).sum(0)
-        self.constant[step] += self._squared(initial, truth).sum(0)
+        self.persistence[step] += self._squared(initial, truth).sum(0)
         return valid
 
     def _squared(self, prediction: Tensor, truth: Tensor) -> Tensor:
@@ -195,13 +185,13 @@ class _Sums:
         no_state = _without_angle(prediction, self.layout).any(-1, keepdim=True)
         return torch.where(no_state, torch.inf, squared)
 
-    def error(self, name: str, steps: int, sequences: int, count: int, dead: set[str]) -> PredictionError:
+    def error(self, name: str, steps: int, sequences: int, count: int, fixed: set[str]) -> PredictionError:
         """Error over the first ``steps`` rows, which hold ``sequences * count`` terms in all."""
         number = sequences * count
-        model, constant = ((sums[:steps].sum(0) / number).tolist() for sums in (self.model, self.constant))
+        model, persistence = ((sums[:steps].sum(0) / number).tolist() for sums in (self.model, self.persistence))
         names = self.layout.names
-        baselines = dict(zip(names, constant, strict=True))
-        left_out = tuple(n for n in names if n in dead or baselines[n] <= _ROUNDING)
+        baselines = dict(zip(names, persistence, strict=True))
+        left_out = tuple(n for n in names if n in fixed or baselines[n] <= _ROUNDING)
         components = {n: value / baselines[n] for n, value in zip(names, model, strict=True) if n not in left_out}
         if not components:
             raise ValueError(f"Nothing moves in the trajectories, so {name} relative to no change has no meaning.")
@@ -253,7 +243,7 @@ def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:
     return torch.stack([(state[..., where] == 0).all(-1) for where in turning]).any(0)
 
 
-def _dead_components(scene: Scene, layout: StateLayout) -> set[str]:
+def _fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
     movable = scene.movable[scene.predicted]
     return {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
 

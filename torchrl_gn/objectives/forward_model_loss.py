@@ -13,6 +13,9 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.shapes import check_shapes
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.objectives.batch_entries import read_entries
@@ -120,8 +123,8 @@ class ForwardModelLoss(LossModule):
         state, action, next_state = self._read(tensordict)
         parameters = self._read_parameters(tensordict) if model.model.parameter_source == "scene" else None
         noisy = self._fit_scales(state, next_state)
-        model.update_parameter_normalizers(parameters)
-        model.update_dynamic_normalizers(noisy, action, next_state, parameters)
+        update_parameter_normalizers(model, parameters)
+        update_dynamic_normalizers(model, noisy, action, next_state, parameters)
 
     @torch.no_grad()
     def fit_scales(self, tensordict: TensorDictBase) -> None:
@@ -133,7 +136,7 @@ class ForwardModelLoss(LossModule):
         """Fit the scales; returns the states with noise."""
         model, layout = self.model, self.model.layout
         clean = Normalizer(layout.size, floor=1e-9)
-        clean.update(model.frame.recentered(state)[..., model.incidence.predicted, :].cpu())
+        clean.update(model.canonicalizer.recentered(state)[..., model.incidence.predicted, :].cpu())
         scale = torch.ones(layout.delta_size, dtype=torch.float64)
         for component in layout.components:
             if component.kind == "add":
@@ -176,11 +179,11 @@ class ForwardModelLoss(LossModule):
         if state.ndim == 3:
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
         layout, steps = self.model.layout, state.shape[1]
-        current, hidden_state = self._perturb(state[:, 0]), None
-        errors, folded = state.new_zeros(len(layout.components)), self.model.fold(parameters)
+        current, hidden = self._perturb(state[:, 0]), None
+        errors, program = state.new_zeros(len(layout.components)), self.model.program(parameters)
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
-            delta, hidden_state = self.model.delta_and_hidden_state(current, action[:, step], folded, hidden_state)
+            delta, hidden = eager.delta(program, current, action[:, step], hidden)
             errors = errors + self._component_errors(delta, target)
             if step + 1 < steps:
                 forced = step + 1 < self.teacher_forced_steps

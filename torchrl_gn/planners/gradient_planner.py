@@ -10,12 +10,13 @@ from typing import cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
 from torchrl_gn.data.controls import numpy_generator, spline_controls
-from torchrl_gn.dynamics import Predictor
+from torchrl_gn.dynamics import as_predictor
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
@@ -115,6 +116,10 @@ class GradientPlanner(RecedingHorizonPlanner):
         return cast(ModelEnv, self.env)
 
     @property
+    def _model(self):
+        return as_predictor(cast(TensorDictModuleBase, self.imagined.world_model))
+
+    @property
     def plan_shape(self) -> tuple[int, int, int]:
         """Shape of a sample's plan: candidates, horizon, actions."""
         return self.candidates, self.horizon, self.imagined.scene.num_actions
@@ -140,7 +145,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         entries = self._entries(flat)
         if self._recurrent and "hidden_state" not in entries.keys() and bool(planned.any()):
             raise KeyError(
-                "The model is recurrent, and the environment drops its hidden state 'hidden_state' between steps: append the"
+                "The model is recurrent, and the environment drops its entry 'hidden_state' between steps: append the"
                 " planner's make_tensordict_primer() to the real environment."
             )
         best, step_size = plan.clone(), self._step_size(flat).to(device)
@@ -159,7 +164,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         remaining = shift_plan(batch, plan.to(states_at), step_size=step_size.to(states_at))
         written: dict[NestedKey, TensorDictBase] = {KEY: remaining}
         if self._recurrent:
-            written["next", "hidden_state"] = self._next_memory(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
+            written["next", "hidden_state"] = self._next_hidden_state(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
         return actions[:, 0, 0].reshape(*batch, -1).to(states_at), written
 
     def _step_size(self, flat: TensorDictBase) -> Tensor:
@@ -182,16 +187,14 @@ class GradientPlanner(RecedingHorizonPlanner):
         return "hidden_state" in self.imagined.world_model.in_keys
 
     @torch.no_grad()
-    def _next_memory(self, entries: TensorDictBase, action: Tensor) -> TensorDictBase:
+    def _next_hidden_state(self, entries: TensorDictBase, action: Tensor) -> TensorDictBase:
         """The recurrent model's hidden state after this state and action."""
         action = self.env.action_spec.project(action)
         return self.imagined.world_model(entries.copy().set("action", action))["next", "hidden_state"]
 
     def _entries(self, flat: TensorDictBase) -> TensorDictBase:
         """Entries that a rollout reads, detached."""
-        model = cast(object, self.imagined.world_model)
-        if isinstance(model, Predictor):
-            model.parameters_in(flat)  # refuses other variants, which the entries below no longer show
+        self._model.parameters_in(flat)  # refuses other variants, which the entries below no longer show
         keys = [key for key in (*self.imagined.world_model.in_keys, "task") if key != "action"]
         read = flat.select(*keys, strict=False).detach()
         # Autograd refuses tensors made in inference mode: clone them.
@@ -214,7 +217,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         drawn = self._splines(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
         # A compiled model recompiles, in minutes, for every number of rows: use the later one.
-        size = self.candidates if getattr(self.imagined.world_model, "compile_steps", False) else self.samples
+        size = self.candidates if self._model.fixed_batch else self.samples
         drawn = drawn[:, : self.samples // size * size]
         starts = _repeated(entries, size)
         with torch.no_grad():

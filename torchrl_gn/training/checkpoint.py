@@ -26,7 +26,7 @@ from torchrl_gn.scenes import Scene, scene_from_description
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
 """Where a run folder keeps its checkpoint."""
 
-FORMAT = 3
+FORMAT = 4
 """Version of the checkpoint format that this package writes and reads."""
 
 _PACKAGES = (

@@ -1,0 +1,84 @@
+"""Any TensorDict module that predicts a next state, with the methods of a predictor."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_gn.dynamics.predictor import Predictor
+
+
+def as_predictor(module: TensorDictModuleBase) -> Predictor | ModulePredictor:
+    """The module itself if it is a predictor, else wrapped to have its methods.
+
+    Args:
+        module: reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
+    """
+    return module if isinstance(module, Predictor) else ModulePredictor(module)
+
+
+class ModulePredictor:
+    """Methods of a :class:`Predictor` over another TensorDict module.
+
+    Its other inputs are the hidden state: carried from step to step, updated by what the module writes at ``next``.
+
+    Args:
+        module: as of :func:`as_predictor`.
+    """
+
+    fixed_batch = False
+
+    def __init__(self, module: TensorDictModuleBase) -> None:
+        self.module = module
+        named = {"state", "action"} <= set(module.in_keys)
+        self.keys = ["state", "action"] if named else list(module.in_keys[:2])
+        self.rest = [key for key in module.in_keys if key not in self.keys]
+        self.out_key = ("next", "state") if ("next", "state") in module.out_keys else module.out_keys[0]
+
+    def parameters_in(self, tensordict: TensorDictBase) -> None:
+        """None: only predictors read physical parameters."""
+
+    def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The module's inputs other than state and action."""
+        return tensordict.select(*self.rest, strict=False)
+
+    def in_range(self, states: Tensor, limit: float) -> Tensor:
+        """Which states ``[*B, N, C]`` are finite, ``[*B]``."""
+        return states.isfinite().flatten(-2).all(-1)
+
+    def step(
+        self, state: Tensor, action: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDictBase]:
+        """Next state and hidden state, see :meth:`Predictor.step`."""
+        batch = state.shape[:-2]
+        entries = TensorDict(batch_size=batch) if hidden_state is None else hidden_state.copy()
+        for key, value in zip(self.keys, (state, action), strict=True):
+            entries.set(key, value)  # a key may be nested: set() splits it
+        entries = self.module(entries)
+        after = cast(Tensor, entries.get(self.out_key))
+        rest = TensorDict(batch_size=batch) if hidden_state is None else hidden_state.copy()
+        if "next" in entries.keys():
+            rest.update(cast(TensorDictBase, entries["next"]).select(*self.rest, strict=False))
+        return after, rest
+
+    def rollout(
+        self, state: Tensor, actions: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDictBase | None]:
+        """States ``[*B, T + 1, N, C]`` and hidden state, see :meth:`Predictor.rollout`."""
+        states = [state]
+        for action in actions.unbind(-2):
+            state, hidden_state = self.step(state, action, None, hidden_state)
+            states.append(state)
+        return torch.stack(states, dim=-3), hidden_state
+
+    def teacher_forced(
+        self, states: Tensor, actions: Tensor, parameters: None = None
+    ) -> tuple[Tensor, TensorDictBase | None]:
+        """Predictions from true states, see :meth:`Predictor.teacher_forced`."""
+        batch = actions.shape[:-1]
+        after, _ = self.step(states.flatten(0, -3), actions.flatten(0, -2))
+        return after.unflatten(0, batch), None
