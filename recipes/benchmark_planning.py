@@ -1,11 +1,11 @@
 """What planning time buys: the reward of a planner against how long it plans a step.
 
     python recipes/benchmark_planning.py [system=cheetah] [iterations=[1,3,10,30]] ["checkpoints=[PATH, ...]"]
-    python recipes/benchmark_planning.py system=jaco episodes=1 steps=60 "rivals={ilqg: []}"
+    python recipes/benchmark_planning.py system=jaco episodes=1 steps=60 "baselines={ilqg: []}"
 
-Plays the same episodes with ever more iterations a control step, through every model (of several hidden sizes, for
-example) and with the rivals: each a run of recipes/mpc.py, one after the other. Finished runs are kept, and the same
-run_dir goes on. What came out: docs/results.md.
+Runs the same episodes with more and more iterations a control step, with every model (of several hidden sizes, say) and
+every baseline planner: each a run of recipes/mpc.py, one after the other. Finished runs are kept; the same run_dir goes
+on. No figure of the paper. Results: docs/results.md.
 
 Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
 folder.
@@ -17,24 +17,23 @@ import math
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+from _common import as_list, clean_exit, open_log, with_help
+from _common.sweeps import MPC, Run, folder_name, refuse_changes, report_sweep, run_all
 from torchrl_gn.evaluation import plot_planning_curves
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, with_help
-from torchrl_gn.training.sweep import Run, folder_name, refuse_changes, report_sweep, run_all
-
-RECIPE = Path(__file__).with_name("mpc.py")
+from torchrl_gn.training import RunFolder
 
 
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
-    """Every model's and rival's runs, by number of iterations."""
+    """Every model's and baseline's runs, by number of iterations."""
     options = [f"{name}={cfg[name]}" for name in ("system", "episodes", "steps", "compile", "seed", "threads")]
     options += [f"simulation_threads={cfg.threads}", "video=false", *as_list(cfg.overrides)]
     models = as_list(cfg.checkpoints) or [None]
     ways = [("gn" if path is None else Path(path).stem, "gn", as_list(cfg.iterations), path) for path in models]
-    # Rivals have the first model too: what cem and mppi plan with, and what identifies variants for all.
-    ways += [(str(planner), str(planner), as_list(iterations), models[0]) for planner, iterations in cfg.rivals.items()]
+    # Baselines have the first model too: what cem and mppi plan with, and what identifies variants for all.
+    ways += [(str(planner), str(planner), as_list(counts), models[0]) for planner, counts in cfg.baselines.items()]
     runs: dict[str, dict[int, Run]] = {}
     for label, planner, iterations, checkpoint in ways:
         if label in runs:
@@ -44,7 +43,7 @@ def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
         runs[label] = {}
         for count in iterations:
             place = folder / folder_name(label) / str(count)
-            runs[label][count] = Run(RECIPE, place, (*chosen, f"{key}={count}"), f"{label}, {count} iterations")
+            runs[label][count] = Run(MPC, place, (*chosen, f"{key}={count}"), f"{label}, {count} iterations")
     return runs
 
 
@@ -56,33 +55,30 @@ def main(cfg: DictConfig) -> None:
     clock = 1e3 * load_scene(cfg.system).timestep
     runs = make_runs(cfg, folder.path)
     refuse_changes(run for of in runs.values() for run in of.values())
-    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, folder.path / "log", name=f"benchmark_planning-{cfg.system}", config=cfg)
+    tracker = open_log(cfg, folder, label=f"benchmark_planning-{cfg.system}")
     failed = run_all([run for of in runs.values() for run in of.values()], jobs=1, desc="planning")
 
     metrics: dict[str, float] = {"clock_ms": clock}
     curves: dict[str, tuple[list[float], list[float], list[float]]] = {}
     lines = [
-        f"| {cfg.system}, {cfg.episodes} x {cfg.steps} steps | iterations | mean reward of a step | spread |"
+        f"| {cfg.system}, {cfg.episodes} x {cfg.steps} steps | iterations | mean reward of a step | std |"
         " planning a step, ms | times the clock |",
         "|---" * 6 + "|",
     ]
     for label, of in runs.items():
-        planner = label if label in cfg.rivals else "gn"
-        times, rewards, spreads = [], [], []
+        planner = label if label in cfg.baselines else "gn"
+        times, rewards, stds = [], [], []
         for iterations, run in of.items():
             if not (found := run.numbers(math.nan)):  # not one: a reward where every episode became unstable
                 continue
-            reward, spread, ms = (
-                found[f"{planner}/{key}"] for key in ("mean_reward", "mean_reward_std", "planning_ms")
-            )
-            for values, value in ((times, ms), (rewards, reward), (spreads, spread)):
+            reward, std, ms = (found[f"{planner}/{key}"] for key in ("mean_reward", "mean_reward_std", "planning_ms"))
+            for values, value in ((times, ms), (rewards, reward), (stds, std)):
                 values.append(value)
             name = f"{label}/{iterations}"
-            metrics |= {f"{name}/mean_reward": reward, f"{name}/mean_reward_std": spread, f"{name}/planning_ms": ms}
-            lines.append(f"| {label} | {iterations} | {reward:.4g} | {spread:.2g} | {ms:,.0f} | {ms / clock:.2g} |")
+            metrics |= {f"{name}/mean_reward": reward, f"{name}/mean_reward_std": std, f"{name}/planning_ms": ms}
+            lines.append(f"| {label} | {iterations} | {reward:.4g} | {std:.2g} | {ms:,.0f} | {ms / clock:.2g} |")
         if times:
-            curves[label] = (times, rewards, spreads)
+            curves[label] = (times, rewards, stds)
     if curves:
         plot_planning_curves(curves, folder.file("curves.png"))
     report_sweep(folder, lines, {}, metrics, failed, tracker, seed=cfg.seed)

@@ -2,10 +2,12 @@
 
     python recipes/benchmark_scaling.py [processes=[1,2]] [batches=[200,2000]] [key=value ...]
 
-Times training steps of one process, of two and so on, in turn, for every batch size; the batch is split among them
-(torchrun, DistributedDataParallel). Prints milliseconds a step and the speed-up, and of one process what the parts of a
-step take: what is split, what every process repeats (the optimiser), and so what more processes can gain.
-What came out: docs/scaling.md. Writes config.yaml and metrics.json to its run folder.
+Times training steps of one process, of two and so on, in turn, for every batch size; torchrun and
+DistributedDataParallel split the batch. Prints milliseconds a step, the speed-up, and the time of every part of a step:
+what the processes split, and what each of them repeats (the optimiser). No figure of the paper. Results:
+docs/scaling.md.
+
+Writes config.yaml and metrics.json to its run folder.
 """
 
 from __future__ import annotations
@@ -20,24 +22,15 @@ from tempfile import TemporaryDirectory
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
+from _common import clean_exit, finish_run, open_run, with_help
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import ParameterNames, load_scene
-from torchrl_gn.training import (
-    Budget,
-    RunFolder,
-    Tracker,
-    Trainer,
-    Workers,
-    clean_exit,
-    join_workers,
-    make_optimizer,
-    with_help,
-)
+from torchrl_gn.training import Budget, Trainer, Workers, join_workers, make_optimizer
 
 PART = "TORCHRL_GN_BENCHMARK"  # set in the processes that are timed: where they leave their times
 
@@ -92,9 +85,7 @@ def main(cfg: DictConfig) -> None:
     for name in ("steps", "warm_up"):
         if cfg[name] < 1:
             raise ValueError(f"{name}={cfg[name]} must be 1 or more.")
-    run = RunFolder(cfg.run_dir, "benchmark_scaling")
-    run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_scaling", config=cfg)
+    run, tracker = open_run(cfg, "benchmark_scaling")
     every = [(batch, processes) for batch in cfg.batches for processes in cfg.processes] * cfg.repeats
     found: dict[tuple[int, int], list[dict[str, float]]] = {}
     for batch, processes in tqdm(every, desc="measuring", leave=False):
@@ -110,9 +101,7 @@ def main(cfg: DictConfig) -> None:
         metrics[f"batch {batch}/{processes} processes/speedup"] = speedup
         parts = f"{middle['sampling']:>10.1f}{middle['model']:>10.1f}{middle['optimizer']:>11.1f}"
         print(f"{batch:>8}{processes:>11}{middle['step']:>11.1f}{speedup:>9.2f}x{parts}")
-    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), run.written)
-    for path in run.written:
-        print(path)
+    finish_run(cfg, run, tracker, metrics)
 
 
 if __name__ == "__main__":

@@ -2,95 +2,39 @@
 
     python recipes/benchmark_speed.py [system=swimmer6] [hidden=[128,128]] [compile=true] [curves=true]
 
-Measures one step, rollouts, gradients through rollouts and a training step of one forward model (random weights,
-true static features) as it is evaluated in different ways: `plain` (PyG message passing, eager: the rival),
-`folded` (what training uses), `specialised`, and on top of it oneDNN's matrix products (`fast`), bfloat16
-products (where this processor is fast at them) and `torch.compile`. Each way does each piece of work in turn,
-several times; the table shows medians, speed-ups over `plain` and errors against the plain model in float64. The
-share of the limit is that of the specialised model's FLOPs at the rate of a large matrix product measured beside it.
-`curves=true` draws the cost of a step over links, batch sizes and hidden sizes, and of a rollout's gradient over its
-length. Takes about ten minutes, half of it compiling; results: docs/performance.md.
+Times one step, rollouts, gradients through rollouts and a training step of one forward model (random weights, true
+static features), evaluated in several ways: `plain` (PyG message passing, eager: the baseline), `folded` (what training
+uses), `specialised`, and on top of it oneDNN's matrix products (`fast`), bfloat16 products (where this processor is
+fast at them) and `torch.compile`. Each way does each piece of work in turn, several times. The table shows medians,
+speed-ups over `plain`, peak memory, and errors against the plain model in float64. The share of the limit compares the
+specialised model's FLOP/s with those of a large matrix product. `curves=true` draws the time of a step over links,
+batch sizes and hidden sizes, and of a rollout's gradient over its length. No figure of the paper. Takes about ten
+minutes, half of it compiling. Results: docs/performance.md.
 
 Writes config.yaml, metrics.json and with curves the figure speed.png to its run folder.
 """
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import ctypes
 import functools
-import math
 import statistics
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TypeVar, cast
+from typing import cast
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDict
-from torch import Tensor
 from tqdm import tqdm
 
+from _common import clean_exit, finish_run, open_run, with_help
+from _common.speed_work import Way, Work, gemm_rate, make_works, peak_memory, pull, step_once, timed, train_work
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import plot_loglog
-from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import product_speeds
 from torchrl_gn.scenes import ParameterNames, load_scene
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, make_optimizer, with_help
-
-R = TypeVar("R")
-
-
-@dataclass(frozen=True)
-class Way:
-    """A way to evaluate the forward model."""
-
-    model: Predictor
-    fast: bool = False
-
-
-@dataclass
-class Work:
-    """Something to time: ``run`` does it with a way and gives a result to compare."""
-
-    name: str
-    run: Callable[[Way], Tensor | None]
-    steps: int = 1
-    repeats: int = 9
-    milliseconds: dict[str, list[float]] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-    megabytes: dict[str, float] = field(default_factory=dict)
-
-
-def peak_memory(run: Callable[[], object]) -> float:
-    """Most memory that ``run`` takes beyond what was taken before, in MB; NaN where Linux does not tell."""
-
-    def resident(name: str) -> int:
-        status = Path("/proc/self/status").read_text()
-        return int(next(line for line in status.splitlines() if line.startswith(name)).split()[1])
-
-    try:
-        ctypes.CDLL(None).malloc_trim(0)  # gives back what is free
-        Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
-    except (OSError, AttributeError):
-        return math.nan
-    before = resident("VmRSS")
-    run()
-    return (resident("VmHWM") - before) / 1024
-
-
-def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
-    """What ``run`` gives, and the seconds it takes, with products that may round if ``fast``."""
-    with fast_matmul(rounding=True) if fast else contextlib.nullcontext():
-        start = time.perf_counter()
-        result = run()
-        return result, time.perf_counter() - start
 
 
 def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[ForwardModel, TensorDict]:
@@ -107,7 +51,7 @@ def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[Forward
 
 
 def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Way]:
-    """All ways, the rival first."""
+    """All ways, the baseline first."""
     scene = load_scene(system)
     bound = model.bind(scene)
     ways = {
@@ -127,60 +71,6 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
         if rounded:
             ways["compiled, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, compile=True))
     return ways
-
-
-@torch.no_grad()
-def step_once(model: Predictor, state: Tensor, action: Tensor) -> Tensor:
-    """Next state."""
-    return model.step(state, action)
-
-
-def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
-    """Gradient of a rollout to its actions."""
-    leaf = actions.clone().requires_grad_()
-    model.rollout(state, leaf)[..., 7:].square().sum().backward()
-    assert leaf.grad is not None
-    return leaf.grad
-
-
-def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) -> list[Work]:
-    """The work of the table, but for the training step."""
-
-    def first(batch: int, horizon: int = 1) -> tuple[Tensor, Tensor]:
-        count = batch * horizon
-        actions = cast(Tensor, transitions["action"]).repeat(-(-count // len(transitions)), 1)[:count]
-        return cast(Tensor, transitions["state"])[:batch], actions.view(batch, horizon, -1)
-
-    def step(batch: int) -> Work:
-        state, actions = first(batch)
-
-        def run(way: Way) -> Tensor:
-            return step_once(way.model, state, actions[:, 0]) - state
-
-        return Work(f"step, batch {batch}", run, repeats=cfg.repeats)
-
-    def rollout(batch: int, horizon: int) -> Work:
-        state, actions = first(batch, horizon)
-
-        def run(way: Way) -> Tensor:
-            with torch.no_grad():
-                return way.model.rollout(state, actions)[:, -1] - state
-
-        return Work(f"rollout of {horizon}, batch {batch}", run, horizon, cfg.repeats)
-
-    def gradient(batch: int, horizon: int) -> Work:
-        state, actions = first(batch, horizon)
-
-        def run(way: Way) -> Tensor:
-            return pull(way.model, state, actions)
-
-        return Work(f"gradient of {horizon}, batch {batch}", run, horizon, cfg.repeats)
-
-    return [
-        *(step(batch) for batch in cfg.batches),
-        *(rollout(batch, cfg.horizon) for batch in cfg.rollout_batches),
-        *(gradient(batch, cfg.gradient_horizon) for batch in cfg.gradient_batches),
-    ]
 
 
 def measure(works: list[Work], ways: dict[str, Way], reference: Predictor | None) -> dict[str, float]:
@@ -204,28 +94,6 @@ def measure(works: list[Work], ways: dict[str, Way], reference: Predictor | None
             work.megabytes[name] = peak_memory(functools.partial(timed, functools.partial(work.run, way), way.fast))
     bar.close()
     return compile_seconds
-
-
-def train_work(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) -> Work:
-    """A whole training step: loss, gradient and optimiser."""
-    batch = transitions[: cfg.training_batch]
-    optimizer = make_optimizer(model.core, cfg.optimizer)
-    losses: dict[int, ForwardModelLoss] = {}
-
-    def run(way: Way) -> None:
-        loss = losses.setdefault(id(way), ForwardModelLoss(way.model))
-        optimizer.zero_grad()
-        loss(batch)["loss_forward_model"].backward()
-        optimizer.step(0, 1.0)  # the schedule has ended: the weights stay as they are
-
-    return Work(f"training step, batch {cfg.training_batch}", run, repeats=cfg.repeats)
-
-
-def gemm_rate(rows: int, size: int, dtype: torch.dtype, fast: bool, repeats: int) -> float:
-    """FLOP/s of a product as large as the model's largest."""
-    a, b = torch.randn(rows, size).to(dtype), torch.randn(size, size).to(dtype)
-    seconds = [timed(functools.partial(torch.mm, a, b), fast)[1] for _ in range(repeats + 1)]
-    return 2 * rows * size * size / statistics.median(seconds[1:])
 
 
 def limits(cfg: DictConfig, ways: dict[str, Way], work: Work, batch: int) -> dict[str, float]:
@@ -278,9 +146,7 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    run = RunFolder(cfg.run_dir, "benchmark_speed")
-    run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_speed", config=cfg)
+    run, tracker = open_run(cfg, "benchmark_speed")
     model, transitions = make_model(cfg, cfg.system, list(cfg.hidden))
     ways, works = make_ways(cfg, model, cfg.system), make_works(cfg, model, transitions)
     model.requires_grad_(False)
@@ -298,15 +164,15 @@ def main(cfg: DictConfig) -> None:
     metrics: dict[str, float | int] = {"threads": cfg.threads}
     for work in [*works, training]:
         print(work.name)
-        rival = statistics.median(work.milliseconds["plain"])
+        baseline = statistics.median(work.milliseconds["plain"])
         for name, values in work.milliseconds.items():
             median = statistics.median(values)
             error = f"{work.errors[name]:11.1e}" if name in work.errors else ""
-            print(f"  {name:24}{median:10.3f}{rival / median:8.1f}x{work.megabytes[name]:9.1f}{error}")
+            print(f"  {name:24}{median:10.3f}{baseline / median:8.1f}x{work.megabytes[name]:9.1f}{error}")
             metrics[f"{work.name}/{name}/megabytes"] = work.megabytes[name]
             metrics[f"{work.name}/{name}/milliseconds"] = median
-            metrics[f"{work.name}/{name}/speedup"] = rival / median
-            metrics[f"{work.name}/{name}/spread"] = (max(values) - min(values)) / median
+            metrics[f"{work.name}/{name}/speedup"] = baseline / median
+            metrics[f"{work.name}/{name}/range"] = (max(values) - min(values)) / median
             if name in work.errors:
                 metrics[f"{work.name}/{name}/error"] = work.errors[name]
     batch = max(cfg.batches)
@@ -325,9 +191,7 @@ def main(cfg: DictConfig) -> None:
             for name, (xs, ys) in lines.items():
                 metrics.update({f"curve/{panel}/{name}/{x}": y for x, y in zip(xs, ys, strict=True)})
         plot_loglog(panels, run.file("speed.png"), ylabel="milliseconds")
-    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), run.written)
-    for path in run.written:
-        print(path)
+    finish_run(cfg, run, tracker, metrics)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""How long a step of policy learning takes: experience, and updates with the plain and the fast model.
+"""Run time of policy learning: environment steps, and updates with the plain and the fast model.
 
     python recipes/benchmark_svg.py [repeats=30] [batch_size=256] [horizons=[0,1,3]]
 
-Times, in turn and several times, one update (sampling, losses of policy, value and model, gradients, optimiser) of
-SVG(N) with a graph network that is evaluated by message passing (plain), folded, folded and compiled (what
-recipes/svg.py uses), and with an MLP in its place, beside a step of the environments. Results: docs/performance.md.
+Times one update (sampling, losses of policy, value and model, gradients, optimiser) of SVG(N), in turn and several
+times: with a graph network evaluated by message passing (plain), folded, folded and compiled (what recipes/svg.py
+uses), and with an MLP in its place, beside a step of the environments. No figure of the paper. Results:
+docs/performance.md.
 
 Writes config.yaml, metrics.json and the table as table.md to its run folder.
 """
@@ -12,24 +13,24 @@ Writes config.yaml, metrics.json and the table as table.md to its run folder.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import ValueEstimators
-from tqdm import tqdm
 
+from _common import clean_exit, finish_run, open_run, with_help
+from _common.timing import time_in_turn
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.envs import observation_env
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
 from torchrl_gn.policies import Agent
 from torchrl_gn.rewards import TargetDistance
 from torchrl_gn.scenes import ObservationGraph
-from torchrl_gn.training import OffPolicyTrainer, RunFolder, Tracker, clean_exit, make_agent_optimizer, with_help
+from torchrl_gn.training import OffPolicyTrainer, make_agent_optimizer
 
 
 def make_update(
@@ -55,27 +56,19 @@ def make_update(
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    run = RunFolder(cfg.run_dir, "benchmark_svg")
-    run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_svg", config=cfg)
+    run, tracker = open_run(cfg, "benchmark_svg")
     graph = ObservationGraph.of_task("swimmer", cfg.task)
     env = observation_env(graph, "swimmer", cfg.task, num_envs=cfg.num_envs, timestep=0.02, seed=cfg.seed)
     data = env.rollout(-(-4 * cfg.batch_size // cfg.num_envs), break_when_any_done=False)
     policy, start = Agent(graph, hidden=cfg.hidden).policy, env.reset()
-    ways: dict[str, Callable] = {f"{cfg.num_envs} environment steps": lambda: env.step(policy(start.copy()))}
+    experience = torch.no_grad()(lambda: env.step(policy(start.copy())))
+    ways: dict[str, Callable] = {f"{cfg.num_envs} environment steps": experience}
     for horizon in cfg.horizons:
         of = ("plain", "folded", "compiled", "mlp", "mlp compiled") if horizon else ("plain", "compiled")
         for way in of if cfg.compile else (way for way in of if "compiled" not in way):
             ways[f"SVG({horizon}), {way}"] = make_update(cfg, graph, env, data, horizon, way)
 
-    seconds = {name: [] for name in ways}
-    for turn in tqdm(range(cfg.repeats + 3), desc="measuring", leave=False):
-        for name, once in ways.items():
-            begun = time.perf_counter()
-            with torch.set_grad_enabled("environment" not in name):
-                once()
-            if turn >= 3:
-                seconds[name].append(time.perf_counter() - begun)
+    seconds = time_in_turn(ways, cfg.repeats, warm_up=3)
     medians = {name: statistics.median(found) for name, found in seconds.items()}
     lines = ["| | ms | a second | against plain |", "|---|---|---|---|"]
     for name, median in medians.items():
@@ -85,11 +78,8 @@ def main(cfg: DictConfig) -> None:
         )
     with atomic_path(run.file("table.md")) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
-    metrics = run.write_metrics({f"{name}/ms": 1e3 * median for name, median in medians.items()}, seed=cfg.seed)
-    tracker.finish(metrics, run.written)
     print("\n".join(lines))
-    for path in run.written:
-        print(path)
+    finish_run(cfg, run, tracker, {f"{name}/ms": 1e3 * median for name, median in medians.items()})
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 
     python recipes/benchmark_training.py [system=swimmer6] [optimizers=[muon,torch_muon,adam]] [threads=1]
 
-Trains one forward model of default size for each optimiser, a step each in turn, and prints the median of every part.
-`torch_muon` is `torch.optim.Muon`, which multiplies in bfloat16: slow on processors without instructions for it. Takes
-a minute (several, on those); results: docs/performance.md.
+Trains one forward model of default size for each optimiser, a step each in turn, and prints the median time of every
+part. `torch_muon` is `torch.optim.Muon`, which multiplies in bfloat16: slow on processors without instructions for it.
+No figure of the paper. Takes a minute (several, on those). Results: docs/performance.md.
 
 Writes config.yaml and metrics.json to its run folder.
 """
@@ -18,16 +18,17 @@ from collections import defaultdict
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import nn
 from tqdm import trange
 
+from _common import as_list, clean_exit, finish_run, open_run, with_help
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import ParameterNames, load_scene
-from torchrl_gn.training import RunFolder, ScheduledOptimizer, Tracker, as_list, clean_exit, make_optimizer, with_help
+from torchrl_gn.training import ScheduledOptimizer, make_optimizer
 
 PARTS = ("sampling", "loss", "gradient", "optimiser")
 
@@ -80,9 +81,7 @@ def measure(cfg: DictConfig) -> dict[str, dict[str, float]]:
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    run = RunFolder(cfg.run_dir, "benchmark_training")
-    run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, run.path / "log", name="benchmark_training", config=cfg)
+    run, tracker = open_run(cfg, "benchmark_training")
     found = measure(cfg)
     metrics: dict[str, float] = {"threads": cfg.threads}
     print(f"{'ms a step':12}" + "".join(f"{title:>12}" for title in (*PARTS, "in all", "its share")))
@@ -91,9 +90,7 @@ def main(cfg: DictConfig) -> None:
         share = parts["optimiser"] / whole
         print(f"{name:12}" + "".join(f"{parts[part]:12.2f}" for part in PARTS) + f"{whole:12.2f}{100 * share:10.0f} %")
         metrics |= {f"{name}/{part}": value for part, value in parts.items()} | {f"{name}/optimiser_share": share}
-    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), run.written)
-    for path in run.written:
-        print(path)
+    finish_run(cfg, run, tracker, metrics)
 
 
 if __name__ == "__main__":

@@ -2,16 +2,20 @@
 
     python recipes/compare.py [experiment=accuracy] [systems=[swimmer6,jaco]] [minutes=3] [seeds=[0]] [only=[default]]
 
-Experiments (recipes/config/experiment): accuracy (what makes the difference), ablation (paper, SM Figure "Ablation
-study"), several_systems (paper, "Learning a forward model for multiple systems"), swimmers (paper, Figure "Zero-shot
-dynamics prediction"). Every variant is a run of recipes/forward_model.py with the overrides that the experiment
-names, on the same data: one for each of `systems`, or, with `train_on`, one for all that it lists. Finished runs are
-kept and interrupted ones go on when the recipe is started again with the same run_dir; runs that fail are listed and
-the others go on. Tables show means over seeds and, with several, the half-range; the last column is the geometric
-mean over systems, relative to the first variant. What came out: docs/results.md.
+Experiments (recipes/config/experiment):
 
-Writes config.yaml, metrics.json, the tables as table.md, bars of the errors as errors.png, and each run with its log
-to its run folder.
+- accuracy: what makes the difference
+- ablation: paper, SM Figure "Ablation study"
+- several_systems: paper, "Learning a forward model for multiple systems"
+- swimmers: paper, Figure "Zero-shot dynamics prediction"
+
+Every variant is a run of recipes/forward_model.py with the overrides of the experiment, on the same data: one for each
+of `systems`, or, with `train_on`, one for all that it lists. Finished runs are kept and interrupted ones go on with the
+same run_dir; runs that fail are listed and the others go on. Tables show means over seeds and, with several, the
+half-range; the last column is the geometric mean over systems, relative to the first variant. Results: docs/results.md.
+
+Writes config.yaml, metrics.json, the tables as table.md, bars of the errors as errors.png, and each run with its log to
+its run folder.
 """
 
 from __future__ import annotations
@@ -25,12 +29,12 @@ from statistics import mean
 from typing import Any
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, plain_config, with_help
-from torchrl_gn.training.sweep import Run, folder_name, refuse_changes, report_sweep, run_all
+from _common import as_list, clean_exit, open_log, with_help
+from _common.sweeps import FORWARD_MODEL, Run, folder_name, mean_and_half_range, refuse_changes, report_sweep, run_all
+from torchrl_gn.training import RunFolder, plain_config
 
-RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_100": "100 steps"}
 
 
@@ -95,7 +99,7 @@ def all_trainings(cfg: DictConfig, folder: Path) -> list[Training]:
                 *variant.overrides,
             )
             place = folder / folder_name("-".join(systems)) / folder_name(name) / f"seed{seed}"
-            run = Run(RECIPE, place, overrides, f"{', '.join(systems)}, {name}, seed {seed}")
+            run = Run(FORWARD_MODEL, place, overrides, f"{', '.join(systems)}, {name}, seed {seed}")
             trainings.append(Training(run, name, systems))
     return trainings
 
@@ -122,14 +126,14 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
                 if not values:
                     cells.append("-")
                     continue
-                center, spread = mean(values), (max(values) - min(values)) / 2
+                center, half_range = mean_and_half_range(values)
                 metrics[f"{system}/{variant}/{key}"] = center
                 if key == "steps":
                     cells.append(f"{center:,.0f}")
                     continue
-                cells.append(f"{center:.1e}" + (f" ± {spread:.0e}" if len(values) > 1 else ""))
-                metrics[f"{system}/{variant}/{key}/half_range"] = spread
-                bars.setdefault(title, {}).setdefault(variant, {})[system] = (center, spread)
+                cells.append(f"{center:.1e}" + (f" ± {half_range:.0e}" if len(values) > 1 else ""))
+                metrics[f"{system}/{variant}/{key}/half_range"] = half_range
+                bars.setdefault(title, {}).setdefault(variant, {})[system] = (center, half_range)
                 if 0 < first.setdefault(system, center) < math.inf:  # nothing to compare with where it diverged
                     logs.append(math.log(center / first[system]) if center > 0 else -math.inf)
             if key != "steps":
@@ -151,8 +155,7 @@ def main(cfg: DictConfig) -> None:
         cfg.data_dir = str(folder.data)
     trainings = all_trainings(cfg, folder.path)
     refuse_changes(training.run for training in trainings)
-    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, folder.path / "log", name="compare", config=cfg)
+    tracker = open_log(cfg, folder)
     failed = run_all([training.run for training in trainings], cfg.jobs)
     lines, metrics, bars = summarise(trainings, [*as_list(cfg.systems), *as_list(cfg.zero_shot)])
     report_sweep(folder, lines, bars, metrics, failed, tracker, seed=as_list(cfg.seeds)[0])

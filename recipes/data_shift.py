@@ -1,14 +1,14 @@
-"""How well models trained on random control predict a swimmer that swims on purpose.
+"""Errors on a swimmer that swims on purpose, of models trained on random control.
 
     python recipes/data_shift.py [system=swimmer6] [minutes=4] [seeds=[0]] [run_dir=PATH]
     python recipes/data_shift.py policy=runs/ddpg/<time>
 
-Lets the true swimmer swim: by a learned policy (of recipes/ddpg.py or svg.py, to random targets), or by variations of
-a gait, waves of control that travel along the body and carry it far (found by the cross-entropy method). Graph networks
-and an MLP are then trained for equal time on random trajectories, and on a mixture with as many in which the swimmer
-swims, and compared on trajectories of their training, of random control never trained on, and of swimming (paper,
-Figure "Swimmer6 prediction errors ... for data in the training set, in the validation set, and data from DDPG agent
-trajectories"). Finished runs are kept; the same run_dir goes on. What came out: docs/results.md.
+Reproduces the paper's Figure "Swimmer6 prediction errors ... for data in the training set, in the validation set, and
+data from DDPG agent trajectories". The true swimmer swims by a learned policy (of recipes/ddpg.py or svg.py, to random
+targets), or by variations of a gait: waves of control along the body, found by the cross-entropy method. Graph networks
+and an MLP are trained for equal time on random trajectories, and on a mixture with as many swimming ones. They are
+compared on trajectories of their training, of new random control, and of swimming. Finished runs are kept; the same
+run_dir goes on. Results: docs/results.md.
 
 Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, a video of the swimmer as
 swimming.gif, and each run with its log to its run folder.
@@ -20,101 +20,25 @@ import itertools
 import math
 from pathlib import Path
 from statistics import mean
-from typing import cast
 
 import hydra
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictSequential
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
 from tqdm import tqdm
 
-from torchrl_gn.data import Simulator, UnstableSimulationError, create_dataset, sample_start_states
-from torchrl_gn.envs import SceneEnv
+from _common import as_list, clean_exit, open_log, refuse_other_options, with_help
+from _common.sweeps import FORWARD_MODEL, Run, mean_and_half_range, refuse_changes, report_sweep, run_all
+from _common.swimming import find_gait, swim, swim_by_policy
+from torchrl_gn.data import create_dataset
 from torchrl_gn.evaluation import evaluate_errors, rollout_video
-from torchrl_gn.policies import Agent, SwimmerObservation
-from torchrl_gn.scenes import Scene, load_scene
-from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, load_checkpoint, with_help
-from torchrl_gn.training.run_folder import CONFIG_FILE
-from torchrl_gn.training.sweep import Run, refuse_changes, report_sweep, run_all
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import RunFolder, load_checkpoint
 
-RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
-# When a run goes on. All else makes other data, which finished trainings have not seen.
+# Options that may differ when a run goes on. All else makes other data, which finished trainings have not seen.
 MAY_CHANGE = ("minutes", "seeds", "sequences", "jobs", "threads", "data_dir", "logger", "run_dir")
-LOW, HIGH = np.array([0.1, 0.2, -np.pi]), np.array([1.0, 2.0, np.pi])  # of a wave: height, Hz, lag from joint to joint
-
-
-def waves(scene: Scene, gaits: np.ndarray, steps: int, phase: np.ndarray) -> np.ndarray:
-    """Controls ``[n, T, A]`` of gaits ``[n, 3]`` (height as a share of the bounds, Hz, lag), from phases ``[n]``."""
-    time = np.arange(steps) * scene.timestep
-    height, frequency, lag = (column[:, None, None] for column in gaits.T)
-    angle = 2 * np.pi * frequency * time[None, :, None] - lag * np.arange(scene.num_actions) + phase[:, None, None]
-    middle, half = (scene.action_high + scene.action_low) / 2, (scene.action_high - scene.action_low) / 2
-    return middle + half * height * np.sin(angle)
-
-
-def distance(states: torch.Tensor) -> np.ndarray:
-    """How far the middle of the bodies gets ``[n]``, metres."""
-    middle = states[:, :, 1:, :3].mean(2)
-    return (middle[:, -1] - middle[:, 0]).norm(dim=-1).numpy()
-
-
-def find_gait(scene: Scene, cfg: DictConfig, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """The gait that carries the swimmer farthest, and how far."""
-    simulator, center, spread = Simulator(scene), (LOW + HIGH) / 2, (HIGH - LOW) / 2
-    for _ in tqdm(range(cfg.search.generations), desc="looking for a gait", leave=False):
-        gaits = np.clip(rng.normal(center, spread, (cfg.search.population, 3)), LOW, HIGH)
-        # Every gait from several starts, so that none is lucky.
-        every = np.repeat(gaits, cfg.search.starts, axis=0)
-        starts = np.tile(sample_start_states(scene, cfg.search.starts, rng), (len(gaits), 1))
-        actions = waves(scene, every, cfg.search.steps, np.zeros(len(every)))
-        far = distance(simulator.rollout(starts, actions)["state"]).reshape(len(gaits), -1).mean(1)
-        elite = gaits[np.argsort(-far)[: max(2, len(gaits) // 8)]]
-        center, spread = elite.mean(0), elite.std(0) + 1e-3
-    return center, float(np.sort(far)[::-1][: len(elite)].mean())
-
-
-def swim(scene: Scene, gait: np.ndarray, count: int, steps: int, rng: np.random.Generator) -> TensorDict:
-    """Trajectories ``[count]`` of variations of a gait, begun when the swimmer has got going."""
-    gaits = np.clip(gait * rng.uniform(0.8, 1.2, (count, 3)), LOW, HIGH)
-    gaits[:, 2] *= rng.choice([-1, 1], count)  # to either end
-    going = 100
-    actions = waves(scene, gaits, going + steps, rng.uniform(0, 2 * np.pi, count))
-    half = (scene.action_high - scene.action_low) / 2
-    actions = np.clip(actions + 0.1 * half * rng.normal(size=actions.shape), scene.action_low, scene.action_high)
-    found = Simulator(scene).rollout(sample_start_states(scene, count, rng), actions)
-    if unstable := int((~found["stable"]).sum()):
-        raise UnstableSimulationError(f"{unstable} of {count} swimmers became unstable; try another seed.")
-    action = torch.from_numpy(actions[:, going:])
-    return TensorDict({"state": found["state"][:, going:].clone(), "action": action}, [count])
-
-
-def swim_by_policy(scene: Scene, agent: Agent, hold: int, count: int, steps: int, seed: int) -> TensorDict:
-    """Trajectories ``[count]`` under a learned policy, each to a target of its own, begun when it has got going.
-
-    Each action is held for as many control steps as the policy learned with.
-    """
-    env, going = SceneEnv(scene, seed=seed), 100
-    policy = TensorDictSequential([SwimmerObservation(scene), agent.policy])
-    generator = torch.Generator().manual_seed(seed)
-    now = env.reset(TensorDict(batch_size=[count]))
-    targets = 4 * torch.rand(count, 2, generator=generator, dtype=torch.float64) - 2  # the suite's, metres
-    now["target"] = torch.cat((targets, torch.full((count, 1), 0.05, dtype=torch.float64)), dim=1)
-    states, actions = [], []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for step in tqdm(range(going + steps + 1), desc="swimming", leave=False):
-            states.append(now["state"])
-            if step % hold == 0:
-                now = policy(now)
-            actions.append(now["action"].double())
-            now.update(env.step(now)["next"].select("state", "physics", "terminated"))
-            if unstable := int(now["terminated"].sum()):
-                raise UnstableSimulationError(f"{unstable} of {count} swimmers became unstable; try another seed.")
-    kept = {"state": torch.stack(states[going:], 1), "action": torch.stack(actions[going:-1], 1)}
-    return TensorDict(kept, [count])
 
 
 def make_runs(cfg: DictConfig, folder: Path, swimming: Path) -> dict[tuple[str, str], list[Run]]:
@@ -129,7 +53,7 @@ def make_runs(cfg: DictConfig, folder: Path, swimming: Path) -> dict[tuple[str, 
         options += (*(f"data.{name}={size}" for name, size in cfg.random.items()), f"data.length={cfg.length}")
         options += (f"data.folder={cfg.data_dir}", *as_list(cfg.overrides), *networks[network], *data[trained_on])
         runs[network, trained_on] = [
-            Run(RECIPE, place / f"seed{seed}", (*options, f"seed={seed}"), f"{network} on {trained_on} data")
+            Run(FORWARD_MODEL, place / f"seed{seed}", (*options, f"seed={seed}"), f"{network} on {trained_on} data")
             for seed in as_list(cfg.seeds)
         ]
     return runs
@@ -157,13 +81,11 @@ def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "data_shift")
     if cfg.data_dir is None:
         cfg.data_dir = str(folder.data)
-    if (begun := folder.path / CONFIG_FILE).exists():
-        folder.refuse_changes(cast(DictConfig, OmegaConf.load(begun)), cfg, free=MAY_CHANGE)
+    refuse_other_options(cfg, folder, MAY_CHANGE)
     place = folder.path / "swimming"
     runs = make_runs(cfg, folder.path, place)
     refuse_changes(run for of in runs.values() for run in of)
-    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, folder.path / "log", name="data_shift", config=cfg)
+    tracker = open_log(cfg, folder)
     scene, rng = load_scene(cfg.system), np.random.default_rng(cfg.seed)
     metrics: dict[str, float | int] = {}
     if cfg.policy is not None:
@@ -207,11 +129,12 @@ def main(cfg: DictConfig) -> None:
     for (network, trained_on), of in results.items():
         for test, error in itertools.product(tests, ERRORS):
             found = of[test][error]
-            center, spread = mean(found), (max(found) - min(found)) / 2
+            center, half_range = mean_and_half_range(found)
             metrics[f"{network}/{trained_on}/{test}/{error}"] = center
-            metrics[f"{network}/{trained_on}/{test}/{error}/half_range"] = spread
+            metrics[f"{network}/{trained_on}/{test}/{error}/half_range"] = half_range
             if math.isfinite(center):
-                bars.setdefault(ERRORS[error], {}).setdefault(f"{network}, {trained_on}", {})[test] = (center, spread)
+                panel = bars.setdefault(ERRORS[error], {})
+                panel.setdefault(f"{network}, {trained_on}", {})[test] = (center, half_range)
     lines = table(results) if results else []
     report_sweep(folder, lines, bars, metrics, failed, tracker, seed=cfg.seed)
 

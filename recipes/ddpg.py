@@ -1,12 +1,12 @@
-"""Learn a policy by DDPG, TorchRL's own loss: the model-free rival, and a source of policy trajectories.
+"""Learn a policy by DDPG, TorchRL's own loss: the model-free baseline, and a source of policy trajectories.
 
     python recipes/ddpg.py [task=swimmer6] [key=value ...]
 
-The paper's baseline agent (SM "DDPG"), with the environments, networks, replay buffer and updates of recipes/svg.py, so
-that only the losses differ. Curves over several seeds: recipes/learning_curves.py. A run that was stopped goes on with
-the same `run_dir`. What came out: docs/results.md.
+The paper's agent (SM "DDPG"), with the environments, networks, replay buffer and updates of recipes/svg.py, so that
+only the losses differ. Curves over several seeds: recipes/learning_curves.py. The same `run_dir` goes on with a stopped
+run. Results: docs/results.md.
 
-Leaves config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
+Writes config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
 recipes/config/ddpg.yaml.
 """
 
@@ -16,29 +16,26 @@ from functools import partial
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict.nn import TensorDictSequential
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
+from _common import clean_exit, open_log, resumed_checkpoint, with_help
 from torchrl_gn.envs import observation_env
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training import (
     OffPolicyTrainer,
     RunFolder,
-    Tracker,
-    clean_exit,
     learn_with_progress,
-    load_checkpoint,
     make_agent_optimizer,
     mean_return,
     plain_config,
     report_learning,
-    with_help,
 )
 
-# When a run goes on.
+# Options that may differ when a run goes on.
 MAY_CHANGE = ("trainer.frames", "trainer.compile", "threads", "logger", "run_dir", "checkpoint_seconds")
 
 
@@ -49,13 +46,10 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
     run = RunFolder(cfg.run_dir, "ddpg")
-    begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
-    if begun:
-        run.refuse_changes(begun.config, cfg, free=MAY_CHANGE)
+    resumed = resumed_checkpoint(cfg, run, MAY_CHANGE)
     graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, plain_config(cfg)["task"]["graph"])
-    agent = begun.agent if begun else Agent(graph, stochastic=False, hidden=cfg.hidden)
-    run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"ddpg-{cfg.task.name}", config=cfg)
+    agent = resumed.agent if resumed else Agent(graph, stochastic=False, hidden=cfg.hidden)
+    tracker = open_log(cfg, run, label=f"ddpg-{cfg.task.name}")
 
     task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
     make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)
@@ -74,7 +68,7 @@ def main(cfg: DictConfig) -> None:
         seed=cfg.seed,
         **plain_config(cfg.trainer),
     )
-    learn_with_progress(trainer, run.checkpoint, begun, tracker, config=plain_config(cfg))
+    learn_with_progress(trainer, run.checkpoint, resumed, tracker, config=plain_config(cfg))
     report_learning(trainer, run, tracker, label="DDPG", seed=cfg.seed)
 
 

@@ -3,22 +3,23 @@
     python recipes/evaluate.py checkpoint=runs/forward_model/<time> [system=swimmer8] [key=value ...]
     python recipes/evaluate.py checkpoint=swimmerN system=swimmer12
 
-Collects fresh test trajectories, prints the error table (docs/evaluation.md says how errors
-are defined), and leaves metrics.json, a figure and a video in its run folder. All options:
-recipes/config/evaluate.yaml. Takes seconds.
+Collects fresh test trajectories and prints the error table (docs/evaluation.md defines the errors). Takes seconds. All
+options: recipes/config/evaluate.yaml.
+
+Writes config.yaml, metrics.json, a figure and a video to its run folder.
 """
 
 from __future__ import annotations
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+from _common import clean_exit, finish_run, open_run, with_help
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.evaluation import report
 from torchrl_gn.pretrained import load_model
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, Tracker, clean_exit, with_help
 from torchrl_gn.training.progress import HORIZON, collecting
 
 
@@ -34,16 +35,12 @@ def main(cfg: DictConfig) -> None:
     if cfg.length < HORIZON:
         raise ValueError(f"length={cfg.length} is too short: errors are measured over {HORIZON} steps.")
     torch.set_num_threads(cfg.threads)
-    run = RunFolder(cfg.run_dir, "evaluate")
-    run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name="evaluate", config=cfg)
+    run, tracker = open_run(cfg, "evaluate")
     with collecting("test data") as show:
         test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, split=3, progress=show)
     table, files = report(model, test, run.path)
-    tracker.finish(run.write_metrics(table.to_metrics(), seed=cfg.seed), files)
     print(table)
-    for path in [*files, run.path / "metrics.json"]:
-        print(path)
+    finish_run(cfg, run, tracker, table.to_metrics(), files=files)
 
 
 if __name__ == "__main__":

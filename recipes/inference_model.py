@@ -1,18 +1,18 @@
-"""Train an inference model that finds out what a system is like from how it moves, and the forward model that uses it.
+"""Train an inference model, which identifies a system from how it moves, and the forward model that uses it.
 
     python recipes/inference_model.py [system=pendulum] [minutes=4] [baselines=true] [run_dir=PATH]
 
-Trains both on random variants of the system whose parameters they never see (paper, "Inference models"; SM "End-to-end
-training algorithm for System ID"). On new variants every system is identified once, from `context_length` steps of one
-trajectory, and another of its trajectories is predicted: with what was inferred of it, and with what was inferred of
-another system. `baselines=true` also trains models without identification and with the true parameters for the same
-time (paper, Figure "System identification performance"). Ctrl-C saves everything; the same `run_dir` goes on.
+Reproduces the paper's Figures "System identification performance" and "System identification analysis in Pendulum".
+Trains both models on random variants of the system whose parameters they never see (paper, "Inference models"; SM
+"End-to-end training algorithm for System ID"). On new variants, every system is identified once, from `context_length` steps of
+one trajectory, and another of its trajectories is predicted: with its own estimate, and with that of another system.
+`baselines=true` also trains models without identification and with the true parameters for the same time. Ctrl-C saves
+everything; the same `run_dir` goes on.
 
-Leaves config.yaml, metrics.json, the checkpoint, and figures in its run folder: errors as bars (errors.png), error
+Writes config.yaml, metrics.json, the checkpoint, and figures to its run folder: errors as bars (errors.png), error
 against the number of observed steps (steps.png), and predictions of three systems identified with and without control
-(control.png; paper, Figure "System identification analysis in Pendulum"). metrics.json also has how well each
-parameter can be read from the inferred graph by a linear map. All options: recipes/config/inference_model.yaml. What
-came out: docs/results.md.
+(control.png). metrics.json also has how well a linear map reads each parameter from the inferred graph. All options:
+recipes/config/inference_model.yaml. Results: docs/results.md.
 """
 
 from __future__ import annotations
@@ -21,52 +21,32 @@ from pathlib import Path
 from typing import cast
 
 import hydra
-import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
-from tqdm import tqdm
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torch import nn
 
-from torchrl_gn.data import (
-    Simulator,
-    TrajectoryDataset,
-    collect_trajectories,
-    spline_controls,
-    trajectory_buffer,
-)
-from torchrl_gn.data.start_states import draw_start_states
+from _common import clean_exit, finish_run, open_log, resumed_checkpoint, with_help
+from _common.identification import TestSystems, control_figure, identified_errors, probe
+from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
+from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import (
     ErrorTable,
     evaluate_errors,
     identification_errors,
-    linear_probe,
     plot_bars,
     plot_loglog,
-    plot_motions,
     plot_training_curve,
     summary,
 )
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.objectives import IdentificationLoss
-from torchrl_gn.scenes import ParameterNames, Scene, load_scene, make_variants, parameter_ranges, sample_parameters
-from torchrl_gn.training import (
-    Budget,
-    RunFolder,
-    Tracker,
-    Trainer,
-    clean_exit,
-    load_checkpoint,
-    make_optimizer,
-    plain_config,
-    with_help,
-)
+from torchrl_gn.scenes import ParameterNames, Scene, load_scene
+from torchrl_gn.training import Budget, RunFolder, Trainer, load_checkpoint, make_optimizer, plain_config
 from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
-from torchrl_gn.training.sweep import Run, refuse_failures, run_all
 
-RECIPE = Path(__file__).with_name("forward_model.py")
-# A run may go on with these changed, and nothing else.
+# Options that may differ when a run goes on.
 MAY_CHANGE = (
     "minutes",
     "steps",
@@ -129,69 +109,6 @@ def refuse_sizes(cfg: DictConfig) -> None:
         raise ValueError(f"test.systems={cfg.test.systems} must be 4 or more: parameters are read from three quarters.")
 
 
-class TestSystems:
-    """New variants with two trajectories each, one to identify the system from and one to predict."""
-
-    def __init__(self, cfg: DictConfig, scene: Scene) -> None:
-        system = scene.origin["system"]
-        rng = np.random.default_rng(np.random.SeedSequence(cfg.data.seed, spawn_key=(5,)))
-        self.parameters = sample_parameters(system, cfg.test.systems, rng)
-        self.names = list(parameter_ranges(system))
-        self.scenes = make_variants(system, self.parameters, timestep=scene.timestep)
-        count = cfg.test.systems
-        both = collect_trajectories(self.scenes, 2 * count, cfg.data.length, cfg.data.seed, split=4)
-        self.observed, self.predicted = (cast(TensorDictBase, half) for half in (both[:count], both[count:]))
-
-
-def identified_errors(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestSystems):
-    """Error tables by way, and the error against the number of observed steps."""
-    bound, inference = model.bind(scene)
-    pairs = bound, inference, systems.observed, systems.predicted
-    tables = {
-        "identified": identification_errors(*pairs, steps=cfg.context_length),
-        "identified from another system": identification_errors(*pairs, steps=cfg.context_length, wrong=True),
-    }
-    curve = {}
-    for steps in tqdm([steps for steps in cfg.test.steps if steps <= cfg.data.length], desc="evaluating", leave=False):
-        table = identification_errors(*pairs, steps=steps, one_step=False)
-        curve[steps] = table["rollout_error_100"].total
-    return tables, curve
-
-
-def probe(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestSystems) -> dict[str, float]:
-    """How well each parameter can be read from the inferred graph."""
-    _, inference = model.bind(scene)
-    state, action = (cast(Tensor, systems.observed.get(key)) for key in ("state", "action"))
-    with torch.no_grad():
-        parameters = inference.identify(state[:, : cfg.context_length + 1], action[:, : cfg.context_length])
-    features = torch.cat([cast(Tensor, value).flatten(1) for value in parameters.values()], dim=1)
-    share = linear_probe(features, torch.from_numpy(systems.parameters), train=int(0.75 * len(features)))
-    return dict(zip(systems.names, share.tolist(), strict=True))
-
-
-def control_figure(cfg: DictConfig, model: IdentifyingModel, scene: Scene, path: Path) -> Path:
-    """Predictions of three systems identified with control, and without."""
-    bound, inference = model.bind(scene)
-    system, ranges = scene.origin["system"], parameter_ranges(scene.origin["system"])
-    low, high = (np.array([getattr(one, side) for one in ranges.values()]) for side in ("low", "high"))
-    scenes = make_variants(system, np.array([low, (low + high) / 2, high]), timestep=scene.timestep)
-    simulator, rng, each = Simulator(scenes), np.random.default_rng(cfg.seed), np.arange(3)
-    # All from one state, under one control: only the systems differ.
-    start = np.repeat(draw_start_states(simulator, np.zeros(1, dtype=np.int64), rng)[0], 3, axis=0)
-    controls = np.repeat(spline_controls(scene, 1, cfg.data.length, rng), 3, axis=0)
-    panels = {}
-    for title, factor in (("with control", 1.0), ("without control", 0.0)):
-        actions = controls.copy()
-        actions[:, : cfg.context_length] *= factor
-        states = cast(Tensor, simulator.rollout(start, actions, each).get("state"))
-        actions = torch.from_numpy(actions)
-        with torch.no_grad():
-            parameters = inference.identify(states[:, : cfg.context_length + 1], actions[:, : cfg.context_length])
-            predicted = bound.rollout(states[:, cfg.context_length], actions[:, cfg.context_length :], parameters)
-        panels[f"identified {title}"] = (states, predicted)
-    return plot_motions(panels, scene, path, labels=("smallest", "middle", "largest"))
-
-
 def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, scene: Scene) -> dict[str, ErrorTable]:
     """Errors of models without identification and with the true parameters, trained for the same time."""
     runs = {}
@@ -204,7 +121,7 @@ def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, s
         shared += [f"data.{key}={cfg.data[key]}" for key in ("train", "validation", "test", "length", "seed")]
         shared += [f"noise={cfg.noise}", *model, f"model.parameters={parameters}"]
         place = folder / name.replace(" ", "_")
-        runs[name] = Run(RECIPE, place, tuple(shared), name, goes_on=("minutes", "steps", "clock"))  # as this one may
+        runs[name] = Run(FORWARD_MODEL, place, tuple(shared), name, goes_on=("minutes", "steps", "clock"))
     refuse_failures(run_all(runs.values(), cfg.jobs, desc="training baselines"))
     models = {
         name: load_checkpoint(run.folder).model.bind(scene, parameters_key="parameters") for name, run in runs.items()
@@ -222,22 +139,20 @@ def main(cfg: DictConfig) -> None:
     refuse_sizes(cfg)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)
     run = RunFolder(cfg.run_dir, "inference_model")
-    begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
-    if begun:
-        run.refuse_changes(begun.config, cfg, free=MAY_CHANGE)
-        model = cast(IdentifyingModel, begun.trained)
+    resumed = resumed_checkpoint(cfg, run, MAY_CHANGE)
+    if resumed:
+        model = cast(IdentifyingModel, resumed.trained)
     else:
         forward_model = ForwardModel(ParameterNames.of(scene), parameters="inferred", **plain_config(cfg.model))
         model = IdentifyingModel(forward_model, **plain_config(cfg.inference))
-    run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"inference_model-{scene.name}", config=cfg)
+    tracker = open_log(cfg, run, label=f"inference_model-{scene.name}")
 
     data = Path(cfg.data.folder) if cfg.data.folder else run.data
     dataset = dataset_with_progress(data, scene, cfg.data, variants=cfg.data.train)
     trainer = make_trainer(cfg, model, scene, dataset)
-    if not begun:
+    if not resumed:
         trainer.loss.fit_normalizers(trajectory_buffer(dataset.train, batch_size=20_000, seed=cfg.seed).sample())
-    curves = train_with_progress(trainer, run.checkpoint, begun, tracker, scene=scene, config=plain_config(cfg))
+    curves = train_with_progress(trainer, run.checkpoint, resumed, tracker, scene=scene, config=plain_config(cfg))
 
     systems = TestSystems(cfg, scene)
     tables, curve = identified_errors(cfg, model, scene, systems)
@@ -264,12 +179,10 @@ def main(cfg: DictConfig) -> None:
     metrics |= {f"observed steps/{steps}/rollout_error_100": value for steps, value in curve.items()}
     metrics |= {f"read from the inferred graph/{name}": value for name, value in readable.items()}
     metrics |= {"validation_error": trainer.best, "steps": trainer.step, "training_seconds": trainer.seconds}
-    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), [*files, run.checkpoint], trainer.step)
     print(summary(tables))
     print("\nShare of each parameter's variance that a linear map reads from the inferred graph:")
     print("  ".join(f"{name} {value:.2f}" for name, value in readable.items()))
-    for path in [*files, run.path / "metrics.json", run.checkpoint]:
-        print(path)
+    finish_run(cfg, run, tracker, metrics, files=files, checkpoints=[run.checkpoint], step=trainer.step)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,7 @@
 
 Reproduces the paper's Figure "Learning curves for Swimmer6 SVG agents": the median return over seeds with quartiles, of
 every agent that recipes/config/learning_curves.yaml names. Each is a run of recipes/svg.py or recipes/ddpg.py. Finished
-runs are kept and interrupted ones go on when the recipe is started again with the same run_dir. What came out:
-docs/results.md.
+runs are kept and interrupted ones go on with the same run_dir. Results: docs/results.md.
 
 Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
 folder.
@@ -19,11 +18,12 @@ from pathlib import Path
 
 import hydra
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+from _common import as_list, clean_exit, open_log, with_help
+from _common.sweeps import RECIPES, Run, folder_name, refuse_changes, report_sweep, run_all
 from torchrl_gn.evaluation import plot_learning_curves
-from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, with_help
-from torchrl_gn.training.sweep import Run, folder_name, refuse_changes, report_sweep, run_all
+from torchrl_gn.training import RunFolder
 
 
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, list[Run]]:
@@ -36,7 +36,7 @@ def make_runs(cfg: DictConfig, folder: Path) -> dict[str, list[Run]]:
     for seed, name in itertools.product(as_list(cfg.seeds), chosen):  # seed by seed, so that early figures compare
         agent = cfg.agents[name]
         overrides = (f"seed={seed}", f"threads={cfg.threads}", *as_list(cfg.overrides), *agent.overrides)
-        recipe = Path(__file__).with_name(f"{agent.recipe}.py")
+        recipe = RECIPES / f"{agent.recipe}.py"
         runs[name].append(Run(recipe, folder / folder_name(name) / f"seed{seed}", overrides, f"{name}, seed {seed}"))
     return runs
 
@@ -55,8 +55,7 @@ def main(cfg: DictConfig) -> None:
     runs = make_runs(cfg, folder.path)
     in_turn = [run for of in zip(*runs.values(), strict=True) for run in of]
     refuse_changes(in_turn)
-    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, folder.path / "log", name="learning_curves", config=cfg)
+    tracker = open_log(cfg, folder)
     failed = run_all(in_turn, cfg.jobs, desc="learning")
 
     curves, metrics = {}, {}

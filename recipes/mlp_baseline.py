@@ -2,14 +2,19 @@
 
     python recipes/mlp_baseline.py [systems=[pendulum,swimmer6]] [minutes=4] [seeds=[0]]
 
-For every system the MLPs of the paper's five sizes are trained with every optimiser and rate of the sweep for
-`screen_minutes` (paper, SM "MLP baseline architectures"); the `keep` best on validation rollouts are trained for
-`minutes`, and the best of these is the baseline. It and the graph network, with the same normalisers, features, state
-update, data and training time, are then compared over all seeds (paper, Figure "Prediction errors ... between the best
-MLP baseline and the best GN model"). Finished runs are kept; the same run_dir goes on. What came out: docs/results.md.
+Reproduces the paper's Figure "Prediction errors ... between the best MLP baseline and the best GN model". For every
+system:
 
-Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, and each run with its log
-to its run folder.
+1. Train MLPs of the paper's five sizes with every optimiser and rate of the sweep for `screen_minutes` (paper, SM "MLP
+   baseline architectures").
+2. Train the `keep` best on validation rollouts for `minutes`; the best of these is the baseline.
+3. Compare it with the graph network over all seeds, with the same normalisers, features, state update, data and
+   training time.
+
+Finished runs are kept; the same run_dir goes on. Results: docs/results.md.
+
+Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, and each run with its log to
+its run folder.
 """
 
 from __future__ import annotations
@@ -20,12 +25,21 @@ from pathlib import Path
 from statistics import mean
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from torchrl_gn.training import RunFolder, Tracker, as_list, clean_exit, with_help
-from torchrl_gn.training.sweep import Run, best, folder_name, refuse_changes, report_sweep, run_all
+from _common import as_list, clean_exit, open_log, with_help
+from _common.sweeps import (
+    FORWARD_MODEL,
+    Run,
+    best,
+    folder_name,
+    mean_and_half_range,
+    refuse_changes,
+    report_sweep,
+    run_all,
+)
+from torchrl_gn.training import RunFolder
 
-RECIPE = Path(__file__).with_name("forward_model.py")
 ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
 
 
@@ -35,7 +49,7 @@ def make_run(cfg: DictConfig, folder: Path, system: str, name: str, options: lis
     shared += [f"seed={seed}", f"threads={cfg.threads}"]
     place = folder / system / folder_name(name) / f"minutes{minutes}_seed{seed}"
     overrides = (*shared, f"data.folder={cfg.data_dir}", *as_list(cfg.overrides), *options)
-    return Run(RECIPE, place, overrides, f"{system}, {name}, {minutes} minutes, seed {seed}")
+    return Run(FORWARD_MODEL, place, overrides, f"{system}, {name}, {minutes} minutes, seed {seed}")
 
 
 def candidates(cfg: DictConfig) -> dict[str, list[str]]:
@@ -71,8 +85,7 @@ def main(cfg: DictConfig) -> None:
     names = list(mlps)
     screened = {system: runs(system, names, cfg.screen_minutes, [first]) for system in systems}
     refuse_changes(run for of in screened.values() for run in of)
-    folder.write_config(OmegaConf.to_yaml(cfg, resolve=True))
-    tracker = Tracker(cfg.logger, folder.path / "log", name="mlp_baseline", config=cfg)
+    tracker = open_log(cfg, folder)
     failed = run_all([run for of in screened.values() for run in of], cfg.jobs, desc="screening")
     long = {}
     for system, of in screened.items():
@@ -101,10 +114,10 @@ def main(cfg: DictConfig) -> None:
                 if not found:
                     cells.append("-")
                     continue
-                centers[kind], spread = mean(found), (max(found) - min(found)) / 2
-                metrics[f"{system}/{kind}/{key}"], metrics[f"{system}/{kind}/{key}/half_range"] = centers[kind], spread
-                bars.setdefault(title, {}).setdefault(kind, {})[system] = (centers[kind], spread)
-                cells.append(f"{centers[kind]:.1e} ± {spread:.0e}")
+                centers[kind], half_range = mean_and_half_range(found)
+                metrics |= {f"{system}/{kind}/{key}": centers[kind], f"{system}/{kind}/{key}/half_range": half_range}
+                bars.setdefault(title, {}).setdefault(kind, {})[system] = (centers[kind], half_range)
+                cells.append(f"{centers[kind]:.1e} ± {half_range:.0e}")
             ratio = centers["MLP"] / centers["GN"] if len(centers) == 2 else math.nan
             metrics[f"{system}/ratio/{key}"] = ratio
             cells.append(f"{ratio:.2g}")

@@ -2,11 +2,10 @@
 
     python recipes/publish.py checkpoint=runs/forward_model/<time> file=swimmer6.safetensors [also=[swimmer7]]
 
-Weights become half-precision numbers, the state of the training is left out, and of the places on disk that the
-configuration names only the last part is kept. What is written is evaluated on fresh
-trajectories of every system that the model was trained on, and of those named by `also` (a model that identifies, on
-random variants of them); the errors go into the file
-(`load_checkpoint(file).metrics`) and are printed. All options: recipes/config/publish.yaml.
+Stores weights in half precision, without the state of the training, and keeps only the last part of every path in the
+configuration. Evaluates the result on fresh trajectories of every system that the model was trained on, and of those
+that `also` names (a model that identifies: on random variants of them). The errors go into the file
+(`load_checkpoint(file).metrics`) and are printed. No figure of the paper. All options: recipes/config/publish.yaml.
 """
 
 from __future__ import annotations
@@ -22,10 +21,11 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from _common import as_list, clean_exit, with_help
 from torchrl_gn.evaluation import fresh_errors, summary
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import as_list, clean_exit, load_checkpoint, save_checkpoint, with_help
+from torchrl_gn.training import load_checkpoint, save_checkpoint
 
 
 def without_places(value: Any) -> Any:

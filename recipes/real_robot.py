@@ -1,16 +1,16 @@
-"""Train forward models on the logs of a robot's joints: with a hidden state, and without.
+"""Train forward models on the logs of a robot's joints, with and without recurrence.
 
     python recipes/real_robot.py [log=arm.npz] [timestep=0.01] ["names={angle: q, velocity: dq, command: u}"]
 
-Reads angles, velocities and commands of the joints (docs/data.md says in what form), cuts them where they break and
-says what was dropped, and trains a feed-forward and a recurrent graph network for equal time (paper, "Real robot data";
-SM "Recurrent one-step predictions"). Both are compared on episodes never trained on (of a log with few episodes: on its
-last part), from a short warm-up on. Without a log it makes one: of the simulated JACO arm, with lagging motors, play,
-and noisy, coarse encoders. Ctrl-C saves everything; the same `run_dir` goes on.
+Follows the paper's "Real robot data" and SM "Recurrent one-step predictions". Reads angles, velocities and commands of
+the joints (docs/data.md has the format), cuts them where they break, prints what was dropped, and trains a feed-forward
+and a recurrent graph network for equal time. Compares both on episodes never trained on (of a log with few episodes: on
+its last part), after `warm_up` true steps. Without a log it simulates one: the JACO arm, with lagging motors, play, and
+noisy, coarse encoders. Ctrl-C saves everything; the same `run_dir` goes on.
 
-Leaves config.yaml, metrics.json, a checkpoint of each model, and figures of measured and predicted joint angles
-(joints.png) and of the errors (errors.png) in its run folder. All options: recipes/config/real_robot.yaml. What
-came out: docs/results.md.
+Writes config.yaml, metrics.json, a checkpoint of each model, and figures of measured and predicted joint angles
+(joints.png) and of the errors (errors.png) to its run folder. All options: recipes/config/real_robot.yaml. Results:
+docs/results.md.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from typing import Any, cast
 import hydra
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
+from _common import clean_exit, finish_run, open_log, with_help
 from torchrl_gn.data import RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_joints, summary
@@ -36,17 +37,15 @@ from torchrl_gn.training import (
     RunFolder,
     Tracker,
     Trainer,
-    clean_exit,
     load_checkpoint,
     make_optimizer,
     plain_config,
-    with_help,
 )
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 from torchrl_gn.training.progress import train_with_progress
 
 MODELS = {"feed-forward": "gn", "recurrent": "recurrent"}
-# A run may go on with these changed, and nothing else.
+# Options that may differ when a run goes on.
 MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")
 
 
@@ -122,11 +121,17 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
 
 
 def train(
-    cfg: DictConfig, name: str, path: Path, begun: Checkpoint | None, tree: KinematicTree, data: dict, tracker: Tracker
+    cfg: DictConfig,
+    name: str,
+    path: Path,
+    resumed: Checkpoint | None,
+    tree: KinematicTree,
+    data: dict,
+    tracker: Tracker,
 ):
     """Train one of the models, or go on with it; the model and its trainer."""
-    if begun:
-        model = begun.model
+    if resumed:
+        model = resumed.model
     else:
         torch.manual_seed(cfg.seed)
         model = ForwardModel(
@@ -139,9 +144,9 @@ def train(
             **plain_config(cfg.model),
         )
     trainer = make_trainer(cfg, model, tree, data)
-    if not begun:
+    if not resumed:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
-    train_with_progress(trainer, path, begun, tracker, scene=cast(Any, tree), config=plain_config(cfg), name=name)
+    train_with_progress(trainer, path, resumed, tracker, scene=cast(Any, tree), config=plain_config(cfg), name=name)
     return model, trainer
 
 
@@ -162,15 +167,14 @@ def main(cfg: DictConfig) -> None:
     data = split(cfg, log)
     run = RunFolder(cfg.run_dir, "real_robot")
     paths = {name: run.path / name / CHECKPOINT_FILE for name in MODELS}
-    begun = {name: load_checkpoint(path) for name, path in paths.items() if path.exists()}
-    for checkpoint in begun.values():
+    resumed = {name: load_checkpoint(path) for name, path in paths.items() if path.exists()}
+    for checkpoint in resumed.values():
         run.refuse_changes(checkpoint.config, cfg, free=MAY_CHANGE)
-    run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"real_robot-{tree.name}", config=cfg)
+    tracker = open_log(cfg, run, label=f"real_robot-{tree.name}")
     tables: dict[str, ErrorTable] = {}
     metrics: dict[str, float] = {}
     for name, path in paths.items():
-        model, trainer = train(cfg, name, path, begun.get(name), tree, data, tracker)
+        model, trainer = train(cfg, name, path, resumed.get(name), tree, data, tracker)
         tables[name] = evaluate_errors(
             model.bind(cast(Any, tree)),
             data["test"],
@@ -185,12 +189,10 @@ def main(cfg: DictConfig) -> None:
         plot_joints(cast(Any, data["test"]["state"])[0], predictions, tree, run.path / "joints.png"),
         plot_errors(tables, run.path / "errors.png"),
     ]
-    tracker.finish(run.write_metrics(metrics, seed=cfg.seed), [*pictures, *paths.values()], trainer.step)
     print(summary(tables))
     for name, table in tables.items():
         print(f"\n{name}\n{table}")
-    for path in [*pictures, run.path / "metrics.json", *paths.values()]:
-        print(path)
+    finish_run(cfg, run, tracker, metrics, files=pictures, checkpoints=list(paths.values()), step=trainer.step)
 
 
 if __name__ == "__main__":

@@ -4,10 +4,10 @@
 
 Reproduces the agents of the paper's Figure "Learning curves for Swimmer6 SVG agents": SVG(1) differentiates through a
 graph network that predicts observations, SVG(0) (`horizon=0`) through the value alone. Policy, value and model start
-from nothing and learn from the same replay buffer. Curves over several seeds, and all agents in one figure:
-recipes/learning_curves.py. A run that was stopped goes on with the same `run_dir`. What came out: docs/results.md.
+from fresh weights and learn from the same replay buffer. Curves over several seeds, all agents in one figure:
+recipes/learning_curves.py. The same `run_dir` goes on with a stopped run. Results: docs/results.md.
 
-Leaves config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
+Writes config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
 recipes/config/svg.yaml.
 """
 
@@ -18,10 +18,11 @@ from functools import partial
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
 
+from _common import clean_exit, open_log, resumed_checkpoint, with_help
 from torchrl_gn.envs import observation_env
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
 from torchrl_gn.policies import Agent
@@ -31,18 +32,14 @@ from torchrl_gn.training import (
     OffPolicyTrainer,
     RayCluster,
     RunFolder,
-    Tracker,
-    clean_exit,
     learn_with_progress,
-    load_checkpoint,
     make_agent_optimizer,
     mean_return,
     plain_config,
     report_learning,
-    with_help,
 )
 
-# When a run goes on.
+# Options that may differ when a run goes on.
 MAY_CHANGE = (
     "trainer.frames",
     "trainer.compile",
@@ -78,9 +75,7 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(
             f"trainer.frames_per_batch={per_batch} must be a multiple of {together}: num_envs times collectors."
         )
-    begun = load_checkpoint(run.checkpoint) if run.checkpoint.exists() else None
-    if begun:
-        run.refuse_changes(begun.config, cfg, free=MAY_CHANGE)
+    resumed = resumed_checkpoint(cfg, run, MAY_CHANGE)
     graph = ObservationGraph.of_task(cfg.task.domain, cfg.task.name, plain_config(cfg)["task"]["graph"])
     if cfg.evaluate_on and cfg.agent.policy != "graph":
         raise ValueError("Only a graph network drives other bodies; evaluate_on needs agent.policy=graph.")
@@ -88,9 +83,8 @@ def main(cfg: DictConfig) -> None:
     if cfg.horizon == 0:
         more["model"] = None
     learned = cfg.task.reward == "learned" and cfg.horizon > 0
-    agent = begun.agent if begun else Agent(graph, learned_reward=learned, **more)
-    run.write_config(OmegaConf.to_yaml(cfg))
-    tracker = Tracker(cfg.logger, run.path / "log", name=f"svg{cfg.horizon}-{cfg.task.name}", config=cfg)
+    agent = resumed.agent if resumed else Agent(graph, learned_reward=learned, **more)
+    tracker = open_log(cfg, run, label=f"svg{cfg.horizon}-{cfg.task.name}")
 
     task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
     others = {}  # before all learning, so that what does not fit is told at once
@@ -113,7 +107,7 @@ def main(cfg: DictConfig) -> None:
             seed=cfg.seed,
             **plain_config(cfg.trainer),
         )
-        learn_with_progress(trainer, run.checkpoint, begun, tracker, config=plain_config(cfg))
+        learn_with_progress(trainer, run.checkpoint, resumed, tracker, config=plain_config(cfg))
     returns = {}
     for name, (other, env) in tqdm(others.items(), desc="other bodies", leave=False, disable=not others):
         returns[f"return/{name}"] = mean_return(env, agent.policy_for(other), cfg.task.steps, seed=10_000)

@@ -29,6 +29,7 @@ def examples(page: Path) -> list[str]:
 def test_examples_run(page, tmp_path, monkeypatch):
     """The blocks of one page share their names and run from top to bottom in an empty folder."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(ROOT / "recipes")  # as for a recipe
     names = {"__name__": "__example__"}
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # what a reader would see on the screen

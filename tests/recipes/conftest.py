@@ -16,6 +16,9 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[2]
+# As Python does for a script in recipes, which imports _common; Ray's workers read the variable.
+sys.path.append(str(ROOT / "recipes"))
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(ROOT / "recipes"))))
 
 SHORT_LEARNING = (
     "num_envs=2",

@@ -68,7 +68,7 @@ def test_every_recipe_helps_and_logs(recipe):
     if recipe == "publish":  # it makes a file of a model, and has no run
         return
     assert "\nlogger: none" in options.read_text()
-    assert re.search(r"tracker\.finish\(|report_sweep\(.* tracker,|report_learning\(.* tracker,", source.read_text())
+    assert re.search(r"(finish_run|report_sweep|report_learning)\(.* tracker,", source.read_text())
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The model-free rival's recipe."""
+"""The model-free baseline's recipe."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchrl_gn.training import as_list, plain_config
+from torchrl_gn.training import plain_config
 
 omegaconf = pytest.importorskip("omegaconf")
 
@@ -15,8 +15,3 @@ def test_a_configuration_becomes_plain_with_its_references_resolved():
     assert plain == {"size": 3, "model": {"hidden": [3, 4], "name": "gn"}, "none": None}
     assert type(plain["model"]) is dict and type(plain["model"]["hidden"]) is list
     assert plain_config(plain) == plain
-
-
-def test_one_of_a_list_may_stand_alone():
-    assert as_list("swimmer6") == ["swimmer6"] and as_list(0) == [0] and as_list(None) == []
-    assert as_list(omegaconf.OmegaConf.create(["swimmer6", {"seed": 1}])) == ["swimmer6", {"seed": 1}]

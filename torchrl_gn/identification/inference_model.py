@@ -88,7 +88,11 @@ class InferenceModel(nn.Module):
             raise ValueError(f"readout must be 'mean' or 'last', got {readout!r}.")
         self.readout = readout
         self.inferred_size, self.hidden_size = GraphSize(*inferred), GraphSize(*hidden_state)
-        sizes = {"edge_hidden": list(edge_hidden), "node_hidden": list(node_hidden), "global_hidden": list(global_hidden)}
+        sizes = {
+            "edge_hidden": list(edge_hidden),
+            "node_hidden": list(node_hidden),
+            "global_hidden": list(global_hidden),
+        }
         self.options = {
             "inferred": list(inferred),
             "hidden_state": list(hidden_state),
@@ -106,9 +110,7 @@ class InferenceModel(nn.Module):
     def forward(self, observed: Graph, hidden: Graph) -> tuple[Graph, Graph]:
         """Output of one observation, and the hidden graph for the next."""
         size = self.inferred_size
-        output, rest = graph_split(
-            self.block(graph_concat(observed, hidden)), (size.nodes, size.edges, size.globals_)
-        )
+        output, rest = graph_split(self.block(graph_concat(observed, hidden)), (size.nodes, size.edges, size.globals_))
         return output, Graph(rest.nodes.tanh(), rest.edges.tanh(), rest.globals_.tanh(), rest.edge_index)
 
 
@@ -192,7 +194,9 @@ class BoundInferenceModel(TensorDictModuleBase):
         for each in self._contexts(state, action, next_state, context):
             yield self._estimate(each)
 
-    def _contexts(self, state: Tensor, action: Tensor, next_state: Tensor, context: Context | None) -> Iterator[Context]:
+    def _contexts(
+        self, state: Tensor, action: Tensor, next_state: Tensor, context: Context | None
+    ) -> Iterator[Context]:
         if state.shape[-3] == 0 or next_state.shape != state.shape:
             raise ValueError(
                 "The inference model needs at least one transition, states and next states of equal shape; got"

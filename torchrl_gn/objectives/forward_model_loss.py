@@ -15,7 +15,6 @@ from torchrl.objectives import LossModule
 from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
-from torchrl_gn.dynamics.shapes import check_shapes
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.objectives.batch_entries import read_entries

@@ -164,7 +164,9 @@ class GradientPlanner(RecedingHorizonPlanner):
         remaining = shift_plan(batch, plan.to(states_at), step_size=step_size.to(states_at))
         written: dict[NestedKey, TensorDictBase] = {KEY: remaining}
         if self._recurrent:
-            written["next", "hidden_state"] = self._next_hidden_state(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
+            written["next", "hidden_state"] = (
+                self._next_hidden_state(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
+            )
         return actions[:, 0, 0].reshape(*batch, -1).to(states_at), written
 
     def _step_size(self, flat: TensorDictBase) -> Tensor:

@@ -1,4 +1,4 @@
-"""Training loop, optimiser presets, checkpoints, and what recipes share."""
+"""Training loop, optimiser presets, checkpoints, and run folders."""
 
 from torchrl_gn.training.budget import Budget as Budget
 from torchrl_gn.training.checkpoint import Checkpoint as Checkpoint
@@ -6,10 +6,7 @@ from torchrl_gn.training.checkpoint import CheckpointError as CheckpointError
 from torchrl_gn.training.checkpoint import load_checkpoint as load_checkpoint
 from torchrl_gn.training.checkpoint import package_versions as package_versions
 from torchrl_gn.training.checkpoint import save_checkpoint as save_checkpoint
-from torchrl_gn.training.config import as_list as as_list
 from torchrl_gn.training.config import plain_config as plain_config
-from torchrl_gn.training.exit import clean_exit as clean_exit
-from torchrl_gn.training.help import with_help as with_help
 from torchrl_gn.training.learning import learn_with_progress as learn_with_progress
 from torchrl_gn.training.learning import report_learning as report_learning
 from torchrl_gn.training.learning_curve import mean_return as mean_return

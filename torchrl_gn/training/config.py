@@ -1,4 +1,4 @@
-"""A recipe's configuration as plain values."""
+"""A configuration as plain values."""
 
 from __future__ import annotations
 
@@ -17,11 +17,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [_plain(each) for each in value]
     return value
-
-
-def as_list(value: Any) -> list[Any]:
-    """An option that may be a list: what stands alone (``only=default``) is a list of one, null one of none."""
-    if value is None:
-        return []
-    plain = _plain(value)
-    return plain if isinstance(plain, list) else [plain]

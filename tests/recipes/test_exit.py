@@ -8,9 +8,9 @@ import time
 
 import pytest
 
+from _common.exit import clean_exit
 from torchrl_gn.training import RunFolder
 from torchrl_gn.training.checkpoint import CheckpointError
-from torchrl_gn.training.exit import clean_exit
 
 
 def ending(error: BaseException):

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from torchrl_gn.training.help import commented_options
+from _common.help import commented_options
 
 YAML = """# Options of a recipe.
 size: 3            # of something
@@ -34,7 +34,7 @@ RECIPE = """'''What it does.
 What came out.
 '''
 from functools import wraps
-from torchrl_gn.training import with_help
+from _common import with_help
 
 ran = []
 

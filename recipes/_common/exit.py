@@ -1,4 +1,4 @@
-"""How a recipe ends: exit codes, and errors as a person wants to read them."""
+"""Exit codes of a recipe, and its errors in one line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-from torchrl_gn.training.run_folder import RunFolder
+from torchrl_gn.training import RunFolder
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -18,10 +18,9 @@ R = TypeVar("R")
 def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
     """Let a recipe's main function end cleanly.
 
-    What its user can mend (a bad option, file or data set, an unstable simulation) is one line
-    on standard error and exit code 1, without a traceback. Ctrl-C is exit code 130, and being told to
-    end (SIGTERM, as a cluster does) 143, after the recipe has saved what it has, and said where. Anything else is
-    a bug and keeps its traceback, as do torch's own RuntimeErrors.
+    Errors that a user can fix (a bad option, file or data set, an unstable simulation) print one line to standard error
+    and exit with code 1. Ctrl-C exits with 130 and SIGTERM with 143, after the recipe has saved what it has and printed
+    where. Anything else is a bug and keeps its traceback, as do torch's RuntimeErrors.
     """
 
     @functools.wraps(main)

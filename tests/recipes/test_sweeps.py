@@ -13,7 +13,7 @@ from threading import Thread
 
 import pytest
 
-from torchrl_gn.training.sweep import Run, best, folder_name, refuse_changes, run_all
+from _common.sweeps import Run, best, folder_name, refuse_changes, run_all
 
 RECIPE = """
 import json, pathlib, sys

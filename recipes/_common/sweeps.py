@@ -1,4 +1,4 @@
-"""Runs of a recipe side by side, each in a process of its own, kept when they are done."""
+"""Run recipes side by side, each in its own process; finished runs are kept."""
 
 from __future__ import annotations
 
@@ -13,30 +13,32 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 from tqdm import tqdm
 
 from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.evaluation import plot_bars
-from torchrl_gn.training.ray_cluster import RayCluster
-from torchrl_gn.training.run_folder import METRICS_FILE, RunFolder
-from torchrl_gn.training.tracking import Tracker
+from torchrl_gn.training import RayCluster, RunFolder, Tracker
+from torchrl_gn.training.run_folder import METRICS_FILE
 
+RECIPES = Path(__file__).parents[1]
+FORWARD_MODEL, MPC = RECIPES / "forward_model.py", RECIPES / "mpc.py"
 OPTIONS_FILE = "options.json"
 MAY_DIFFER = ("threads=", "compile=", "data.folder=")  # of a finished run
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a recipe.
+    """A run of a recipe.
 
     Attributes:
         recipe: the recipe's file.
-        folder: its run folder, and what tells it from other runs.
+        folder: its run folder.
         overrides: options of the recipe.
-        name: what a person is told that it is.
-        goes_on: options, as ``"minutes"``, with other values of which a finished run goes on instead of being refused.
+        name: its name in messages.
+        goes_on: options (``"minutes"``) that may differ: a finished run then goes on and is not refused.
     """
 
     recipe: Path
@@ -46,21 +48,21 @@ class Run:
     goes_on: tuple[str, ...] = ()
 
     def numbers(self, diverged: float = math.inf) -> dict[str, float]:
-        """Numbers that it measured, ``diverged`` for those that were not finite; none if it is not done."""
+        """Numbers of ``metrics.json``, ``diverged`` for those that were not finite; empty if the run is not done."""
         found = {name: diverged if value is None else value for name, value in (self.metrics or {}).items()}
         return {name: float(value) for name, value in found.items() if isinstance(value, (int, float))}
 
     @property
     def metrics(self) -> dict[str, Any] | None:
-        """What it measured, if it is done."""
+        """Content of ``metrics.json``, if the run is done."""
         path = self.folder / METRICS_FILE
         return json.loads(path.read_text()) if path.exists() else None
 
     def is_done(self) -> bool:
-        """Whether it has finished, with these options.
+        """Whether the run has finished with these options.
 
         Raises:
-            ValueError: if it has finished with others, naming those that differ: what they gave is not this run's.
+            ValueError: if it has finished with other options, naming those that differ.
         """
         if not (self.folder / METRICS_FILE).exists():
             return False
@@ -77,24 +79,24 @@ class Run:
 
 
 def folder_name(text: str) -> str:
-    """A text as a folder's name that Hydra does not misread (it takes a comma for a list)."""
+    """Turn a text into a folder's name without what Hydra misreads (a comma is a list)."""
     return re.sub(r"[^\w.%-]+", "_", text).strip("_")
 
 
 def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> list[Run]:
-    """Run those that are not done yet, several at a time, with a progress bar.
+    """Run what is not done yet, several at a time, with a progress bar.
 
-    Runs that fail are told and the others go on; what they print is in ``log.txt`` of their
-    folder. Ctrl-C tells all of them to end, and they save what they have.
+    If a run fails, its name is printed and the others go on; the output is in ``log.txt`` of its folder. Ctrl-C ends
+    all runs, which save what they have.
 
     Args:
         runs: the runs; equal ones run once.
-        jobs: how many at a time, or the address of a Ray cluster that takes as many as it has cores (``"local"`` for
-            one of this machine); its machines see the same files.
-        desc: what they do.
+        jobs: how many at a time, or the address of a Ray cluster, which runs one on every core (``"local"``: one of
+            this machine); its machines must see the same files.
+        desc: text of the progress bar.
 
     Returns:
-        Those that failed.
+        The runs that failed.
 
     Raises:
         ValueError: if a finished run was made with other options.
@@ -120,7 +122,7 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
 
 
 def refuse_changes(runs: Iterable[Run]) -> None:
-    """Refuse what :func:`run_all` would, before anything is written.
+    """Refuse finished runs with other options, as :func:`run_all` would, before anything is written.
 
     Raises:
         ValueError: if a finished run was made with other options.
@@ -130,7 +132,7 @@ def refuse_changes(runs: Iterable[Run]) -> None:
 
 
 def refuse_failures(failed: Sequence[Run]) -> None:
-    """End where runs failed, whose logs say why.
+    """Raise if runs failed.
 
     Raises:
         ValueError: if any did.
@@ -149,15 +151,15 @@ def report_sweep(
     *,
     seed: int,
 ) -> None:
-    """Write what a sweep found, log it, print it, and say what failed.
+    """Write, log and print the results of a sweep, and raise if runs failed.
 
     Args:
         folder: where ``table.md``, ``errors.png`` and ``metrics.json`` go.
         lines: the tables, in Markdown.
-        bars: as :func:`~torchrl_gn.evaluation.plot_bars` takes them; none are drawn if there are none.
+        bars: as :func:`~torchrl_gn.evaluation.plot_bars` takes them; empty: no figure.
         metrics: flat names and plain numbers.
         failed: runs that failed.
-        tracker: what the numbers and figures are logged with, and which is closed.
+        tracker: the log, which is closed.
         seed: the sweep's first seed.
 
     Raises:
@@ -175,10 +177,10 @@ def report_sweep(
 
 
 def _start(run: Run, folder: Path) -> subprocess.Popen:
-    """Start a run's process in a working folder; what it prints goes to its log."""
+    """Start a run's process in a working folder; its output goes to ``log.txt``."""
     place = folder / run.folder
     place.mkdir(parents=True, exist_ok=True)
-    (place / METRICS_FILE).unlink(missing_ok=True)  # of other options, which the run goes on from
+    (place / METRICS_FILE).unlink(missing_ok=True)  # of the options before
     write_json(place / OPTIONS_FILE, list(run.overrides))
     command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]
     with (place / "log.txt").open("a") as log:
@@ -189,7 +191,7 @@ def _start(run: Run, folder: Path) -> subprocess.Popen:
 
 
 class _Threads(ThreadPoolExecutor):
-    """Processes of this machine, each watched by a thread."""
+    """Processes of this machine, one thread waiting for each."""
 
     def __init__(self, jobs: int) -> None:
         super().__init__(jobs)
@@ -204,7 +206,7 @@ class _Threads(ThreadPoolExecutor):
             return 130
         process = _start(run, Path.cwd())
         self.running.add(process)
-        if self.stopped:  # while it was started
+        if self.stopped:  # since the check above
             process.terminate()
         try:
             return process.wait()
@@ -237,6 +239,11 @@ def _run_and_wait(run: Run, folder: Path) -> int:
     finally:
         process.terminate()
         process.wait()
+
+
+def mean_and_half_range(values: Sequence[float]) -> tuple[float, float]:
+    """Mean of the values and half the difference of the largest and the smallest."""
+    return mean(values), (max(values) - min(values)) / 2
 
 
 def best(runs: Sequence[Run], metric: str, count: int = 1) -> list[Run]:

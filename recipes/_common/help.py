@@ -1,4 +1,4 @@
-"""What a recipe's `--help` says."""
+"""A recipe's `--help`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ R = TypeVar("R")
 
 
 def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
-    """Let `--help` show what a recipe's first lines say, and its options with the comments beside them.
+    """Let `--help` print a recipe's docstring, and its options with their comments.
 
-    Put it above ``@hydra.main``, whose own help has neither. Options are read from ``config/<recipe>.yaml`` beside the
-    recipe's file, and from the file of each group that it names (``config/task/swimmer6.yaml``, or of another one that
-    stands beside ``--help``).
+    Put it above ``@hydra.main``, whose own help has neither. Reads the options from ``config/<recipe>.yaml`` beside the
+    recipe, and from the file of each group in its defaults (``config/task/swimmer6.yaml``) or on the command line.
     """
 
     @functools.wraps(main)
@@ -35,7 +34,7 @@ def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
 
 
 def commented_options(text: str) -> str:
-    """A recipe's options as its file has them, without what it tells Hydra itself."""
+    """The text of an options file without Hydra's own settings."""
     text = re.sub(r"^hydra:.*\n(?:[ \t]+.*\n?)*", "", text, flags=re.MULTILINE)
     text = re.sub(r"^ *- (?:_self_|override hydra/).*\n?", "", text, flags=re.MULTILINE)
     text = re.sub(r"^defaults:[^\n]*\n(?![ \t]*- )", "", text, flags=re.MULTILINE)
@@ -43,7 +42,7 @@ def commented_options(text: str) -> str:
 
 
 def _groups(text: str, folder: Path) -> Iterator[str]:
-    """What the files of a recipe's groups say, of those that are its defaults or asked for."""
+    """Texts of the groups' files: the defaults, or those on the command line."""
     asked = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
     for group, default in re.findall(r"^ *- (\w+): (\w+)", text, flags=re.MULTILINE):
         name = asked.get(group, default)

@@ -1,0 +1,10 @@
+"""What recipes share. They import it as ``_common``: Python looks for modules beside the script that it runs."""
+
+from _common.exit import clean_exit as clean_exit
+from _common.help import with_help as with_help
+from _common.options import as_list as as_list
+from _common.run import finish_run as finish_run
+from _common.run import open_log as open_log
+from _common.run import open_run as open_run
+from _common.run import refuse_other_options as refuse_other_options
+from _common.run import resumed_checkpoint as resumed_checkpoint

@@ -1,0 +1,118 @@
+"""Episodes under a planner: recorded, saved, resumed, summarised and filmed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import torch
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.evaluation import rollout_video
+from torchrl_gn.scenes import Scene
+
+TIME_FIRST = ("seconds", "planned")  # records of all episodes together, or of the first alone
+
+
+class Episodes:
+    """Episodes under one planner, saved to a file and resumed from it.
+
+    Args:
+        path: the file.
+        start: first TensorDict ``[B]``, where the file does not exist.
+    """
+
+    def __init__(self, path: Path, start: TensorDictBase) -> None:
+        self.path, self.now = path, start
+        self.records: dict[str, list[Tensor]] = {name: [] for name in ("state", "action", "reward", *TIME_FIRST)}
+        self.records["state"].append(start["state"])
+        if path.exists():
+            saved = load_file(path)
+            flat = {key.removeprefix("now."): value for key, value in saved.items() if key.startswith("now.")}
+            batch = start.batch_size
+            self.now = cast(TensorDictBase, TensorDict(flat, batch_size=batch).unflatten_keys("."))
+            for name, record in self.records.items():
+                values = saved[name]
+                record[:] = list(values.unbind(0) if name in TIME_FIRST else values.unbind(1))
+
+    def __len__(self) -> int:
+        return len(self.records["action"])
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Record ``[B, T, ...]`` of states, actions and rewards, ``[T, ...]`` of seconds and planned states."""
+        record = self.records[name]
+        if not record:
+            return torch.zeros(0)
+        return torch.stack(record, dim=0 if name in TIME_FIRST else 1)
+
+    @property
+    def over(self) -> Tensor:
+        """Episodes ``[B]`` that ended early because their simulation became unstable."""
+        return self.records["state"][-1].isnan().flatten(1).any(1)
+
+    def save(self) -> None:
+        """Write everything, atomically."""
+        if not len(self):
+            return
+        now = {f"now.{key}": value for key, value in self.now.flatten_keys(".").items()}
+        values = {name: self[name] for name in self.records}
+        # Copies: a target is also the task, and safetensors refuses what shares memory.
+        apart = {key: value.clone(memory_format=torch.contiguous_format) for key, value in (now | values).items()}
+        with atomic_path(self.path) as temporary:
+            save_file(apart, temporary)
+
+
+def planned_state(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase) -> Tensor:
+    """Last state ``[N, 13]`` of the first episode's plan, predicted by the model or, without one, simulated."""
+    left = cast(Tensor, now["plan", "actions"])
+    left = left if left.ndim == 3 else left[:, 0]  # of candidates the best
+    actions = torch.cat((now["action"].unsqueeze(1), left[:, :-1]), dim=1)
+    if imagined is None:
+        ahead = env.simulator.rollout(now["physics"][:1], actions[:1])
+        return ahead["state"][0, -1].where(ahead["stable"][0], torch.nan)
+    # As many rows as the planner has: a compiled model is compiled for every number of them.
+    rows = cast(Tensor, now["plan", "actions"]).shape[1]
+    many = cast(TensorDictBase, now.repeat_interleave(rows, 0))
+    return imagined.imagine(many, actions.repeat_interleave(rows, 0))[0][0, -1].detach()
+
+
+def distance_left(episodes: Episodes, target: Tensor) -> Tensor:
+    """Final over initial distance ``[B]`` of a swimmer to its target."""
+    away = (episodes["state"][:, [0, -1], 1, :2] - target[:, None, :2]).norm(dim=-1)
+    return away[:, 1] / away[:, 0]
+
+
+def summarize(episodes: Episodes, target: Tensor | None) -> dict[str, float]:
+    """Summarise a planner's episodes; with ``target`` ``[B, 3]``, the distance left to it too."""
+    rewards, seconds = episodes["reward"], episodes["seconds"]
+    of = {
+        "mean_reward": rewards.nanmean().item(),
+        "mean_reward_std": standard_deviation(rewards.nanmean(1)),
+        "last_tenth_reward": rewards[:, -max(1, rewards.shape[1] // 10) :].nanmean().item(),
+        "unstable": episodes.over.sum().item(),
+        "planning_ms": 1e3 * seconds.median().item(),
+        "planning_ms_first": 1e3 * seconds[0].item(),
+    }
+    if target is not None:
+        left = distance_left(episodes, target)
+        of |= {"distance_left": left.nanmean().item(), "distance_left_std": standard_deviation(left)}
+    return of
+
+
+def standard_deviation(values: Tensor) -> float:
+    """Standard deviation of the values that are not NaN."""
+    return (values - values.nanmean()).square().nanmean().sqrt().item()
+
+
+def film(episodes: Episodes, scene: Scene, horizon: int, path: Path) -> None:
+    """Make a video of the first episode, beside the states that were planned a horizon before."""
+    states, planned = episodes["state"][0], episodes["planned"]
+    states = states[states.isfinite().flatten(1).all(1)]  # until its simulation became unstable
+    speed, prediction = min(1.0, scene.timestep / 0.01), None
+    if len(episodes) == len(planned) and len(states) > horizon + 1:
+        prediction = torch.cat((states[:horizon], planned))[: len(states)]
+    rollout_video(scene, states, prediction, path, speed=speed, labels=("executed", "planned a horizon before"))

@@ -1,0 +1,127 @@
+"""What a planning recipe solves: its options, scenes, model, start states and targets."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, ListConfig, open_dict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states, spline_controls
+from torchrl_gn.dynamics import Predictor, specialize
+from torchrl_gn.envs import SceneEnv
+from torchrl_gn.identification import IdentifyingModel
+from torchrl_gn.planners.plan import check_count
+from torchrl_gn.pretrained import load_model, pretrained_names
+from torchrl_gn.rewards import Reward
+from torchrl_gn.scenes import Scene, load_scene, sample_variants
+
+ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
+
+
+def fill_in(cfg: DictConfig) -> None:
+    """Fill options that are null with the paper's task of the system, and check them."""
+    name = re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system
+    if name not in cfg.tasks:
+        raise ValueError(
+            f"{cfg.system!r} is no system of the paper; this recipe has rewards of {list(cfg.tasks)} alone. With a"
+            " reward and a model of your own it takes a few lines of Python: 'Plan with a model of your own' in"
+            " docs/planning.md and docs/guides/write-a-reward.md."
+        )
+    task = cfg.tasks[name]
+    defaults = [
+        (cfg, "reward", task["rewards"][0]),
+        (cfg, "horizon", task["horizon"]),
+        (cfg, "steps", task["steps"]),
+        (cfg.gn, "iterations", task.get("iterations", 3)),
+    ]
+    for part, key, value in defaults:
+        if part[key] is None:
+            part[key] = value
+    for key in ("horizon", "steps", "episodes", "context_length", "threads"):
+        check_count(key, cfg[key], 1)
+    with open_dict(cfg):  # or another system's task would change the run's options
+        del cfg.tasks
+    if not isinstance(cfg.planner, ListConfig):
+        cfg.planner = [cfg.planner]
+    unknown = [name for name in cfg.planner if name not in ON_MODEL + ON_PHYSICS]
+    if unknown:
+        raise ValueError(f"There is no planner {unknown[0]!r}; use some of {[*ON_MODEL, *ON_PHYSICS]}.")
+
+
+def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
+    """Load the standard scene, and with ``variants=true`` a random variant for every episode."""
+    scene = load_scene(cfg.system)
+    if not cfg.variants:
+        return scene, [scene]
+    rng = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(2,)))
+    return scene, sample_variants(cfg.system, cfg.episodes, rng)
+
+
+def shipped_models(cfg: DictConfig) -> list[str]:
+    """Names of the package's models of the system, or of its variants."""
+    fitting = [cfg.system, re.sub(r"^swimmer\d+$", "swimmerN", cfg.system)]
+    if cfg.variants:
+        fitting = [f"identified_{cfg.system}"]
+    return [name for name in fitting if name in pretrained_names()]
+
+
+def bind_model(cfg: DictConfig, scene: Scene):
+    """Bind the trained model to the scene; returns it and its inference model, or None."""
+    names = shipped_models(cfg)
+    if cfg.checkpoint is None and not names:
+        what = f"variants of {cfg.system!r}" if cfg.variants else repr(cfg.system)
+        raise ValueError(f"No trained model of {what} comes with the package; give checkpoint=PATH.")
+    checkpoint = load_model(cfg.checkpoint or names[0])
+    if isinstance(checkpoint.trained, IdentifyingModel):
+        bound, inference = checkpoint.trained.bind(scene)
+        return fast_model(bound, cfg.compile), inference
+    if cfg.variants and not checkpoint.config.get("parametrized"):
+        raise ValueError("The model was trained on one system, not on variants: give checkpoint=PATH of one that was.")
+    bound = checkpoint.model.bind(scene, parameters_key="parameters" if cfg.variants else None)
+    return fast_model(bound, cfg.compile), None
+
+
+def fast_model(bound: Predictor, compile: bool) -> Predictor:
+    """Specialise the model, if its core allows it."""
+    try:
+        return specialize(bound, compile=compile)
+    except TypeError:
+        core = bound.model.options["core"]
+        print(f"Planning through the bound model, more slowly: core={core} can be neither specialised nor compiled.")
+        return bound
+
+
+def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:
+    """Target of every episode: a place for a swimmer's head, a random pose for an arm, or None."""
+    if reward.target_shape is None:
+        return None
+    rng, count = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(1,))), len(state)
+    if reward.target_shape == (3,):
+        angle = torch.from_numpy(rng.uniform(-np.pi, np.pi, count))
+        way = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=-1)
+        return state[:, 1, :3] + cfg.target_distance * way
+    return Simulator(scene).observe(sample_start_states(scene, count, rng))
+
+
+def start_states(cfg: DictConfig, env: SceneEnv, bound, inference) -> TensorDictBase:
+    """Start states with each system's static graph: its true parameters, or identified from random controls."""
+    now = env.reset(TensorDict(batch_size=[cfg.episodes])).exclude("done", "terminated")
+    if inference is not None:
+        controls = torch.from_numpy(spline_controls(env.scene, cfg.episodes, cfg.context_length, cfg.seed + 1))
+        simulated = env.simulator.rollout(now["physics"], controls)  # its scenes in turn, as reset has them
+        unstable = int((~simulated["stable"]).sum())
+        if unstable:
+            raise UnstableSimulationError(
+                f"{unstable} of {cfg.episodes} simulations became unstable under the {cfg.context_length} random controls that a"
+                " system is identified from; try another seed, or a smaller context_length."
+            )
+        now.update({key: simulated[key][:, -1] for key in ("state", "physics")})
+        with torch.no_grad():
+            now["parameters"] = inference.identify(simulated["state"], controls)
+    elif bound is not None and bound.parameters_key is not None:
+        now["parameters"] = torch.stack([bound.parameters_of(scene) for scene in env.scenes])
+    return now

@@ -1,0 +1,75 @@
+"""A recipe's run folder: open it, resume what it holds, and finish it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_gn.training import Checkpoint, RunFolder, Tracker, load_checkpoint
+from torchrl_gn.training.run_folder import CONFIG_FILE, METRICS_FILE
+
+
+def open_run(cfg: DictConfig, name: str) -> tuple[RunFolder, Tracker]:
+    """Make the run folder of the recipe ``name``, write its ``config.yaml`` and open its log."""
+    run = RunFolder(cfg.run_dir, name)
+    return run, open_log(cfg, run)
+
+
+def open_log(cfg: DictConfig, run: RunFolder, *, label: str | None = None) -> Tracker:
+    """Write ``config.yaml`` and open the log that ``logger=`` names, called ``label`` (default: the recipe's name)."""
+    run.write_config(OmegaConf.to_yaml(cfg, resolve=True))
+    return Tracker(cfg.logger, run.path / "log", name=label or run.name, config=cfg)
+
+
+def resumed_checkpoint(cfg: DictConfig, run: RunFolder, may_change: Collection[str]) -> Checkpoint | None:
+    """Load the checkpoint to go on from; None if the run is new.
+
+    Raises:
+        ValueError: if an option outside of ``may_change`` differs from the checkpoint's.
+    """
+    if not run.checkpoint.exists():
+        return None
+    checkpoint = load_checkpoint(run.checkpoint)
+    run.refuse_changes(checkpoint.config, cfg, free=may_change)
+    return checkpoint
+
+
+def refuse_other_options(cfg: DictConfig, run: RunFolder, may_change: Collection[str]) -> None:
+    """Refuse to go on with a run of other options than its ``config.yaml`` has.
+
+    Raises:
+        ValueError: if an option outside of ``may_change`` differs.
+    """
+    if (config := run.path / CONFIG_FILE).exists():
+        run.refuse_changes(cast(DictConfig, OmegaConf.load(config)), cfg, free=may_change)
+
+
+def finish_run(
+    cfg: DictConfig,
+    run: RunFolder,
+    tracker: Tracker,
+    metrics: Mapping[str, Any],
+    *,
+    files: Sequence[Path] | None = None,
+    checkpoints: Sequence[Path] = (),
+    step: int = 0,
+) -> None:
+    """Write ``metrics.json``, log numbers and files, and print the paths.
+
+    Args:
+        cfg: the recipe's options.
+        run: the run folder.
+        tracker: the log, which is closed.
+        metrics: flat names and plain numbers.
+        files: figures and videos. Default: all that were asked of the folder.
+        checkpoints: models, printed last.
+        step: of the training, for the log.
+    """
+    numbers = run.write_metrics(metrics, seed=cfg.seed)
+    tracker.finish(numbers, [*(run.written if files is None else files), *checkpoints], step)
+    paths = run.written if files is None else [*files, run.path / METRICS_FILE]
+    for path in [*paths, *checkpoints]:
+        print(path)

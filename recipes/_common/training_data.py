@@ -1,0 +1,107 @@
+"""Data that a forward model is trained on: one system or several, variants, and trajectories of one's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import torch
+from omegaconf import DictConfig
+from safetensors.torch import load_file
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
+
+from _common import as_list
+from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
+from torchrl_gn.dynamics import ForwardModel, Predictor
+from torchrl_gn.scenes import Scene, has_variants
+from torchrl_gn.training import Workers
+from torchrl_gn.training.progress import dataset_with_progress
+
+
+@dataclass
+class Task:
+    """A system to train on.
+
+    Attributes:
+        scene: the system.
+        dataset: its random trajectories.
+        train: trajectories to train on, the data set's or a mixture with others.
+    """
+
+    scene: Scene
+    dataset: TrajectoryDataset
+    train: TensorDictBase
+
+    @property
+    def parametrized(self) -> bool:
+        """Whether its sequences are of random variants."""
+        return "parameters" in self.train.keys()
+
+    def bind(self, model: ForwardModel) -> Predictor:
+        """Bind the weights to the scene, or to its variants, whose parameters come with the samples."""
+        if not self.parametrized:
+            return model.bind(self.scene)
+        return model.bind(self.scene, parameters_key="parameters", static_features=self.dataset.features)
+
+
+def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]:
+    """Collect every system's data, or open the data set that is there."""
+    if cfg.data.extra is not None and (len(scenes) > 1 or cfg.parametrized):
+        raise ValueError("data.extra holds trajectories of one system without variants; name that one.")
+    tasks = []
+    for scene in scenes:
+        parametrized = cfg.parametrized and (len(scenes) == 1 or has_variants(scene))
+        variants = (cfg.data.variants or cfg.data.train) if parametrized else None
+        dataset = dataset_with_progress(folder, scene, cfg.data, variants=variants)
+        tasks.append(Task(scene, dataset, mixture(cfg, dataset)))
+    return tasks
+
+
+def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
+    """Half of the training trajectories and as many of `data.extra`, repeated if those are fewer."""
+    if cfg.data.extra is None:
+        return dataset.train
+    count = (len(dataset.train) + 1) // 2
+    own = cast(TensorDict, dataset.train[:count]).select("state", "action")
+    each = []
+    for source in as_list(cfg.data.extra):
+        each.append(extra_trajectories(source, cfg.data.length))
+        shapes, wanted = ([list(of.get(key).shape[1:]) for key in ("state", "action")] for of in (each[-1], own))
+        if shapes != wanted:
+            raise ValueError(
+                f"data.extra={source} has states and actions [M, *] of shapes {shapes}; {cfg.system} with"
+                f" data.length={cfg.data.length} has {wanted}."
+            )
+    more = each[0] if len(each) == 1 else cast(TensorDict, torch.cat(each))  # what lies on disk stays there
+    return cast(TensorDictBase, torch.cat([own, more[torch.arange(count) % len(more)].to(own["action"].dtype)]))
+
+
+def extra_trajectories(source: str, length: int) -> TensorDict:
+    """Trajectories ``[M]`` of a folder, or of a file of recipes/mpc.py's episodes, in pieces of `length` steps."""
+    if not source.endswith(".safetensors"):
+        return cast(TensorDict, TensorDict.load_memmap(source)).select("state", "action")
+    kept = load_file(source)
+    episodes, steps = kept["action"].shape[:2]
+    if steps < length:
+        raise ValueError(f"data.extra={source} has episodes of {steps} steps, fewer than data.length={length}.")
+    states, actions = (kept[name].unfold(1, length + more, length) for name, more in (("state", 1), ("action", 0)))
+    pieces = {"state": states.movedim(-1, 2).flatten(0, 1), "action": actions.movedim(-1, 2).flatten(0, 1)}
+    # An episode whose simulation became unstable is NaN from there on.
+    whole = pieces["state"].isfinite().flatten(1).all(1)
+    if not bool(whole.any()):
+        raise ValueError(f"data.extra={source} has no {length} steps of an episode that stayed stable.")
+    return TensorDict({name: piece[whole] for name, piece in pieces.items()}, [int(whole.sum())])
+
+
+def make_buffer(tasks: list[Task], batch_size: int, window: int, seed: int, workers: Workers) -> ReplayBuffer:
+    """Replay buffer of windows of one system, or of equal shares of several."""
+    share = max(1, batch_size // len(tasks))
+    buffers = [
+        trajectory_buffer(task.train, batch_size=share, window=window, seed=seed + 1000 * index, shard=workers.shard)
+        for index, task in enumerate(tasks)
+    ]
+    if len(buffers) == 1:
+        return buffers[0]
+    return ReplayBufferEnsemble(*buffers, batch_size=share * len(tasks), sample_from_all=True)

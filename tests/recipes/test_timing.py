@@ -1,0 +1,19 @@
+"""Run times are taken in turn."""
+
+from __future__ import annotations
+
+from _common.sweeps import mean_and_half_range
+from _common.timing import time_in_turn
+
+
+def test_each_runs_once_a_round_and_warm_up_is_not_timed():
+    order = []
+    works = {name: lambda name=name: order.append(name) for name in ("a", "b")}
+    seconds = time_in_turn(works, repeats=2, warm_up=3)
+    assert order == ["a", "b"] * 5
+    assert {name: len(values) for name, values in seconds.items()} == {"a": 2, "b": 2}
+    assert min(seconds["a"] + seconds["b"]) >= 0
+
+
+def test_half_range_is_half_of_largest_less_smallest():
+    assert mean_and_half_range([1.0, 2.0, 6.0]) == (3.0, 2.5) and mean_and_half_range([4.0]) == (4.0, 0.0)
