@@ -41,7 +41,7 @@ from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import product_speeds
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.systems import find_system
-from torchrl_gn.training import RunFolder, load_checkpoint
+from torchrl_gn.training import RunFolder, load_pretrained
 
 
 @dataclass
@@ -89,7 +89,7 @@ def learned(folders: list[Path], scene: Scene) -> list[Method]:
     """Every trained model, evaluated in every way."""
     methods = []
     for folder in folders:
-        model = load_checkpoint(folder).model.requires_grad_(False)
+        model = load_pretrained(folder).model.requires_grad_(False)
         bound, (kind, name) = model.bind(scene), title(model.options)
         if any(other.name.startswith(f"{name},") for other in methods):
             name = f"{name} ({folder.name})"

@@ -34,7 +34,7 @@ from _common.swimming import find_gait, swim, swim_by_policy
 from torchrl_gn.data import create_dataset
 from torchrl_gn.evaluation import evaluate_errors, rollout_video
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, load_checkpoint
+from torchrl_gn.training import RunFolder, load_pretrained
 
 ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
 # Options that may differ when a run goes on. All else makes other data, which finished trainings have not seen.
@@ -89,7 +89,7 @@ def main(cfg: DictConfig) -> None:
     scene, rng = load_scene(cfg.system), np.random.default_rng(cfg.seed)
     metrics: dict[str, float | int] = {}
     if cfg.policy is not None:
-        loaded, sizes = load_checkpoint(cfg.policy), cfg.swimming
+        loaded, sizes = load_pretrained(cfg.policy), cfg.swimming
         agent = loaded.agent  # or it says what else the checkpoint is of
         hold = max(1, round(loaded.config["task"]["timestep"] / scene.timestep))
         swimming = {
@@ -118,7 +118,7 @@ def main(cfg: DictConfig) -> None:
     results: dict[tuple[str, str], dict[str, dict[str, list[float]]]] = {}
     done = [(key, run) for key, of in runs.items() for run in of if run.metrics is not None]
     for key, run in tqdm(done, desc="evaluating", leave=False):
-        model = load_checkpoint(run.folder).model.bind(scene)
+        model = load_pretrained(run.folder).model.bind(scene)
         for test, trajectories in tests.items():
             errors = evaluate_errors(model, trajectories)
             for error in ERRORS:

@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from _common import clean_exit, finish_run, open_run, with_help
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.evaluation import report
-from torchrl_gn.pretrained import load_model
+from torchrl_gn.training import load_pretrained
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training.progress import HORIZON, collecting
 
@@ -29,7 +29,7 @@ from torchrl_gn.training.progress import HORIZON, collecting
 def main(cfg: DictConfig) -> None:
     if cfg.checkpoint is None:
         raise ValueError("Say what to evaluate: checkpoint=runs/forward_model/<time>, or a trained model's name.")
-    checkpoint = load_model(cfg.checkpoint)
+    checkpoint = load_pretrained(cfg.checkpoint)
     scene = load_scene(cfg.system, timestep=cfg.timestep) if cfg.system else checkpoint.scene()
     model = checkpoint.model.bind(scene, strict=cfg.strict)
     if cfg.length < HORIZON:

@@ -34,7 +34,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_training_curve, report, summary
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
-from torchrl_gn.pretrained import load_model
+from torchrl_gn.training import load_pretrained
 from torchrl_gn.scenes import ParameterNames, Scene, load_scene
 from torchrl_gn.training import Budget, RunFolder, Tracker, Trainer, Workers, join_workers, make_optimizer, plain_config
 from torchrl_gn.training.progress import cut_short_note, train_with_progress
@@ -63,7 +63,7 @@ def load_scenes(names: str | ListConfig, timestep: float | None) -> list[Scene]:
 def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
     """A model with fresh weights, or the one to start from."""
     if cfg.start_from is not None:
-        return load_model(cfg.start_from).model
+        return load_pretrained(cfg.start_from).model
     if cfg.model.core == "mlp" and len(scenes) > 1:
         raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
     items = (scenes[0].num_nodes, scenes[0].num_edges) if cfg.model.core == "mlp" else None

@@ -43,7 +43,7 @@ from torchrl_gn.evaluation import (
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.objectives import IdentificationLoss
 from torchrl_gn.scenes import ParameterNames, Scene, load_scene
-from torchrl_gn.training import Budget, RunFolder, Trainer, load_checkpoint, make_optimizer, plain_config
+from torchrl_gn.training import Budget, RunFolder, Trainer, load_pretrained, make_optimizer, plain_config
 from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
 
 # Options that may differ when a run goes on.
@@ -124,7 +124,7 @@ def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, s
         runs[name] = Run(FORWARD_MODEL, place, tuple(shared), name, goes_on=("minutes", "steps", "clock"))
     refuse_failures(run_all(runs.values(), cfg.jobs, desc="training baselines"))
     models = {
-        name: load_checkpoint(run.folder).model.bind(scene, parameters_key="parameters") for name, run in runs.items()
+        name: load_pretrained(run.folder).model.bind(scene, parameters_key="parameters") for name, run in runs.items()
     }
     return {name: evaluate_errors(bound, systems.predicted) for name, bound in models.items()}
 

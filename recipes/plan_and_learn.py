@@ -24,7 +24,7 @@ from safetensors.torch import load_file
 from _common import as_list, clean_exit, open_log, with_help
 from _common.sweeps import FORWARD_MODEL, MPC, Run, refuse_changes, report_sweep, run_all
 from torchrl_gn.evaluation import plot_rewards
-from torchrl_gn.pretrained import load_model
+from torchrl_gn.training import load_pretrained
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder
 
@@ -64,7 +64,7 @@ def make_runs(cfg: DictConfig, folder: Path, model: str) -> tuple[list[Run], lis
 def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "plan_and_learn")
     model = cfg.checkpoint or cfg.system
-    load_model(model)  # refused before anything is written
+    load_pretrained(model)  # refused before anything is written
     learned, executed = make_runs(cfg, folder.path.resolve(), model)  # named in the options, which may not change
     refuse_changes([*learned, *executed])
     tracker = open_log(cfg, folder)

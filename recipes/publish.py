@@ -5,7 +5,7 @@
 Stores weights in half precision, without the state of the training, and keeps only the last part of every path in the
 configuration. Evaluates the result on fresh trajectories of every system that the model was trained on, and of those
 that `also` names (a model that identifies: on random variants of them). The errors go into the file
-(`load_checkpoint(file).metrics`) and are printed. No figure of the paper. All options: recipes/config/publish.yaml.
+(`load_pretrained(file).metrics`) and are printed. No figure of the paper. All options: recipes/config/publish.yaml.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from _common import as_list, clean_exit, with_help
 from torchrl_gn.evaluation import fresh_errors, summary
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import load_checkpoint, save_checkpoint
+from torchrl_gn.training import load_pretrained, save_checkpoint
 
 
 def without_places(value: Any) -> Any:
@@ -45,7 +45,7 @@ def main(cfg: DictConfig) -> None:
     for name in ("checkpoint", "file"):
         if cfg[name] is None:
             raise ValueError(f"{name}= is needed: checkpoint=runs/forward_model/<time> file=model.safetensors, say.")
-    loaded = load_checkpoint(cfg.checkpoint)
+    loaded = load_pretrained(cfg.checkpoint)
     own, file = loaded.scenes(), Path(cfg.file)
     half = loaded.trained.half()
     model, how = copy.deepcopy(half).float(), {key: cfg[key] for key in ("sequences", "length", "seed")}

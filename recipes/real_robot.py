@@ -37,7 +37,7 @@ from torchrl_gn.training import (
     RunFolder,
     Tracker,
     Trainer,
-    load_checkpoint,
+    load_pretrained,
     make_optimizer,
     plain_config,
 )
@@ -167,7 +167,7 @@ def main(cfg: DictConfig) -> None:
     data = split(cfg, log)
     run = RunFolder(cfg.run_dir, "real_robot")
     paths = {name: run.path / name / CHECKPOINT_FILE for name in MODELS}
-    resumed = {name: load_checkpoint(path) for name, path in paths.items() if path.exists()}
+    resumed = {name: load_pretrained(path) for name, path in paths.items() if path.exists()}
     for checkpoint in resumed.values():
         run.refuse_changes(checkpoint.config, cfg, free=MAY_CHANGE)
     tracker = open_log(cfg, run, label=f"real_robot-{tree.name}")

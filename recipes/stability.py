@@ -30,7 +30,7 @@ from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.maths import BODY_STATE
-from torchrl_gn.pretrained import load_model
+from torchrl_gn.training import load_pretrained
 from torchrl_gn.processor import SlowDtypeWarning
 from torchrl_gn.scenes import Scene, has_variants
 
@@ -73,7 +73,7 @@ def all_checks(scene: Scene, steps: int) -> list[Check]:
 
 def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
     """The model in every dtype, and states to try."""
-    loaded = load_model(checkpoint)
+    loaded = load_pretrained(checkpoint)
     scene = loaded.scene()
     rng = np.random.default_rng(cfg.seed)
     physics = torch.as_tensor(sample_start_states(scene, 64, rng))

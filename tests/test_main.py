@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from torchrl_gn.__main__ import main
-from torchrl_gn.pretrained import load_pretrained, pretrained_names
+from torchrl_gn.training import load_pretrained, pretrained_names
 from torchrl_gn.scenes import SYSTEMS, load_scene
 
 from . import zoo

@@ -28,7 +28,7 @@ from torchrl_gn.maths import Normalizer
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.rewards.balance import Balance
 from torchrl_gn.scenes import ParameterNames, load_scene
-from torchrl_gn.training import Budget, Trainer, load_checkpoint, make_optimizer, save_checkpoint
+from torchrl_gn.training import Budget, Trainer, load_pretrained, make_optimizer, save_checkpoint
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 
 from . import zoo
@@ -83,7 +83,7 @@ def spoiled_checkpoint(g: SimpleNamespace, bad: float) -> None:
     with torch.no_grad():
         g.model.core.first.edge_mlp[0].bias[0] = bad
     save_checkpoint(g.path / "bad.safetensors", g.model, scene=g.scene)
-    load_checkpoint(g.path / "bad.safetensors")
+    load_pretrained(g.path / "bad.safetensors")
 
 
 def trainer(g: SimpleNamespace, **options) -> Trainer:

@@ -126,7 +126,7 @@ from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.scenes import ParameterNames
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import Budget, Trainer, load_checkpoint, make_optimizer, save_checkpoint
+from torchrl_gn.training import Budget, Trainer, load_pretrained, make_optimizer, save_checkpoint
 
 scene = load_scene(MJCF)
 trajectories = collect_trajectories(scene, 4, seed=0)
@@ -136,7 +136,7 @@ buffer = trajectory_buffer(trajectories, batch_size=8, seed=0)
 loss.fit_normalizers(buffer.sample())
 assert list(Trainer(loss, buffer, make_optimizer(bound.model.core), Budget(steps=2)).run())
 save_checkpoint(FILE, bound.model, scene=scene)
-quick = specialize(load_checkpoint(FILE).model.bind(scene))
+quick = specialize(load_pretrained(FILE).model.bind(scene))
 table = evaluate_errors(quick, trajectories, horizons=(2,))
 with pytest.raises(ImportError, match=r'pip install "torchrl_gn\\[figures\\]"'):
     plot_errors({"pole": table}, FILE)

@@ -8,7 +8,7 @@ import pytest
 
 from torchrl_gn.evaluation import fresh_errors
 from torchrl_gn.policies import Agent
-from torchrl_gn.pretrained import WEIGHTS, load_model, load_pretrained, pretrained_names
+from torchrl_gn.training import WEIGHTS, load_model, load_pretrained, pretrained_names
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import CheckpointError, save_checkpoint
 
@@ -58,9 +58,11 @@ def test_a_wrong_name_names_the_right_ones():
 
 def test_a_model_is_found_by_its_name_or_where_it_lies(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    shipped = load_model("pendulum")
+    shipped = load_pretrained("pendulum")
     save_checkpoint(tmp_path / "cartpole", shipped.model, scene=shipped.scene())
-    assert load_model("cartpole").scene().name == "cartpole"
-    assert load_model("./cartpole").scene().name == load_model(tmp_path / "cartpole").scene().name == "pendulum"
+    assert load_pretrained("cartpole").scene().name == "cartpole"
+    assert (
+        load_pretrained("./cartpole").scene().name == load_pretrained(tmp_path / "cartpole").scene().name == "pendulum"
+    )
     with pytest.raises(CheckpointError, match="no checkpoint at no_such_model, and no model of that name.*'cheetah'"):
-        load_model("no_such_model")
+        load_pretrained("no_such_model")

@@ -94,7 +94,7 @@ def test_a_torch_without_the_setting_multiplies_as_ever(monkeypatch):
 
 
 def test_slow_dtypes_warn_and_say_what_to_do(monkeypatch):
-    from torchrl_gn.pretrained import load_pretrained
+    from torchrl_gn.training import load_pretrained
 
     loaded = load_pretrained("pendulum")
     bound = loaded.model.bind(loaded.scene())

@@ -69,7 +69,7 @@ def _systems() -> str:
 
 def _models() -> str:
     """Return the table of pretrained models and their stated errors."""
-    from torchrl_gn.pretrained import load_pretrained, pretrained_names
+    from torchrl_gn.training import load_pretrained, pretrained_names
 
     keys = ("one_step_error", "rollout_error_20", "rollout_error_100")
     rows: list[tuple[str, ...]] = [

@@ -19,8 +19,8 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.pretrained import load_pretrained
 from torchrl_gn.processor import instruction_sets, processor_name, product_speeds, restrictions
+from torchrl_gn.training import load_pretrained
 from torchrl_gn.training.checkpoint import package_versions
 
 _MODEL = "swimmer6"

@@ -15,7 +15,7 @@ from torchrl_gn.dynamics import Predictor, specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.pretrained import load_model, pretrained_names
+from torchrl_gn.training import load_pretrained, pretrained_names
 from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
 
@@ -75,7 +75,7 @@ def bind_model(cfg: DictConfig, scene: Scene):
     if cfg.checkpoint is None and not names:
         what = f"variants of {cfg.system!r}" if cfg.variants else repr(cfg.system)
         raise ValueError(f"No trained model of {what} comes with the package; give checkpoint=PATH.")
-    checkpoint = load_model(cfg.checkpoint or names[0])
+    checkpoint = load_pretrained(cfg.checkpoint or names[0])
     if isinstance(checkpoint.trained, IdentifyingModel):
         bound, inference = checkpoint.trained.bind(scene)
         return fast_model(bound, cfg.compile), inference

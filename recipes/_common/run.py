@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_gn.training import Checkpoint, RunFolder, Tracker, load_checkpoint
+from torchrl_gn.training import Checkpoint, RunFolder, Tracker, load_pretrained
 from torchrl_gn.training.run_folder import CONFIG_FILE, METRICS_FILE
 
 
@@ -32,7 +32,7 @@ def resumed_checkpoint(cfg: DictConfig, run: RunFolder, may_change: Collection[s
     """
     if not run.checkpoint.exists():
         return None
-    checkpoint = load_checkpoint(run.checkpoint)
+    checkpoint = load_pretrained(run.checkpoint)
     run.refuse_changes(checkpoint.config, cfg, free=may_change)
     return checkpoint
 

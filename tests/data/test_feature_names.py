@@ -13,7 +13,7 @@ from torchrl_gn.data import DatasetError, collect, create_dataset, dataset, load
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.pretrained import load_pretrained
+from torchrl_gn.training import load_pretrained
 from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants, static_features
 
 from ..sizes import SMALL

@@ -17,7 +17,7 @@ from torchrl_gn.maths import joint_layout
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.scenes import KinematicTree, ParameterNames, load_scene
-from torchrl_gn.training import load_checkpoint, save_checkpoint
+from torchrl_gn.training import load_pretrained, save_checkpoint
 
 SMALL = {"latent": 16, "edge_hidden": (16,), "node_hidden": (16,), "global_hidden": (16,)}
 
@@ -50,7 +50,7 @@ def test_it_trains_is_saved_and_evaluated_like_any_scene(robot, core, tmp_path):
     path = plot_joints(data["state"][0, :16], {core: table.rollouts[0]}, tree, tmp_path / "joints.png")
     assert path.read_bytes().startswith(b"\x89PNG")
     save_checkpoint(tmp_path / "robot.safetensors", model, scene=tree)
-    again = load_checkpoint(tmp_path / "robot.safetensors")
+    again = load_pretrained(tmp_path / "robot.safetensors")
     state, action = data["state"][:, 3], data["action"][:, 3]
     assert torch.equal(again.model.bind(again.scene()).step(state, action), bound.step(state, action))
     base = bound.step(state, action)[:, 0]

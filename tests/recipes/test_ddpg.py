@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.training import load_checkpoint
+from torchrl_gn.training import load_pretrained
 
 from .conftest import SHORT_LEARNING
 
@@ -26,7 +26,7 @@ def test_a_run_is_learned_gone_on_with_and_kept_from_other_options(tmp_path, cal
         assert code == 0 and "warning" not in errors.lower(), errors
         metrics = json.loads((tmp_path / "metrics.json").read_text())
         assert (metrics["frames"], metrics["updates"]) == (frames, updates)
-    saved = load_checkpoint(tmp_path)
+    saved = load_pretrained(tmp_path)
     assert saved.agent.model is None and len(saved.training["buffer"]["action"]) == 120
     explored = saved.training["buffer"]["action"][40:]
     assert explored.abs().max() <= 1 and explored.std() > 0.1

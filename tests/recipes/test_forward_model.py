@@ -13,9 +13,9 @@ from safetensors.torch import save_file
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import UnseenParameterWarning
-from torchrl_gn.pretrained import load_pretrained
+from torchrl_gn.training import load_pretrained
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import load_checkpoint
+from torchrl_gn.training import load_pretrained
 
 pytestmark = pytest.mark.slow  # programs from start to end
 
@@ -40,7 +40,7 @@ def interrupted(tmp_path_factory, start) -> Path:
 
 
 def test_an_interrupted_run_goes_on_to_its_end(interrupted, run):
-    done = load_checkpoint(interrupted).training["progress"]["step"]
+    done = load_pretrained(interrupted).training["progress"]["step"]
     assert done > 0
     code, output, errors = run(*SMALL, f"steps={done + 5}", f"run_dir={interrupted}", "logger=wandb")
     assert code == 0, errors
@@ -102,7 +102,7 @@ def test_several_systems_share_a_model_and_others_are_only_evaluated(tmp_path, c
     assert "one_step_error" not in metrics
     assert [line.split("  ")[0] for line in output.splitlines() if line.startswith(tuple(systems))] == systems
     assert {path.name for path in tmp_path.glob("*/rollout.gif")} and (tmp_path / "errors.png").is_file()
-    saved = load_checkpoint(tmp_path)
+    saved = load_pretrained(tmp_path)
     assert [scene.name for scene in saved.scenes()] == ["swimmer3", "pendulum"]
 
 
@@ -115,7 +115,7 @@ def test_a_model_goes_on_from_another_with_episodes_as_half_of_its_data(tmp_path
     options = (*small, f"data.extra=[{tmp_path / 'gn.safetensors'}]")
     code, _, errors = call(*options, f"run_dir={tmp_path / 'run'}", recipe="forward_model")
     assert code == 0, errors
-    before, after = load_pretrained("pendulum").model, load_checkpoint(tmp_path / "run").model
+    before, after = load_pretrained("pendulum").model, load_pretrained(tmp_path / "run").model
     assert torch.equal(before.node_normalizer.mean, after.node_normalizer.mean)  # weights go with their statistics
     distance = torch.cat([(a - b).flatten() for a, b in zip(before.parameters(), after.parameters(), strict=True)])
     assert 0 < distance.abs().max() < 1e-2

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from torchrl_gn.data import simulate_log
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import load_checkpoint
+from torchrl_gn.training import load_pretrained
 
 SMALL = (
     "steps=2",
@@ -48,7 +48,7 @@ def test_a_double_pendulum_needs_options_alone(pendulum, call, tmp_path):
     assert "1 episodes are too few" in output and "cut at 0 gaps" in output and "not read: 'motor'" in output
     # 398 transitions are 33 trajectories.
     assert "validation: 1 trajectories, test: 3 trajectories, train: 29 trajectories" in output
-    tree = load_checkpoint(run / "recurrent").scene()
+    tree = load_pretrained(run / "recurrent").scene()
     assert tree.num_actions == 1 and tree.edge_action[:, 0].tolist() == [0, 0, -1, -1]
     before = (run / "config.yaml").read_text()
     # Other options, with which the folder must stay as it is: of the first model, and of one that was not begun.

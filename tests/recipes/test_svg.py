@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchrl_gn.training import load_checkpoint
+from torchrl_gn.training import load_pretrained
 
 from .conftest import SHORT_LEARNING
 
@@ -25,13 +25,13 @@ def test_a_run_is_learned_gone_on_with_and_kept_from_other_options(tmp_path, cal
     options = (*SMALL, "task.name=swimmer3", f"run_dir={tmp_path}", "logger=csv")
     code, _, errors = call(*options, "trainer.frames=80", recipe="svg")
     assert code == 0 and "warning" not in errors.lower(), errors
-    first, curve = load_checkpoint(tmp_path), json.loads((tmp_path / "curve.json").read_text())
+    first, curve = load_pretrained(tmp_path), json.loads((tmp_path / "curve.json").read_text())
     assert (curve["frames"], curve["updates"]) == ([0, 40, 80], [0, 0, 4])
     assert first.training["progress"]["updates"] == 4 and len(first.training["buffer"]["action"]) == 80
 
     code, output, errors = call(*options, "trainer.frames=120", recipe="svg")
     assert code == 0 and "warning" not in errors.lower(), errors
-    again, metrics = load_checkpoint(tmp_path), json.loads((tmp_path / "metrics.json").read_text())
+    again, metrics = load_pretrained(tmp_path), json.loads((tmp_path / "metrics.json").read_text())
     assert torch.equal(again.training["buffer"]["action"][:80], first.training["buffer"]["action"])
     assert again.training["curve"]["returns"][:3] == curve["returns"]
     assert (metrics["frames"], metrics["updates"]) == (120, 8)
@@ -61,7 +61,7 @@ def test_a_run_is_learned_gone_on_with_and_kept_from_other_options(tmp_path, cal
 def test_other_agents_and_tasks_learn_too(tmp_path, call, options, has):
     code, _, errors = call(*SMALL, *options, "trainer.frames=80", f"run_dir={tmp_path}", recipe="svg")
     assert code == 0 and "warning" not in errors.lower(), errors
-    agent = load_checkpoint(tmp_path).agent
+    agent = load_pretrained(tmp_path).agent
     assert (agent.model is not None, agent.reward is not None) == has
     assert json.loads((tmp_path / "metrics.json").read_text())["updates"] == 4
 

@@ -16,7 +16,7 @@ from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import Budget
 from torchrl_gn.training import checkpoint as module
-from torchrl_gn.training.checkpoint import CheckpointError, load_checkpoint, package_versions, save_checkpoint
+from torchrl_gn.training.checkpoint import CheckpointError, load_pretrained, package_versions, save_checkpoint
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def same(a, b) -> bool:
 
 
 def test_everything_comes_back(saved, trained, scene):
-    loaded = load_checkpoint(saved)
+    loaded = load_pretrained(saved)
     assert same(dict(loaded.model.state_dict()), dict(trained.model.state_dict()))
     assert loaded.model.description() == trained.model.description()
     for name, normalizer in trained.model.named_modules():
@@ -66,7 +66,7 @@ def test_everything_comes_back(saved, trained, scene):
 def test_weights_stored_in_half_precision_compute_in_single(tmp_path, trained):
     halves = copy.deepcopy(trained.model).half()
     save_checkpoint(tmp_path / "published.safetensors", halves)
-    loaded = load_checkpoint(tmp_path / "published.safetensors").model.state_dict()
+    loaded = load_pretrained(tmp_path / "published.safetensors").model.state_dict()
     assert {value.dtype for name, value in loaded.items() if name.endswith(".weight")} == {torch.float32}
     assert all(torch.equal(loaded[name], value.to(loaded[name].dtype)) for name, value in halves.state_dict().items())
 
@@ -78,11 +78,11 @@ def test_networks_of_another_version_are_refused(tmp_path, monkeypatch, change):
     monkeypatch.setattr(Agent, "description", lambda self: {**description, "options": description["options"] | change})
     save_checkpoint(tmp_path / "c.safetensors", Agent(graph, hidden=(8,)))
     with pytest.raises(CheckpointError, match=r"c\.safetensors is of another version .*train again"):
-        load_checkpoint(tmp_path / "c.safetensors")
+        load_pretrained(tmp_path / "c.safetensors")
 
 
 def test_optimizers_keep_integer_keys_and_exact_rates(saved, trained, make_trainer):
-    state = load_checkpoint(saved).training["optimizer"]
+    state = load_pretrained(saved).training["optimizer"]
     before = trained.optimizer.state_dict()
     for index in ("0", "1"):
         assert list(state[index]["state"]) == list(before[index]["state"]) == list(range(len(state[index]["state"])))
@@ -96,7 +96,7 @@ def test_optimizers_keep_integer_keys_and_exact_rates(saved, trained, make_train
 def test_weights_keep_their_dtype(tmp_path, make_model, scene, dtype):
     model = make_model().to(dtype)
     save_checkpoint(tmp_path / "c.safetensors", model, scene=scene)
-    loaded = load_checkpoint(tmp_path / "c.safetensors")
+    loaded = load_pretrained(tmp_path / "c.safetensors")
     assert same(dict(loaded.model.state_dict()), dict(model.state_dict()))
     assert loaded.training == {}
 
@@ -124,7 +124,7 @@ def test_nested_training_state_comes_back(tmp_path, make_model, scene):
         "view": torch.arange(12.0).view(3, 4).T[1:],
     }
     save_checkpoint(tmp_path / "c.safetensors", make_model(), scene=scene, training=training)
-    assert same(load_checkpoint(tmp_path / "c.safetensors").training, training)
+    assert same(load_pretrained(tmp_path / "c.safetensors").training, training)
 
 
 def test_the_file_is_safetensors_and_holds_no_pickle(saved):
@@ -137,7 +137,7 @@ def test_the_file_is_safetensors_and_holds_no_pickle(saved):
 
 
 def test_a_run_folder_stands_for_the_checkpoint_in_it(tmp_path, saved, trained):
-    assert same(dict(load_checkpoint(tmp_path).model.state_dict()), dict(trained.model.state_dict()))
+    assert same(dict(load_pretrained(tmp_path).model.state_dict()), dict(trained.model.state_dict()))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -149,7 +149,7 @@ def test_an_agent_comes_back_with_its_statistics(tmp_path, dtype):
     observation, action, after = torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13)
     agent.update_normalizers(observation, action, after)
     save_checkpoint(tmp_path / "c.safetensors", agent)
-    loaded = load_checkpoint(tmp_path / "c.safetensors")
+    loaded = load_pretrained(tmp_path / "c.safetensors")
     again = loaded.agent
     assert loaded.scenes() == [] and same(dict(again.state_dict()), dict(agent.state_dict()))
     td = TensorDict({"observation": observation.to(dtype)}, [20])
@@ -163,19 +163,19 @@ def test_an_agent_comes_back_with_its_statistics(tmp_path, dtype):
 
 def test_a_model_is_no_agent(saved):
     with pytest.raises(CheckpointError, match="The checkpoint holds a ForwardModel .*, not a Agent"):
-        _ = load_checkpoint(saved).agent
+        _ = load_pretrained(saved).agent
 
 
 def refused(path, message: str) -> None:
     with pytest.raises(CheckpointError, match=message) as caught:
-        load_checkpoint(path)
+        load_pretrained(path)
     assert str(path) in str(caught.value)
 
 
 def test_missing_files(tmp_path):
     refused(tmp_path / "no.safetensors", "No checkpoint at")
     with pytest.raises(CheckpointError, match=f"No checkpoint at .*{module.CHECKPOINT_FILE}"):
-        load_checkpoint(tmp_path)
+        load_pretrained(tmp_path)
 
 
 @pytest.mark.parametrize("keep", [0, 1, 7, 8, 100, 0.3, 0.9, -1])
@@ -199,7 +199,7 @@ def test_any_flipped_bit_is_noticed(saved):
         saved.write_bytes(damaged)
         refused(saved, "damaged|no checkpoint of torchrl_gn")
     saved.write_bytes(content)
-    load_checkpoint(saved)
+    load_pretrained(saved)
 
 
 def test_files_that_are_not_ours(tmp_path):
@@ -227,7 +227,7 @@ def test_a_newer_format_or_older_format_says_what_to_do(tmp_path, make_model, sc
 def test_a_model_of_several_scenes_names_them(tmp_path, make_model, scene):
     path = tmp_path / "several.safetensors"
     save_checkpoint(path, make_model(), scene=[scene, load_scene("swimmer3")])
-    loaded = load_checkpoint(path)
+    loaded = load_pretrained(path)
     assert [each.name for each in loaded.scenes()] == [scene.name, "swimmer3"]
     with pytest.raises(CheckpointError, match="several scenes, .*'swimmer3'.*; say which one"):
         loaded.scene()

@@ -12,7 +12,7 @@ from torchrl_gn.training import (
     RunFolder,
     Tracker,
     learn_with_progress,
-    load_checkpoint,
+    load_pretrained,
     report_learning,
 )
 
@@ -36,11 +36,11 @@ def test_an_interrupted_run_is_saved_and_goes_on(make_learner, tracker, tmp_path
     trainer.evaluate = interrupt
     with pytest.raises(KeyboardInterrupt):
         learn_with_progress(trainer, path, None, tracker, config=CONFIG)
-    begun = load_checkpoint(path)
+    begun = load_pretrained(path)
     assert begun.config == CONFIG and begun.training["progress"]["frames"] == 100
     again = make_learner(begun.agent, frames=140)
     learn_with_progress(again, path, begun, tracker, config=CONFIG)
-    saved = load_checkpoint(path).training
+    saved = load_pretrained(path).training
     assert saved["progress"]["frames"] == 140 and saved["curve"]["frames"] == [0, 100, 140]
     assert torch.equal(saved["buffer"]["action"][:100], begun.training["buffer"]["action"])
 

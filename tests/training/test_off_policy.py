@@ -17,7 +17,7 @@ from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.policies import Agent
-from torchrl_gn.training import load_checkpoint, mean_return, save_checkpoint
+from torchrl_gn.training import load_pretrained, mean_return, save_checkpoint
 
 
 def spend(trainer) -> list:
@@ -114,7 +114,7 @@ def test_a_stopped_run_goes_on_where_it_was(make_learner, tmp_path, capacity):
         if progress.frames == 160:
             break
     save_checkpoint(tmp_path / "c.safetensors", trainer.agent, training=trainer.state_dict())
-    saved = load_checkpoint(tmp_path / "c.safetensors")
+    saved = load_pretrained(tmp_path / "c.safetensors")
     again = make_learner(saved.agent, seed=1, frames=300, capacity=capacity)
     again.load_state_dict(saved.training)
     assert (again.frames, again.updates, again.owed, again.seconds) == (160, 6, trainer.owed, trainer.seconds)

@@ -12,7 +12,7 @@ import torch
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import onednn_precision
 from torchrl_gn.training import Budget, Trainer, Workers
-from torchrl_gn.training.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_gn.training.checkpoint import load_pretrained, save_checkpoint
 
 
 def weights(trainer) -> dict[str, torch.Tensor]:
@@ -42,7 +42,7 @@ def test_a_gpu_trains_the_same_and_its_checkpoint_goes_on_anywhere(make_trainer,
         losses[device] = [progress.loss for progress in trainer.run()]
     torch.testing.assert_close(losses["cuda"], losses["cpu"], rtol=1e-3, atol=0)
     save_checkpoint(tmp_path / "checkpoint.safetensors", trainer.model, training=trainer.state_dict())
-    saved = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    saved = load_pretrained(tmp_path / "checkpoint.safetensors")
     again = make_trainer(Budget(steps=12), saved.model, preset="adam", unroll=0.5)
     again.load_state_dict(saved.training)
     assert len(list(again.run())) == 2
@@ -151,7 +151,7 @@ def test_resumed_training_is_the_uninterrupted_one(make_trainer, scene, tmp_path
     for _ in first.run():  # what happens after saving does not matter
         pass
 
-    loaded = load_checkpoint(path)
+    loaded = load_pretrained(path)
     torch.manual_seed(123)
     resumed = trainer(loaded.model)
     resumed.load_state_dict(loaded.training)

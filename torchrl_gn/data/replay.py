@@ -29,8 +29,8 @@ def trajectory_buffer(
 
     Draws (trajectory, start time) uniformly with replacement. ``sample()`` gives a TensorDict ``[batch_size]``, or
     ``[batch_size, window]`` for windows longer than one, of ``state`` ``[..., N, 13]``, ``action`` ``[..., A]``,
-    ``("next", "state")`` ``[..., N, 13]``, ``index`` ``[..., 2]`` (trajectory, time) and the trajectory's ``parameters``.
-    ``buffer[i]`` gives whole trajectories. ``state_dict()`` holds the random state, and with ``capacity`` the
+    ``("next", "state")`` ``[..., N, 13]``, ``index`` ``[..., 2]`` (trajectory, time) and the trajectory's
+    ``parameters``. ``buffer[i]`` gives whole trajectories. ``state_dict()`` holds the random state, and with ``capacity`` the
     trajectories.
 
     Args:
@@ -40,7 +40,7 @@ def trajectory_buffer(
         window: consecutive transitions in a draw.
         seed: seed of the draws; default: drawn from torch's global generator.
         capacity: trajectories to allocate, for ``extend`` to add more and replace the oldest; default: read-only.
-        query_windows: ``(count, length)`` of query windows at other times of the same trajectory, which follow the first
+        query_windows: ``(count, length)`` of query windows at other times of the same trajectory, after the first
             along the second dimension, ``[batch_size, window + count * length]`` (paper, SM "End-to-end training
             algorithm for System ID").
         shard: ``(rank, size)``: return only this equal part of each draw; ranks with one seed share the draws.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, cast, get_args
 
 from tensordict.utils import NestedKey
 from torch import nn
@@ -97,9 +97,9 @@ class ForwardModel(nn.Module):
         # The network's output has the residual's scale; errors are weighted by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
-        kind = core_class(core)
-        fixed = {"counts": counts} if kind.fixed_size else {}
-        self.core: Core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
+        kind: Callable[..., Core] = core_class(core)
+        fixed = {"counts": counts} if core_class(core).fixed_size else {}
+        self.core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
 
     @classmethod
     def for_scene(
@@ -114,14 +114,14 @@ class ForwardModel(nn.Module):
             features: what the network sees; default: all that suits the scene.
             **options: of :class:`ForwardModel` and its core.
         """
-        scene = scene if isinstance(scene, (Scene, KinematicTree)) else scene[0]
-        layout = joint_layout(scene.extras) if isinstance(scene, KinematicTree) else BODY_STATE
+        first = cast(Scene, scene if isinstance(scene, (Scene, KinematicTree)) else scene[0])
+        layout = joint_layout(first.extras) if isinstance(first, KinematicTree) else BODY_STATE
         if features is None:
             spatial = "orientation" in layout.names
             features = (BodyState(), Controls(), *((JointAxes(), Contacts()) if spatial else ()))
-        chosen = [feature.resolved(scene) for feature in features]  # pyright: ignore[reportArgumentType]
-        counts = scene.num_nodes, scene.num_edges
-        return cls(ParameterNames.of(scene), layout=layout, features=chosen, counts=counts, **options)
+        chosen = [feature.resolved(first) for feature in features]
+        counts = first.num_nodes, first.num_edges
+        return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)
 
     @property
     def parameter_normalizers(self) -> dict[str, Normalizer]:

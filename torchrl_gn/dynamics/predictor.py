@@ -125,7 +125,7 @@ class Predictor(TensorDictModuleBase):
         return False
 
     def own_parameters(self) -> TensorDict:
-        """Entry of a sample of the scene itself at the ``parameters_key``, without batch; zeros of an inferred graph."""
+        """Entry of the scene itself at the ``parameters_key``, without batch; zeros of an inferred graph."""
         return self.parameter_reader.entries()
 
     def parameters_of(self, scene: Scene) -> TensorDict:
@@ -304,7 +304,7 @@ class Predictor(TensorDictModuleBase):
         return torch.stack(predictions, dim=-3), hidden.tensordict()
 
     def delta(self, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> Tensor:
-        """Predicted change ``[*B, N, 12]``, zero in fixed components; of a recurrent model from the initial hidden state.
+        """Predicted change ``[*B, N, 12]``, zero in fixed components; from a recurrent model's initial hidden state.
 
         Raises:
             ValueError: if a shape does not fit the scene.
@@ -315,7 +315,8 @@ class Predictor(TensorDictModuleBase):
     def _graph(self, hidden_state: TensorDictBase | None) -> Graph | None:
         if hidden_state is None:
             return None
-        return Graph(*(hidden_state[part] for part in ("nodes", "edges", "globals_")), self.incidence.edge_index)
+        nodes, edges, globals_ = (hidden_state[part] for part in ("nodes", "edges", "globals_"))
+        return Graph(nodes, edges, globals_, self.incidence.edge_index)
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"

@@ -52,7 +52,7 @@ class SpecializedPredictor(Predictor):
         self.strict, self.executor_name = predictor.strict, executor
         self._dtype = dtype
         self._executor: Executor | None = None
-        self._weights: list[tuple[dict[str, Any], str, Tensor, int]] = []
+        self._weights: list[tuple[Any, str, Tensor, int]] = []
         self._given: dict[str, tuple[Tensor, int]] = {}
         # Refuse now what the executor cannot run, not at the first step.
         if predictor.parameters_key is None:
@@ -87,8 +87,12 @@ class SpecializedPredictor(Predictor):
                     self._executor.update(program)
             owners = [module._parameters for module in self.model.modules()]
             owners += [module._buffers for module in (*self.model.modules(), self, self.parameter_reader)]
-            tensors = ((owner, name, owner[name]) for owner in owners for name in owner)
-            self._weights = [(*each, _version(each[2])) for each in tensors if each[2] is not None]
+            self._weights = [
+                (owner, name, tensor, _version(tensor))
+                for owner in owners
+                for name, tensor in owner.items()
+                if tensor is not None
+            ]
             given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
             # Views that share the storage keep it alive: no other tensor can come to lie at its address.
             self._given = {name: (value.detach(), _version(value)) for name, value in given.items()}

@@ -37,8 +37,8 @@ class ModelEnv(ModelBasedEnvBase):
     parameters. A loss that must not train them keeps the environment out of its submodules.
 
     ``reset()`` draws true start states; ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state``. A
-    model with physical parameters per sample (``parameters_key``) reads them from the TensorDict; without them it gets its
-    scene's, or zeros for an inferred graph. TorchRL does not carry them across auto-resets. The hidden state of a
+    model with physical parameters per sample (``parameters_key``) reads them from the TensorDict; by default they are
+    its scene's, or zeros for an inferred graph. TorchRL does not carry them across auto-resets. The hidden state of a
     recurrent model is the entry ``hidden_state``; without one it starts at its initial value.
 
     Args:

@@ -93,7 +93,7 @@ def evaluate_errors(
     Args:
         model: reads state and action at its first two ``in_keys``, writes the next state at its first ``out_keys``.
         trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]``, ``"action"`` ``[M, T, A]`` and, if
-            the model reads them, physical parameters ``[M]`` at its ``parameters_key``; may lie on disk (memory-mapped).
+            the model reads them, physical parameters ``[M]`` at its ``parameters_key``; may be memory-mapped.
         horizons: lengths of the rollouts to measure, at most ``T``.
         one_step: whether to measure the one-step error, which takes a prediction of every step.
         burn_in: steps at the start of every trajectory that are not evaluated; a recurrent model's hidden state runs

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -39,9 +39,9 @@ class Estimate(NamedTuple):
     """Estimate from observations of a system.
 
     Attributes:
-        parameters: TensorDict ``[*B]`` of the inferred static graph: ``nodes`` ``[*B, N, 10]``, ``edges`` ``[*B, E, 10]``
-            and ``globals_`` ``[*B, 10]``; with constraint projection also the anchor offsets ``parent_anchor`` and
-            ``child_anchor`` ``[*B, N, 3]``.
+        parameters: TensorDict ``[*B]`` of the inferred static graph: ``nodes`` ``[*B, N, 10]``, ``edges``
+            ``[*B, E, 10]`` and ``globals_`` ``[*B, 10]``; with constraint projection also the anchor offsets
+            ``parent_anchor`` and ``child_anchor`` ``[*B, N, 3]``.
         context: to continue from with more observations.
     """
 
@@ -88,7 +88,7 @@ class InferenceModel(nn.Module):
             raise ValueError(f"readout must be 'mean' or 'last', got {readout!r}.")
         self.readout = readout
         self.inferred_size, self.hidden_size = GraphSize(*inferred), GraphSize(*hidden_state)
-        sizes = {
+        sizes: dict[str, Any] = {
             "edge_hidden": list(edge_hidden),
             "node_hidden": list(node_hidden),
             "global_hidden": list(global_hidden),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from torchrl_gn.networks.core import Core, layer_sizes
 from torchrl_gn.networks.fold_gn_core import fold_gn_core
@@ -60,10 +61,10 @@ class GNCore(Core):
                 f"Every MLP of the core needs a hidden layer, got edges {edge}, nodes {node}, globals {last}."
             )
         latent = usual[-1] if latent is None else latent
-        sizes = {"edge_hidden": edge, "node_hidden": node}
         graph, between = dynamic + static, GraphSize(latent, latent, latent)
-        self.first = GNBlock(graph, between, **sizes, global_hidden=last, activation=activation, pool=pool)
-        self.second = GNBlock(graph + between, GraphSize(out_nodes, latent, 0), **sizes, activation=activation)
+        sizes: dict[str, Any] = {"edge_hidden": edge, "node_hidden": node, "activation": activation}
+        self.first = GNBlock(graph, between, global_hidden=last, pool=pool, **sizes)
+        self.second = GNBlock(graph + between, GraphSize(out_nodes, latent, 0), **sizes)
 
     def forward(self, graph: Graph) -> Graph:
         """Graph with dynamic and static features in, graph with ``out_nodes`` node features out."""

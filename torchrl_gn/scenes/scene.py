@@ -64,8 +64,8 @@ class Scene:
         receivers: ``[E]`` receiving node of each edge.
         edge_action: ``[E]`` action at the edge's joint, -1 without motor.
         static: static graph.
-        movable: ``[N, 12]`` bool mask of movable components of the state change (position 3, rotation 3, linear velocity
-            3, angular velocity 3; world frame).
+        movable: ``[N, 12]`` bool, movable components of the state change (position 3, rotation 3, linear velocity 3,
+            angular velocity 3; world frame).
         translation_invariant: ``[3]`` bool, world axes along which the dynamics do not depend on position.
         yaw_frame: yaw frame, if the dynamics do not depend on the yaw.
         joint_anchors: joint anchors.

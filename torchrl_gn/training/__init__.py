@@ -3,10 +3,11 @@
 from torchrl_gn.training.budget import Budget as Budget
 from torchrl_gn.training.checkpoint import Checkpoint as Checkpoint
 from torchrl_gn.training.checkpoint import CheckpointError as CheckpointError
-from torchrl_gn.training.checkpoint import load_checkpoint as load_checkpoint
 from torchrl_gn.training.checkpoint import package_versions as package_versions
 from torchrl_gn.training.checkpoint import save_checkpoint as save_checkpoint
 from torchrl_gn.training.config import plain_config as plain_config
+from torchrl_gn.training.fit import History as History
+from torchrl_gn.training.fit import fit as fit
 from torchrl_gn.training.learning import learn_with_progress as learn_with_progress
 from torchrl_gn.training.learning import report_learning as report_learning
 from torchrl_gn.training.learning_curve import mean_return as mean_return
@@ -14,6 +15,8 @@ from torchrl_gn.training.off_policy import OffPolicyTrainer as OffPolicyTrainer
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer
 from torchrl_gn.training.optimizers import make_agent_optimizer as make_agent_optimizer
 from torchrl_gn.training.optimizers import make_optimizer as make_optimizer
+from torchrl_gn.training.pretrained import load_pretrained as load_pretrained
+from torchrl_gn.training.pretrained import pretrained_names as pretrained_names
 from torchrl_gn.training.ray_cluster import RayCluster as RayCluster
 from torchrl_gn.training.run_folder import RunFolder as RunFolder
 from torchrl_gn.training.tracking import Tracker as Tracker

@@ -18,13 +18,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import Scene, scene_from_description
 
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
-"""Where a run folder keeps its checkpoint."""
+"""Checkpoint of a run folder."""
 
 FORMAT = 4
 """Version of the checkpoint format that this package writes and reads."""
@@ -87,6 +87,14 @@ class Checkpoint:
             CheckpointError: if it is another kind of model.
         """
         return self._as(ForwardModel)
+
+    def bind(self, scene: Scene, **options) -> Predictor:
+        """The forward model joined to a scene, see :meth:`ForwardModel.bind`.
+
+        Raises:
+            CheckpointError: if it is another kind of model.
+        """
+        return self.model.bind(scene, **options)
 
     @property
     def agent(self) -> Agent:
@@ -173,10 +181,10 @@ def save_checkpoint(
         save_file(tensors, temporary, metadata={"format": str(FORMAT), "description": text, "sha256": digest})
 
 
-def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
+def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
     """Read a checkpoint.
 
-    Weights that are stored in half precision, as published ones are, are computed with in single precision.
+    Weights stored in half precision, as shipped ones are, compute in single precision.
 
     Args:
         path: the file, or the run folder that holds it.

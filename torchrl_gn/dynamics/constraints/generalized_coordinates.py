@@ -154,9 +154,7 @@ def _identity(rotation: Tensor) -> Tensor:
 
 
 def _dofs(scene: Scene) -> list[tuple[int, int, int, np.ndarray, int]]:
-    """Degrees of freedom: node, node whose frame fixes the axis, edge or -1, axis in the world if no edge, and place
-    among the node's hinges.
-    """
+    """Degrees of freedom: node, node that fixes the axis, edge or -1, else an axis in the world, index of the hinge."""
     model, joints = scene.model, scene.joint_anchors
     frames, _ = joint_axes(scene)
     dofs: list[tuple[int, int, int, np.ndarray, int]] = []

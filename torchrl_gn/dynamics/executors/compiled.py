@@ -49,26 +49,8 @@ class CompiledExecutor:
 
     def _load(self, program: StepProgram) -> None:
         self.program = program
-
-        if program.recurrent is None:
-
-            def step(state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-                return (eager.step(program, state, action, None)[0],)
-
-            def pull(state: Tensor, action: Tensor, *gradients: Tensor) -> tuple[Tensor, ...]:
-                return torch.func.vjp(step, state, action)[1](gradients)
-        else:
-
-            def step(state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor):
-                hidden = Graph(nodes, edges, globals_, program.edge_index)
-                after, hidden = eager.step(program, state, action, hidden)
-                assert hidden is not None
-                return after, hidden.nodes, hidden.edges, hidden.globals_
-
-            def pull(state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor, *gradients: Tensor):
-                return torch.func.vjp(step, state, action, nodes, edges, globals_)[1](gradients)
-
-        self.run, self.pull = _compile(step), _compile(pull)
+        run, pull = _functions(program) if program.recurrent is None else _recurrent_functions(program)
+        self.run, self.pull = _compile(run), _compile(pull)
 
     def update(self, program: StepProgram) -> None:
         """Take another program: without compiling again if only its numbers differ."""
@@ -87,15 +69,43 @@ class CompiledExecutor:
             after, *rest = _Differentiable.apply(self, *inputs)
         else:
             after, *rest = detached(self.run, *inputs)
-        return after, Graph(*rest, self.program.edge_index) if rest else None
+        return after, Graph(rest[0], rest[1], rest[2], self.program.edge_index) if rest else None
 
     def _start(self, state: Tensor) -> Graph:
         assert self.program.recurrent is not None
         size, edges = self.program.recurrent.hidden_size, self.program.edge_index.shape[1]
         *batch, count, _ = state.shape
         shapes = ((*batch, count, size.nodes), (*batch, edges, size.edges), (*batch, size.globals_))
-        parts = (state.new_zeros(shape, dtype=self.program.dtype) for shape in shapes)
-        return Graph(*parts, self.program.edge_index)
+        nodes, edge_features, globals_ = (state.new_zeros(shape, dtype=self.program.dtype) for shape in shapes)
+        return Graph(nodes, edge_features, globals_, self.program.edge_index)
+
+
+def _functions(program: StepProgram) -> tuple[Callable, Callable]:
+    """The step, and its gradient pulled back."""
+
+    def run(state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+        return (eager.step(program, state, action, None)[0],)
+
+    def pull(state: Tensor, action: Tensor, *gradients: Tensor) -> tuple[Tensor, ...]:
+        return torch.func.vjp(run, state, action)[1](gradients)
+
+    return run, pull
+
+
+def _recurrent_functions(program: StepProgram) -> tuple[Callable, Callable]:
+    """As :func:`_functions`, of state and hidden state."""
+
+    def run(state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor) -> tuple[Tensor, ...]:
+        after, hidden = eager.step(program, state, action, Graph(nodes, edges, globals_, program.edge_index))
+        assert hidden is not None
+        return after, hidden.nodes, hidden.edges, hidden.globals_
+
+    def pull(
+        state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor, *gradients: Tensor
+    ) -> tuple[Tensor, ...]:
+        return torch.func.vjp(run, state, action, nodes, edges, globals_)[1](gradients)
+
+    return run, pull
 
 
 def detached(function: Callable, *inputs: Tensor) -> Any:

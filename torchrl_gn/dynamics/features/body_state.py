@@ -53,7 +53,8 @@ class _Bound(Float64Buffers):
         self, options: BodyState, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer
     ) -> None:
         super().__init__()
-        self.layout, self.encoding = layout, options.encoding
+        self.layout = layout
+        self.encoding: Encoding = options.encoding
         invariant = torch.as_tensor(scene.translation_invariant)
         # In a scene that rotates about an axis, both others must be invariant to be hidden at every yaw.
         yaw = canonicalizer.yaw_frame

@@ -100,7 +100,7 @@ class BoundCanonicalizer(Float64Buffers):
     def forward(self, state: Tensor, parameters: PhysicalParameters) -> CanonicalState:
         """Canonical state of ``[*B, N, 13]``: recentred, then rotated to yaw 0.
 
-        The world node keeps its frame; where bodies can touch the world, it rotates with the scene and so shows the yaw.
+        The world node keeps its frame; if bodies can touch the world, it rotates with the scene and shows the yaw.
         """
         state, rotation = self.recentered(state), self.yaw_rotation(state, parameters)
         if self.yaw_frame is not None and rotation is not None:

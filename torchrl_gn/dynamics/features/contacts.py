@@ -23,9 +23,9 @@ _NEAR = 0.02  # metres: up to this distance from the plane the fine feature vari
 
 @dataclass(frozen=True)
 class Contacts(Feature):
-    """Distances and velocities of the points that can touch the scene's plane
-    (:attr:`Scene.contact_points <torchrl_gn.scenes.Scene>`).
+    """Distances and velocities of the points that can touch the scene's plane.
 
+    The points are :attr:`Scene.contact_points <torchrl_gn.scenes.Scene>`.
     A contact force sets in within millimetres of a body that moves metres; the network need not compute the distance.
     Paper: it sees positions and rotations alone.
     """

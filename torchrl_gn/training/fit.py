@@ -1,0 +1,141 @@
+"""Train a forward model in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from tqdm import tqdm
+
+from torchrl_gn.data import trajectory_buffer
+from torchrl_gn.dynamics import Predictor
+from torchrl_gn.evaluation import evaluate_errors
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.optimizers import Preset, ScheduledOptimizer, make_optimizer
+from torchrl_gn.training.trainer import Trainer
+
+Optimizer = Preset | Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
+
+_NORMALIZER_SAMPLES = 5000
+
+
+@dataclass
+class History:
+    """Course of a training.
+
+    Attributes:
+        steps: number of each recorded step.
+        seconds: training time at each recorded step.
+        losses: mean loss since the last recorded step.
+        validations: ``(step, error)`` of every validation.
+    """
+
+    steps: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+    validations: list[tuple[int, float]] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        if not self.steps:
+            return "no step"
+        text = (
+            f"{self.steps[-1]:,} steps in {self.seconds[-1]:.0f} s, loss {self.losses[0]:.2e} to {self.losses[-1]:.2e}"
+        )
+        best = min((error for _, error in self.validations), default=None)
+        return text if best is None else f"{text}, best validation error {best:.2e}"
+
+
+def fit(
+    model: Predictor,
+    trajectories: TensorDictBase,
+    *,
+    minutes: float | None = None,
+    steps: int | None = None,
+    validation: TensorDictBase | None = None,
+    optimizer: Optimizer = "muon",
+    lr: float | None = None,
+    batch_size: int = 200,
+    noise: float = 0.0,
+    seed: int = 0,
+    progress: bool = True,
+) -> History:
+    """Train a forward model on the trajectories of its scene.
+
+    Fits the normalisers if they have seen no data, then minimises the one-step
+    :class:`~torchrl_gn.objectives.ForwardModelLoss`. For windows, several scenes, checkpoints and several processes
+    put :class:`Trainer` and the losses together yourself, as ``recipes/forward_model.py`` does.
+
+    Args:
+        model: forward model bound to the scene; its weights are trained in place.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``, see
+            :func:`~torchrl_gn.data.collect_trajectories`.
+        minutes: training time; default: one, if ``steps`` is not given.
+        steps: number of optimiser steps.
+        validation: ``[M]`` trajectories; the weights with the lowest 20-step error on them are kept.
+        optimizer: a preset (:func:`make_optimizer`), or a function from parameters to an optimiser of ``torch.optim``,
+            for example ``lambda weights: torch.optim.AdamW(weights, lr=1e-3)``.
+        lr: peak learning rate, instead of the preset's.
+        batch_size: transitions of a step.
+        noise: standard deviation of the input noise, in standard deviations of each component.
+        seed: seed of batches and noise. Weights are made before, with torch's global generator.
+        progress: whether to show a progress bar.
+
+    Returns:
+        Loss and time of the steps, and validation errors.
+
+    Raises:
+        FloatingPointError: if the loss or the gradient is not finite; no weight changes at that step.
+        TypeError: for a specialised predictor, which passes no gradient to the weights.
+        ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit.
+    """
+    if minutes is None and steps is None:
+        minutes = 1.0
+    budget = Budget(steps=steps, minutes=minutes)
+    loss = ForwardModelLoss(model, noise=noise, generator=torch.Generator().manual_seed(seed))
+    buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
+    transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()
+    transitions = transitions.to(model.movable.device)
+    if model.model.fitted:
+        loss.fit_scales(transitions)
+    else:
+        loss.fit_normalizers(transitions)
+
+    def validate() -> float:
+        assert validation is not None
+        return evaluate_errors(model, validation, horizons=(20,), one_step=False).errors["rollout_error_20"].total
+
+    trainer = Trainer(
+        loss,
+        buffer,
+        _make_optimizer(model.model.core, optimizer, lr),
+        budget,
+        validate=None if validation is None else validate,
+    )
+    history, recent = History(), []
+    with tqdm(total=100, desc=f"training on {model.scene.name}", unit="%", disable=not progress, leave=False) as bar:
+        for now in trainer.run():
+            recent.append(now.loss)
+            if now.validation is not None:
+                history.validations.append((now.step, now.validation))
+            # 100 points, for any budget.
+            if now.fraction >= 1 or now.fraction * 100 >= len(history.steps) + 1:
+                history.steps.append(now.step)
+                history.seconds.append(now.seconds)
+                history.losses.append(sum(recent) / len(recent))
+                recent.clear()
+                bar.set_postfix(step=now.step, loss=f"{history.losses[-1]:.1e}", refresh=False)
+                bar.update(round(min(100 * now.fraction, 100)) - bar.n)
+    trainer.restore_best()
+    return history
+
+
+def _make_optimizer(module: nn.Module, optimizer: Optimizer, lr: float | None) -> ScheduledOptimizer:
+    if not callable(optimizer):
+        return make_optimizer(module, optimizer, lr=lr)
+    if lr is not None:
+        raise ValueError(f"lr={lr} is for presets; give {optimizer} its learning rate yourself.")
+    return ScheduledOptimizer.of(optimizer(module.parameters()))
