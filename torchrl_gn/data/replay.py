@@ -30,8 +30,8 @@ def trajectory_buffer(
     Draws (trajectory, start time) uniformly with replacement. ``sample()`` gives a TensorDict ``[batch_size]``, or
     ``[batch_size, window]`` for windows longer than one, of ``state`` ``[..., N, 13]``, ``action`` ``[..., A]``,
     ``("next", "state")`` ``[..., N, 13]``, ``index`` ``[..., 2]`` (trajectory, time) and the trajectory's
-    ``parameters``. ``buffer[i]`` gives whole trajectories. ``state_dict()`` holds the random state, and with ``capacity`` the
-    trajectories.
+    ``parameters``. ``buffer[i]`` gives whole trajectories. ``state_dict()`` holds the random state, and the
+    trajectories with ``capacity``.
 
     Args:
         trajectories: ``[M]`` of ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and optionally ``parameters`` (a

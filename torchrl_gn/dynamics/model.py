@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 from tensordict.utils import NestedKey
 from torch import nn
@@ -97,9 +97,9 @@ class ForwardModel(nn.Module):
         # The network's output has the residual's scale; errors are weighted by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
-        kind: Callable[..., Core] = core_class(core)
-        fixed = {"counts": counts} if core_class(core).fixed_size else {}
-        self.core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
+        kind = cast(Any, core_class(core))
+        fixed = {"counts": counts} if kind.fixed_size else {}
+        self.core: Core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
 
     @classmethod
     def for_scene(

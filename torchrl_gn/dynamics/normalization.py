@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.dynamics.checks import check_shapes
 from torchrl_gn.dynamics.executors import eager
-from torchrl_gn.dynamics.shapes import check_shapes
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.networks.graph import Graph

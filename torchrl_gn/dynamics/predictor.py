@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
+from torchrl_gn.dynamics.checks import check_scene, check_shapes
 from torchrl_gn.dynamics.constraints import make_projection
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.eager import EagerExecutor
@@ -19,7 +20,6 @@ from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.normalization import in_range, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.program import InputScaling, OutputScaling, StepProgram
-from torchrl_gn.dynamics.shapes import check_shapes
 from torchrl_gn.dynamics.unseen_parameters import warn_of_unseen
 from torchrl_gn.networks.core import UnfoldedCore
 from torchrl_gn.networks.graph import Graph
@@ -32,19 +32,16 @@ if TYPE_CHECKING:
 
 
 class Predictor(TensorDictModuleBase):
-    """Predict the next state of one scene with a forward model's shared weights.
+    """Predict the next state of one scene with a forward model's shared weights; made by :meth:`ForwardModel.bind`.
 
-    Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes ``("next", "state")`` in the dtype of ``state``.
-    The network sees recentred, normalised values in its own dtype, so float64 states keep their precision with a
-    float32 network. Differentiable in states, actions and weights. Made by :meth:`ForwardModel.bind`.
+    Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes ``("next", "state")`` in the dtype of ``state``;
+    the network sees recentred, normalised values in its own dtype. Differentiable in states, actions and weights.
 
-    With a ``parameters_key`` each sample may be another variant of the scene: the module then also reads a TensorDict
-    of the entries of :class:`~torchrl_gn.scenes.PhysicalParameters` there, as :meth:`parameters_of` gives them or an
-    inference model writes them. Without one, samples with other parameters are refused. A model with
-    ``parameters="none"`` or ``"inferred"`` never reads a sample's true parameters.
-
-    A recurrent model also reads ``hidden_state``, a TensorDict ``[*B]`` of ``nodes``, ``edges`` and ``globals_``, and
-    writes ``("next", "hidden_state")``; without one it starts from the initial hidden state.
+    With a ``parameters_key`` each sample may be another variant of the scene: reads a TensorDict of the entries of
+    :class:`~torchrl_gn.scenes.PhysicalParameters` there, from :meth:`parameters_of` or an inference model. Without one,
+    samples with other parameters are refused. A model with ``parameters="none"`` or ``"inferred"`` never reads true
+    parameters. A recurrent model also reads ``hidden_state``, a TensorDict ``[*B]`` of ``nodes``, ``edges`` and
+    ``globals_``, by default the initial one, and writes ``("next", "hidden_state")``.
 
     Args:
         model: the shared weights.
@@ -57,8 +54,8 @@ class Predictor(TensorDictModuleBase):
         parameter_names: names of the parameters that samples bring there; None: all that the scene has.
 
     Raises:
-        ValueError: if the scene lacks parameters that the model reads, has another size than its core reads, or is a
-            variant whose parameters must be hidden from the model; or with ``strict``.
+        ValueError: if the scene lacks parameters that the model reads, its graph has another size than the core reads,
+            or it is a variant whose parameters must be hidden from the model; or with ``strict``.
     """
 
     model: ForwardModel
@@ -82,7 +79,7 @@ class Predictor(TensorDictModuleBase):
         parameters_keys = [] if parameters_key is None else [parameters_key]
         self.in_keys: list[NestedKey] = [state_key, action_key, *parameters_keys, *hidden_keys]
         self.out_keys: list[NestedKey] = [unravel_key(("next", key)) for key in (state_key, *hidden_keys)]
-        _check_scene(model, scene)
+        check_scene(model, scene)
         self.model, self.scene, self.layout = model, scene, model.layout
         self.strict, self.reference = strict, reference
 
@@ -116,7 +113,7 @@ class Predictor(TensorDictModuleBase):
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the network."""
-        # Not of parameters(): under TorchRL's losses weights may be plain tensors.
+        # Not parameters(): under TorchRL's losses weights may be plain tensors.
         return next(each.weight for each in self.model.core.modules() if isinstance(each, nn.Linear)).dtype
 
     @property
@@ -129,9 +126,7 @@ class Predictor(TensorDictModuleBase):
         return self.parameter_reader.entries()
 
     def parameters_of(self, scene: Scene) -> TensorDict:
-        """Physical parameters of a variant of this scene, to give samples at the ``parameters_key``.
-
-        Stack those of several variants for a batch.
+        """Physical parameters of a variant of this scene, for the ``parameters_key``; stack several for a batch.
 
         Raises:
             ValueError: if it is another scene (other bodies, joints, motors or control step); with ``strict`` as
@@ -251,19 +246,9 @@ class Predictor(TensorDictModuleBase):
         parameters: TensorDictBase | None = None,
         hidden_state: TensorDictBase | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
-        """States from a start state under a sequence of actions.
+        """States ``[*B, T + 1, N, 13]`` from a start state under actions ``[*B, T, A]``, and the last hidden state.
 
-        Args:
-            state: ``[*B, N, 13]`` start states.
-            actions: ``[*B, T, A]``; ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``.
-            parameters: physical parameters of each rollout, or without batch; default: the scene's.
-            hidden_state: ``[*B]`` hidden state of a recurrent model before the start; default: the initial one.
-
-        Returns:
-            ``[*B, T + 1, N, 13]``, the first being the start state, and the hidden state at the end.
-
-        Raises:
-            ValueError: if a shape does not fit the scene.
+        ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``; the first state is the start. See :meth:`step`.
         """
         for action in actions.unbind(-2)[:1]:
             check_shapes(self.scene, state, action, parameters)
@@ -276,15 +261,7 @@ class Predictor(TensorDictModuleBase):
     def teacher_forced(
         self, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDict | None]:
-        """Predict each next state from true states; a recurrent model's hidden state runs through them.
-
-        Args:
-            states: ``[*B, T, N, 13]``.
-            actions: ``[*B, T, A]``.
-            parameters: physical parameters of each sequence, or without batch; default: the scene's.
-
-        Returns:
-            ``[*B, T, N, 13]`` states after each of them, and the hidden state after the last.
+        """States ``[*B, T, N, 13]`` after each of the true ``states``, and the hidden state that ran through them.
 
         Raises:
             ValueError: if there is no state, or a shape does not fit the scene.
@@ -320,17 +297,3 @@ class Predictor(TensorDictModuleBase):
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"
-
-
-def _check_scene(model: ForwardModel, scene: Scene) -> None:
-    counts = model.core.counts
-    if counts is not None and counts != (scene.num_nodes, scene.num_edges):
-        raise ValueError(
-            f"The model reads graphs of {counts[0]} nodes and {counts[1]} edges alone; scene {scene.name!r} has"
-            f" {scene.num_nodes} and {scene.num_edges}. Train another, or a graph network."
-        )
-    if model.parameter_source != "scene" and "parameters" in getattr(scene, "origin", ()):
-        raise ValueError(
-            f"The model must not see true parameters (parameters={model.parameter_source!r}), and {scene.name!r} is a"
-            " variant, whose joint anchors would show its lengths. Bind the model to the standard scene."
-        )

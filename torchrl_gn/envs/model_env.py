@@ -14,7 +14,8 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.dynamics import as_predictor
+from torchrl_gn.dynamics import Predictor, as_predictor
+from torchrl_gn.dynamics.as_predictor import ModulePredictor
 from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, reward_of, set_specs, step_reward
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.finite import require_finite
@@ -106,6 +107,11 @@ class ModelEnv(ModelBasedEnvBase):
         return Composite(specs, device=self.device)
 
     @property
+    def predictor(self) -> Predictor | ModulePredictor:
+        """The model, with the methods of a predictor."""
+        return as_predictor(cast(TensorDictModuleBase, self.world_model))
+
+    @property
     def _parameters_key(self) -> NestedKey | None:
         return getattr(self.world_model, "parameters_key", None)
 
@@ -185,7 +191,7 @@ class ModelEnv(ModelBasedEnvBase):
                 f" {list(tensordict.shape)} and H at least 1, got {list(actions.shape)}"
             )
         state = read(tensordict, "state", self._state_shape, self)
-        model = as_predictor(cast(TensorDictModuleBase, self.world_model))
+        model = self.predictor
         inputs = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
         states, _ = model.rollout(state, actions, *inputs)  # pyright: ignore[reportArgumentType]
         task = cast("Tensor | None", tensordict.get("task", None))

@@ -38,7 +38,7 @@ class GNBlock(MessagePassing):
         edge_hidden: hidden sizes of the edge MLP.
         node_hidden: hidden sizes of the node MLP.
         global_hidden: hidden sizes of the global MLP.
-        activation: ``"relu"`` (paper), ``"silu"``, ``"gelu"`` or ``"tanh"``.
+        activation: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
         pool: what the globals see of all nodes and edges: their ``"sum"`` (paper) or their ``"mean"``, which does not
             grow with the graph.
 
@@ -54,7 +54,7 @@ class GNBlock(MessagePassing):
         edge_hidden: Sequence[int] = (128, 128),
         node_hidden: Sequence[int] = (128, 128),
         global_hidden: Sequence[int] = (128, 128),
-        activation: str = "relu",
+        activation: str = "silu",
         pool: Pool = "sum",
     ) -> None:
         super().__init__(aggr="sum", node_dim=-2)
@@ -68,15 +68,16 @@ class GNBlock(MessagePassing):
         self.node_mlp = _mlp(g + n + edges, node_hidden, out_size.nodes, activation)
         self.global_mlp = _mlp(g + nodes + edges, global_hidden, out_size.globals_, activation)
 
+    def _set_jittable_templates(self, raise_on_error: bool = False) -> None:
+        """Keep PyG's own methods: those it generates for TorchScript leave files in the temporary folder."""
+
     def forward(self, graph: Graph) -> Graph:
         """``[*B, N, F]``, ``[*B, E, F]``, ``[*B, F]`` features in, the same shapes out."""
         nodes, edges, globals_, edge_index = graph.nodes, graph.edges, graph.globals_, graph.edge_index
         num_nodes = nodes.shape[-2]
         if self.edge_mlp is not None:
-            # edge_updater_type: (nodes: Tensor, edges: Tensor, globals_: Tensor)
             edges = self.edge_updater(edge_index, nodes=nodes, edges=edges, globals_=globals_)
         if self.node_mlp is not None:
-            # propagate_type: (edges: Tensor)
             received = self.propagate(edge_index, edges=edges, size=(num_nodes, num_nodes))
             nodes = self.node_mlp(torch.cat((_per_item(globals_, num_nodes), nodes, received), dim=-1))
         if self.global_mlp is not None:

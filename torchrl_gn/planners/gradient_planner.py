@@ -10,13 +10,11 @@ from typing import cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
 from torchrl_gn.data.controls import numpy_generator, spline_controls
-from torchrl_gn.dynamics import as_predictor
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
@@ -116,10 +114,6 @@ class GradientPlanner(RecedingHorizonPlanner):
         return cast(ModelEnv, self.env)
 
     @property
-    def _model(self):
-        return as_predictor(cast(TensorDictModuleBase, self.imagined.world_model))
-
-    @property
     def plan_shape(self) -> tuple[int, int, int]:
         """Shape of a sample's plan: candidates, horizon, actions."""
         return self.candidates, self.horizon, self.imagined.scene.num_actions
@@ -196,7 +190,7 @@ class GradientPlanner(RecedingHorizonPlanner):
 
     def _entries(self, flat: TensorDictBase) -> TensorDictBase:
         """Entries that a rollout reads, detached."""
-        self._model.parameters_in(flat)  # refuses other variants, which the entries below no longer show
+        self.imagined.predictor.parameters_in(flat)  # refuses other variants, which the entries below no longer show
         keys = [key for key in (*self.imagined.world_model.in_keys, "task") if key != "action"]
         read = flat.select(*keys, strict=False).detach()
         # Autograd refuses tensors made in inference mode: clone them.
@@ -219,7 +213,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         drawn = self._splines(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
         # A compiled model recompiles, in minutes, for every number of rows: use the later one.
-        size = self.candidates if self._model.fixed_batch else self.samples
+        size = self.candidates if self.imagined.predictor.fixed_batch else self.samples
         drawn = drawn[:, : self.samples // size * size]
         starts = _repeated(entries, size)
         with torch.no_grad():
