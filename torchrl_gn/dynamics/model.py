@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_gn.dynamics.features import FEATURES, BodyState, Canonicalizer, Contacts, Controls, Feature, JointAxes
+from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
 from torchrl_gn.networks.core import Core
 from torchrl_gn.networks.cores import core_class
 from torchrl_gn.networks.graph import GraphSize
 from torchrl_gn.scenes import KinematicTree, ParameterNames, PhysicalParameters, Scene
-
-if TYPE_CHECKING:
-    from torchrl_gn.dynamics.predictor import Predictor
 
 ParameterSource = Literal["none", "scene", "inferred"]
 
@@ -191,8 +189,6 @@ class ForwardModel(nn.Module):
         Raises:
             ValueError: if the scene, or what samples bring, lacks parameters that the model reads; or with ``strict``.
         """
-        from torchrl_gn.dynamics.predictor import Predictor
-
         options = {"parameters_key": parameters_key, "parameter_names": parameter_names}
         return Predictor(self, scene, strict=strict, reference=reference, **options)
 

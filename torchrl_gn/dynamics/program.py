@@ -19,17 +19,11 @@ from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 
 class InputScaling(NamedTuple):
-    """How a part of the graph enters the network: columns, less mean, times scale.
+    """How a part of the graph enters the network: columns, less mean, times scale."""
 
-    Attributes:
-        columns: ``[F']`` columns that are read; None: all.
-        mean: ``[F']`` float64.
-        scale: ``[F']`` float64; None: folded into the core.
-    """
-
-    columns: Tensor | None
-    mean: Tensor
-    scale: Tensor | None
+    columns: Tensor | None  # [F'] columns that are read; None: all
+    mean: Tensor  # [F'] float64
+    scale: Tensor | None  # [F'] float64; None: folded into the core
 
     @classmethod
     def of(cls, normalizer: Normalizer) -> InputScaling:
@@ -90,46 +84,26 @@ class StepProgram:
 
     Made by :meth:`Predictor.program` and run by the executors in :mod:`~torchrl_gn.dynamics.executors`. Constants of
     the scene are modules with buffers; a program of a specialised predictor shares no memory with the weights.
-
-    Attributes:
-        layout: channels of the state.
-        timestep: control step, seconds; None: the whole change is predicted.
-        movable: ``[N, 12]`` movable-component mask.
-        edge_index: ``[2, E]``.
-        parameters: physical parameters of the scene, or of each sample.
-        canonicalizer: to the canonical state and back.
-        controls: actions to edges.
-        node_features: modules from :class:`StepInputs` to node features.
-        edge_features: modules to edge features.
-        nodes: scaling of the node features.
-        edges: scaling of the edge features.
-        recurrent: core whose hidden state is updated; None of a feed-forward model.
-        static: normalised static graph, which the hidden state reads.
-        core: the folded network.
-        output: scaling of its output.
-        projection: onto the joint constraints; None without.
-        change_std: ``[12]`` standard deviations of a change, weights of the projection.
-        dtype: of the network.
     """
 
-    layout: StateLayout
-    timestep: float | None
-    movable: Tensor
-    edge_index: Tensor
-    parameters: PhysicalParameters
-    canonicalizer: BoundCanonicalizer
-    controls: ControlInputs
-    node_features: nn.ModuleList
-    edge_features: nn.ModuleList
-    nodes: InputScaling
-    edges: InputScaling
-    recurrent: Core | None
-    static: Graph | None
-    core: FoldedCore
-    output: OutputScaling
-    projection: MaximalProjection | None
-    change_std: Tensor
-    dtype: torch.dtype
+    layout: StateLayout  # channels of the state
+    timestep: float | None  # control step, seconds; None: the whole change is predicted
+    movable: Tensor  # [N, 12] movable-component mask
+    edge_index: Tensor  # [2, E]
+    parameters: PhysicalParameters  # physical parameters of the scene, or of each sample
+    canonicalizer: BoundCanonicalizer  # to the canonical state and back
+    controls: ControlInputs  # actions to edges
+    node_features: nn.ModuleList  # modules from StepInputs to node features
+    edge_features: nn.ModuleList  # modules to edge features
+    nodes: InputScaling  # scaling of the node features
+    edges: InputScaling  # scaling of the edge features
+    recurrent: Core | None  # core whose hidden state is updated; None of a feed-forward model
+    static: Graph | None  # normalised static graph, which the hidden state reads
+    core: FoldedCore  # the folded network
+    output: OutputScaling  # scaling of its output
+    projection: MaximalProjection | None  # onto the joint constraints; None without
+    change_std: Tensor  # [12] standard deviations of a change, weights of the projection
+    dtype: torch.dtype  # of the network
 
 
 def _runs(rows: list[int], size: int) -> tuple[tuple[bool, slice], ...]:

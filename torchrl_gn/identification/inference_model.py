@@ -20,19 +20,12 @@ from torchrl_gn.scenes import Scene
 
 
 class Context(NamedTuple):
-    """What is kept of the observations so far.
+    """What is kept of the observations so far."""
 
-    Attributes:
-        hidden: hidden graph of the network.
-        estimate: static graph estimated so far.
-        count: number of observations.
-        anchors: ``[*B, N, 7, 7]`` normal equations of the anchor offsets; None without constraint projection.
-    """
-
-    hidden: Graph
-    estimate: Graph
-    count: int
-    anchors: Tensor | None
+    hidden: Graph  # hidden graph of the network
+    estimate: Graph  # static graph estimated so far
+    count: int  # number of observations
+    anchors: Tensor | None  # [*B, N, 7, 7] normal equations of the anchor offsets; None without constraint projection
 
 
 class Estimate(NamedTuple):

@@ -96,15 +96,10 @@ def layer_sizes(hidden: int | Sequence[int], layers: int) -> list[int]:
 
 @dataclass(frozen=True)
 class UnfoldedCore:
-    """A core evaluated by message passing, edge by edge: the reference for every folded core.
+    """A core evaluated by message passing, edge by edge: the reference for every folded core."""
 
-    Attributes:
-        core: the core.
-        static: normalised static graph.
-    """
-
-    core: Core
-    static: Graph
+    core: Core  # the core
+    static: Graph  # normalised static graph
 
     def predict(self, dynamic: Graph) -> Tensor:
         """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``."""

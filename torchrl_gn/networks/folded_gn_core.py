@@ -30,68 +30,36 @@ _CACHED = 2**20  # numbers of activations that a processor's cache holds
 
 @dataclass(frozen=True)
 class Factors:
-    """First layer of an MLP by its inputs, and the hidden layers after it.
+    """First layer of an MLP by its inputs, and the hidden layers after it."""
 
-    Attributes:
-        weights: ``[h, F_k]`` for every input ``k``.
-        table: ``[I, 1, h]``, what every sample has in common; ``[I, B, h]`` with static features
-            of their own for every sample.
-        hidden: weight ``[h', h]`` and bias ``[h']`` of each further hidden layer.
-    """
-
-    weights: tuple[Tensor, ...]
-    table: Tensor
-    hidden: tuple[tuple[Tensor, Tensor], ...]
+    weights: tuple[Tensor, ...]  # [h, F_k] for every input k
+    table: Tensor  # [I, 1 or B, h], static features and biases
+    hidden: tuple[tuple[Tensor, Tensor], ...]  # weight [h', h] and bias [h'] of each further layer
 
 
 @dataclass(frozen=True)
 class FoldedGNCore:
-    """A core for one scene, ready to be multiplied; made by :func:`fold_gn_core`.
+    """A core for one scene, ready to be multiplied; made by :func:`fold_gn_core`."""
 
-    Attributes:
-        ends, reduce, gather, reduce_last: matrices of the :class:`~torchrl_gn.networks.incidence.Incidence`.
-        kept: edges that lead to a predicted node.
-        predicted: nodes that are predicted.
-        first_edge: inputs: ends and edge, globals.
-        first_node: inputs: received hidden, node, globals.
-        first_global: inputs: summed node hidden, summed edge hidden, globals.
-        second_edge: inputs: first edge hidden, ends and edge.
-        second_ends: ``[h, h_n]`` twice: node hidden as sender and as receiver.
-        second_globals: ``[h, h_g]`` and ``[h, F_g]``: global hidden and globals, into edges.
-        second_node: inputs: received hidden, node, first node hidden.
-        last_globals: as ``second_globals``, into nodes.
-        out: weight ``[F_out, h]`` and bias ``[F_out]``.
-        activation: after every hidden layer.
-    """
-
-    ends: Tensor
+    ends: Tensor  # the first four are matrices of Incidence
     reduce: Tensor
     gather: Tensor
     reduce_last: Tensor
-    kept: Rows
-    predicted: Rows
-    first_edge: Factors
-    first_node: Factors
-    first_global: Factors
-    second_edge: Factors
-    second_ends: tuple[Tensor, Tensor]
-    second_globals: tuple[Tensor, Tensor]
-    second_node: Factors
-    last_globals: tuple[Tensor, Tensor]
-    out: tuple[Tensor, Tensor]
+    kept: Rows  # edges that lead to a predicted node
+    predicted: Rows  # nodes
+    first_edge: Factors  # of ends and edge, globals
+    first_node: Factors  # of received hidden, node, globals
+    first_global: Factors  # of summed node hidden, summed edge hidden, globals
+    second_edge: Factors  # of first edge hidden, ends and edge
+    second_ends: tuple[Tensor, Tensor]  # [h, h_n] twice: node hidden as sender and as receiver
+    second_globals: tuple[Tensor, Tensor]  # [h, h_g] and [h, F_g]: global hidden and globals, into edges
+    second_node: Factors  # of received hidden, node, first node hidden
+    last_globals: tuple[Tensor, Tensor]  # as second_globals, into nodes
+    out: tuple[Tensor, Tensor]  # weight [F_out, h] and bias [F_out]
     activation: str
 
     def __call__(self, nodes: Tensor, edges: Tensor, globals_: Tensor) -> Tensor:
-        """Output of the predicted nodes.
-
-        Args:
-            nodes: ``[N, B, F_n]`` normalised dynamic features.
-            edges: ``[E, B, F_e]``.
-            globals_: ``[1, B, F_g]``.
-
-        Returns:
-            ``[P, B, F_out]``.
-        """
+        """Predicted nodes ``[P, B, F_out]`` of dynamic features ``[N, B, F_n]``, ``[E, B, F_e]``, ``[1, B, F_g]``."""
         count_n, count_e = nodes.shape[0], edges.shape[0]
         ends = torch.cat((*product(self.ends, nodes).split((count_e, count_e)), edges), dim=-1)
         everywhere = globals_.expand(count_e, -1, -1)

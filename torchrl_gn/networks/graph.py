@@ -24,19 +24,12 @@ class GraphSize:
 
 @dataclass(frozen=True)
 class Graph:
-    """Graphs ``G = (g, {n_i}, {e_j, s_j, r_j})`` that share one topology (paper, "Model").
+    """Graphs ``G = (g, {n_i}, {e_j, s_j, r_j})`` that share one topology (paper, "Model")."""
 
-    Attributes:
-        nodes: ``[*B, N, F_n]``.
-        edges: ``[*B, E, F_e]``.
-        globals_: ``[*B, F_g]``.
-        edge_index: ``[2, E]`` int64, senders above receivers, as in PyG.
-    """
-
-    nodes: Tensor
-    edges: Tensor
-    globals_: Tensor
-    edge_index: Tensor
+    nodes: Tensor  # [*B, N, F_n]
+    edges: Tensor  # [*B, E, F_e]
+    globals_: Tensor  # [*B, F_g]
+    edge_index: Tensor  # [2, E] int64, senders above receivers, as in PyG
 
     def tensordict(self) -> TensorDict:
         """Its features as entries of a TensorDict ``[*B]``."""

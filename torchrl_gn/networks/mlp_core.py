@@ -103,25 +103,15 @@ class MLPCore(Core):
 
 @dataclass(frozen=True)
 class FoldedMLP:
-    """An :class:`MLPCore` for one scene, ready to be multiplied.
+    """An :class:`MLPCore` for one scene, ready to be multiplied."""
 
-    Attributes:
-        weights: ``[h, N F_n]``, ``[h, E F_e]`` and ``[h, F_g]`` for the dynamic nodes, edges and globals.
-        table: ``[h]`` or ``[*B, h]``, biases and static features.
-        hidden: weight and bias of each further hidden layer.
-        out: weight ``[P, F_out, h]`` and bias ``[P, F_out]``.
-        predicted: ``[P]`` nodes that are predicted.
-        counts: numbers of nodes and edges.
-        activation: after every hidden layer.
-    """
-
-    weights: tuple[Tensor, ...]
-    table: Tensor
-    hidden: tuple[tuple[Tensor, Tensor], ...]
-    out: tuple[Tensor, Tensor]
-    predicted: Tensor
-    counts: tuple[int, int]
-    activation: str
+    weights: tuple[Tensor, ...]  # [h, N F_n], [h, E F_e] and [h, F_g] for the dynamic nodes, edges and globals
+    table: Tensor  # [h] or [*B, h], biases and static features
+    hidden: tuple[tuple[Tensor, Tensor], ...]  # weight and bias of each further hidden layer
+    out: tuple[Tensor, Tensor]  # weight [P, F_out, h] and bias [P, F_out]
+    predicted: Tensor  # [P] nodes that are predicted
+    counts: tuple[int, int]  # numbers of nodes and edges
+    activation: str  # after every hidden layer
 
     def predict(self, dynamic: Graph) -> Tensor:
         """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, zero if not predicted."""

@@ -11,15 +11,10 @@ from torchrl_gn.networks.graph import Graph
 
 
 class Executor(Protocol):
-    """Runs one program; made from it, ``EXECUTORS[name](program)``.
+    """Runs one program; made from it, ``EXECUTORS[name](program)``."""
 
-    Attributes:
-        program: the step.
-        fixed_batch: whether another batch size costs a compilation.
-    """
-
-    program: StepProgram
-    fixed_batch: bool
+    program: StepProgram  # the step
+    fixed_batch: bool  # whether another batch size costs a compilation
 
     def update(self, program: StepProgram) -> None:
         """Take another program of the same scene."""

@@ -19,29 +19,18 @@ if TYPE_CHECKING:
 
 
 class FrameRotation(NamedTuple):
-    """Rotation from the yaw frame to the world.
+    """Rotation from the yaw frame to the world."""
 
-    Attributes:
-        quaternion: ``[*B, 4]``.
-        matrix: ``[*B, 3, 3]``.
-    """
-
-    quaternion: Tensor
-    matrix: Tensor
+    quaternion: Tensor  # [*B, 4]
+    matrix: Tensor  # [*B, 3, 3]
 
 
 class CanonicalState(NamedTuple):
-    """A state in the canonical frame.
+    """A state in the canonical frame."""
 
-    Attributes:
-        state: ``[*B, N, 13]`` recentred, at yaw 0.
-        matrices: ``[*B, N, 3, 3]`` of its orientations; None if the state has none.
-        rotation: from the yaw frame to the world; None without a yaw frame.
-    """
-
-    state: Tensor
-    matrices: Tensor | None
-    rotation: FrameRotation | None
+    state: Tensor  # [*B, N, 13] recentred, at yaw 0
+    matrices: Tensor | None  # [*B, N, 3, 3] of its orientations; None if the state has none
+    rotation: FrameRotation | None  # from the yaw frame to the world; None without a yaw frame
 
 
 @dataclass(frozen=True)

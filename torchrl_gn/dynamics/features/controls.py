@@ -19,15 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Controls(Feature):
-    """Controls that act at each edge's joint.
-
-    Attributes:
-        per_joint: most controls that act at one joint; None: as in the scene.
-    """
+    """Controls that act at each edge's joint."""
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    per_joint: int | None = None
+    per_joint: int | None = None  # most controls that act at one joint; None: as in the scene
 
     def resolved(self, scene: Scene) -> Controls:
         return self if self.per_joint is not None else replace(self, per_joint=_controls_per_joint(scene))

@@ -16,28 +16,18 @@ if TYPE_CHECKING:
 
 
 class StepInputs(NamedTuple):
-    """What features are computed from.
+    """What features are computed from."""
 
-    Attributes:
-        canonical: the canonical state.
-        controls: ``[*B, E, C]`` controls at each edge's joint, clipped to the actuators' limits.
-        parameters: physical parameters of the scene, or of each sample.
-    """
-
-    canonical: CanonicalState
-    controls: Tensor
-    parameters: PhysicalParameters
+    canonical: CanonicalState  # the canonical state
+    controls: Tensor  # [*B, E, C] controls at each edge's joint, clipped to the actuators' limits
+    parameters: PhysicalParameters  # physical parameters of the scene, or of each sample
 
 
 @dataclass(frozen=True)
 class Feature:
-    """Features of every node or edge (base class): options here, constants of a scene in what :meth:`bind` returns.
+    """Features of every node or edge (base class): options here, constants of a scene in what :meth:`bind` returns."""
 
-    Attributes:
-        part: whether nodes or edges get the features.
-    """
-
-    part: ClassVar[Literal["nodes", "edges"]]
+    part: ClassVar[Literal["nodes", "edges"]]  # whether nodes or edges get the features
 
     def resolved(self, scene: Scene) -> Feature:
         """The same feature with its open options read from a scene."""
