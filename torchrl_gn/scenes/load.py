@@ -43,10 +43,6 @@ def load_scene(
         FileNotFoundError: if the file does not exist.
         SceneError: if the MJCF is invalid or ``timestep`` does not fit.
         UnsupportedSceneError: if the graph cannot represent an element, which the message names.
-
-    Example:
-        >>> load_scene("swimmer6").timestep
-        0.02
     """
     if parameters is not None:
         return make_variant(source, parameters, timestep=timestep, name=name)
@@ -77,8 +73,7 @@ def load_scene(
 def scene_from_description(description: dict) -> Scene:
     """Rebuild the scene of a :meth:`Scene.description`.
 
-    Warns:
-        SceneChangedWarning: if its physics differ, as with another version of MuJoCo or of the model files.
+    Warns SceneChangedWarning if its physics differ, as with another version of MuJoCo or of the model files.
     """
     if "joint_chain" in description:
         # It has every attribute of a scene that models and errors read.
