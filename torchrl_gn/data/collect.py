@@ -41,7 +41,6 @@ def collect_trajectories(
 
     Args:
         scene: the scene, or variants of one, which the sequences take in turn.
-        num: number of sequences.
         steps: control steps ``T`` of each.
         split: index of an independent split; :func:`~torchrl_gn.data.create_dataset` uses 0, 1, 2.
         knot_interval: control steps between the knots of the random actions.

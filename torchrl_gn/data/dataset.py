@@ -18,7 +18,6 @@ from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.scenes.errors import SceneError
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.parameter_names import ParameterNames, take_columns
 from torchrl_gn.scenes.scene import Scene
@@ -73,11 +72,6 @@ def create_dataset(
 
     Args:
         path: folder of the data set, new, empty or begun by an equal call.
-        scene: the scene.
-        train: number of training sequences.
-        validation: number of validation sequences.
-        test: number of test sequences.
-        steps: control steps of each sequence.
         seed: not negative; splits are independent.
         variants: number of random variants that the sequences of each split take in turn, no split another's; at least
             as many as sequences: one each. Default: all are of the scene itself. The paper does not give it.
@@ -116,7 +110,7 @@ def create_dataset(
     with files.lock():
         if not files.find(request):
             features = None if variants is None else asdict(ParameterNames.of(scene))
-            described = _description(scene)
+            described = scene.description() if scene.origin else None  # made from an MjSpec
             files.create(request=request, description=described, features=features, versions=simulation_versions())
         if not files.is_complete():
             _collect_missing(files, scene, num_threads, progress, map_chunks)
@@ -127,7 +121,6 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
     """Open a finished data set.
 
     Args:
-        path: folder of the data set.
         scene: the scene it must be of; default: the one it was made with, rebuilt.
         verify: compare every file with its checksums (reads all of it once).
 
@@ -258,10 +251,3 @@ def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
         values = data["parameters", part]
         if wanted != list(range(values.shape[-1])):
             data["parameters", part] = take_columns(values, wanted)
-
-
-def _description(scene: Scene) -> dict | None:
-    try:
-        return scene.description()
-    except SceneError:  # made from an MjSpec
-        return None

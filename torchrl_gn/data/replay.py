@@ -110,8 +110,11 @@ class TrajectoryStorage(TensorStorage):
             "next": TensorDict({"state": _rows(stored.get("state"), here + 1)}, batch_size=here.shape),
         }
         parameters = stored.get("parameters", None)
-        if parameters is not None:
-            entries["parameters"] = _of_trajectory(parameters, trajectory)
+        if parameters is not None and trajectory.ndim == 1:
+            entries["parameters"] = parameters[trajectory]
+        elif parameters is not None:
+            rows = parameters[trajectory[:, 0]].unsqueeze(1)
+            entries["parameters"] = rows.expand(*trajectory.shape, *parameters.shape[1:])
         return TensorDict(entries, batch_size=here.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
@@ -194,12 +197,6 @@ def _rows(values: Tensor, row: Tensor) -> Tensor:
     else:
         picked = flat.index_select(0, row.reshape(-1).to(flat.device))
     return picked.view(*row_shape, *values.shape[2:])
-
-
-def _of_trajectory(parameters: Tensor | TensorDictBase, trajectory: Tensor) -> Tensor | TensorDictBase:
-    if trajectory.ndim == 1:
-        return parameters[trajectory]
-    return parameters[trajectory[:, 0]].unsqueeze(1).expand(*trajectory.shape, *parameters.shape[1:])
 
 
 def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:

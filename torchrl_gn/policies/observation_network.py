@@ -192,18 +192,18 @@ class _Places(Float64Buffers):
         super().__init__()
         slots, actions, self.split = graph.node_entries, graph.node_actions, graph.num_node_features
         moved = graph.moved.repeat(2)
-        there = slots >= 0
+        filled = slots >= 0
         self.incidence = Incidence(torch.as_tensor(graph.edge_index), graph.num_nodes)
         self.constants(
             {
                 "slots": torch.as_tensor(slots) % (graph.num_observations + 1),
-                "mask": there,
+                "mask": filled,
                 "actions": torch.as_tensor(actions) % (graph.num_actions + 1),
                 "globals_": graph.global_entries,
                 "moved": moved,
-                "node_mask": there[:, : self.split],
+                "node_mask": filled[:, : self.split],
                 "edge_mask": torch.cat(
-                    [torch.as_tensor(part) for part in (there[moved, self.split :], actions[moved] >= 0)], dim=1
+                    [torch.as_tensor(part) for part in (filled[moved, self.split :], actions[moved] >= 0)], dim=1
                 ),
             }
         )

@@ -11,7 +11,7 @@ from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.rewards.reward import Reward
 from torchrl_gn.scenes.scene import Scene
 
-_THERE = 1e-9  # metres
+_REACHED = 1e-9  # metres
 
 
 class Reach(Reward):
@@ -39,11 +39,11 @@ class Reach(Reward):
         to_target = (location - self.bodies.position(state).squeeze(-2))[..., :2]
         # Divide by the largest entry first, so that squares neither overflow nor vanish.
         largest = to_target.abs().amax(-1, keepdim=True)
-        there = largest < _THERE
+        reached = largest < _REACHED
         scaled = torch.where(
-            there, torch.ones_like(to_target), to_target / torch.where(there, torch.ones_like(largest), largest)
+            reached, torch.ones_like(to_target), to_target / torch.where(reached, torch.ones_like(largest), largest)
         )
-        direction = torch.where(there, torch.zeros_like(to_target), scaled / scaled.norm(dim=-1, keepdim=True))
+        direction = torch.where(reached, torch.zeros_like(to_target), scaled / scaled.norm(dim=-1, keepdim=True))
         return torch.cat((direction, torch.zeros_like(largest)), dim=-1)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:

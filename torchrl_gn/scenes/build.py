@@ -35,7 +35,6 @@ def build_scene(
 
     Args:
         spec: the MJCF model, left as it is.
-        name: name of the scene.
         timestep: control step, seconds, a multiple of the physics step; None: one physics step.
         settle_steps: physics steps without control after a reset.
         origin: source of the model, part of :meth:`Scene.description`.

@@ -79,11 +79,8 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
     for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
         gain = gains(model.actuator_gaintype[actuator])
         bias = biases(model.actuator_biastype[actuator])
-        if gain not in (gains.mjGAIN_FIXED, gains.mjGAIN_AFFINE):
-            return True
-        if bias not in (biases.mjBIAS_NONE, biases.mjBIAS_AFFINE):
-            return True
-        if gain == gains.mjGAIN_AFFINE and model.actuator_gainprm[actuator, 1]:
+        known = gain in (gains.mjGAIN_FIXED, gains.mjGAIN_AFFINE) and bias in (biases.mjBIAS_NONE, biases.mjBIAS_AFFINE)
+        if not known or gain == gains.mjGAIN_AFFINE and model.actuator_gainprm[actuator, 1]:
             return True
         if bias == biases.mjBIAS_AFFINE and model.actuator_biasprm[actuator, 1]:
             return True

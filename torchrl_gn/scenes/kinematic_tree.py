@@ -182,20 +182,12 @@ class KinematicTree:
     @classmethod
     def from_description(cls, description: dict) -> KinematicTree:
         """Rebuild from :meth:`description`."""
-        tree = description["joint_chain"]
-        bounds = {
-            which: np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
-            for which, infinite in (("action_low", -np.inf), ("action_high", np.inf))
-        }
-        return cls(
-            name=tree["name"],
-            joint_names=tuple(tree["joint_names"]),
-            timestep=tree["timestep"],
-            commands=tuple(tuple(indices) for indices in tree["commands"]),
-            extras=tuple(tree["extras"]),
-            joint_parents=tuple(tree["joint_parents"]),
-            **bounds,
-        )
+        tree = dict(description["joint_chain"])
+        for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
+            tree[which] = np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
+        for which in ("joint_names", "extras"):
+            tree[which] = tuple(tree[which])
+        return cls(**tree)
 
     def fingerprint(self) -> str:
         """Hash of all arguments."""

@@ -63,7 +63,7 @@ def load_scene(
                 settle_steps=system.settle_steps,
                 origin={"system": system.name},
             )
-        if not _looks_like_path(source):
+        if not (source.endswith((".xml", ".mjcf")) or set("/\\") & set(source) or Path(source).is_file()):
             raise ValueError(_unknown(source))
     spec, origin = read_mjcf(source if isinstance(source, str) else Path(source))
     own_name = spec.modelname if isinstance(source, str) and is_mjcf_text(source) else Path(source).stem
@@ -101,10 +101,6 @@ def scene_from_description(description: dict) -> Scene:
             stacklevel=2,
         )
     return scene
-
-
-def _looks_like_path(source: str) -> bool:
-    return source.endswith((".xml", ".mjcf")) or any(sep in source for sep in "/\\") or Path(source).is_file()
 
 
 def _unknown(name: str) -> str:

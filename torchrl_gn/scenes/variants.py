@@ -88,7 +88,10 @@ def _build(
         # Every model would render and keep full textures: 12 MB and most of the time.
         texture.width = texture.height = _TEXTURE
     for values in rows:
-        _check_values(system, values)
+        for key, value in values.items():
+            if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
+                wanted = "a finite angle" if system.ranges[key].is_angle else "a finite factor above 0"
+                raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
         spec: mujoco.MjSpec = standard.copy()
         system.vary(spec, values)
         yield build_scene(
@@ -98,13 +101,6 @@ def _build(
             settle_steps=system.settle_steps,
             origin={"system": system.name, "parameters": dict(values)},
         )
-
-
-def _check_values(system: System, values: Mapping[str, float]) -> None:
-    for key, value in values.items():
-        if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
-            wanted = "a finite angle" if system.ranges[key].is_angle else "a finite factor above 0"
-            raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
 
 
 def _system_with_variants(source: object) -> System:

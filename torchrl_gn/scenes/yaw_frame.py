@@ -11,7 +11,6 @@ from torchrl_gn.scenes.invariance import acts_on_position, collides_with_world, 
 from torchrl_gn.scenes.topology import Topology
 
 _TOLERANCE = 1e-9
-_Disable = mujoco.mjtDisableBit
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,7 @@ def find_yaw_frame(
         return None
     across = [index for index in range(3) if index != axis]
     flow = model.opt.wind if model.opt.density or model.opt.viscosity else np.zeros(3)
-    weight = np.zeros(3) if model.opt.disableflags & _Disable.mjDSBL_GRAVITY else model.opt.gravity
+    weight = np.zeros(3) if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY else model.opt.gravity
     if np.abs(flow[across]).max() > _TOLERANCE or np.abs(weight[across]).max() > _TOLERANCE:
         return None
     lateral = [slide for slide in slides if abs((rest @ model.jnt_axis[slide])[axis]) < 1 - _TOLERANCE]

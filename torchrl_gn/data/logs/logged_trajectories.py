@@ -70,7 +70,6 @@ def log_trajectories(
     is the mean over it of the commands, each held until the next row.
 
     Args:
-        log: the log.
         steps: transitions in each trajectory.
         resample: time step of the trajectories, seconds; default: the log's.
         lag: rows by which commands act late: a state is paired with the command that many rows before.

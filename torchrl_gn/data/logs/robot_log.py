@@ -107,8 +107,6 @@ def log_chain(
     """Kinematic tree of a log's robot.
 
     Args:
-        log: the log.
-        name: name of the robot.
         resample: time step, seconds; default: the log's.
         commands: indices of the commands of each joint, none without motor; default: as many for each joint, in order.
         joint_parents: parent of each joint, -1 for the base; default: the joint before it.

@@ -35,9 +35,6 @@ def simulate_log(
 
     Args:
         scene: a robot whose joints are all hinges.
-        episodes: number of episodes.
-        steps: control steps of each.
-        seed: of commands, starts and noise.
         delay: control steps until a command acts.
         time_constant: of the lag, seconds; 0: no lag.
         play: width of the play, as a fraction of the command's range.
