@@ -1,31 +1,20 @@
 """Simulation and data: random controls, start states, data sets, replay buffers."""
 
-from torchrl_gn.data.collect import collect_trajectories
-from torchrl_gn.data.controls import spline_controls
-from torchrl_gn.data.dataset import TrajectoryDataset, create_dataset, load_dataset
-from torchrl_gn.data.errors import DatasetError, UnstableSimulationError
-from torchrl_gn.data.logs import LogReport, RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log
-from torchrl_gn.data.replay import TrajectoryStorage, WindowSampler, trajectory_buffer
-from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.data.start_states import sample_start_states
-
-__all__ = [
-    "DatasetError",
-    "LogReport",
-    "RobotLog",
-    "Simulator",
-    "TrajectoryDataset",
-    "TrajectoryStorage",
-    "UnstableSimulationError",
-    "WindowSampler",
-    "collect_trajectories",
-    "create_dataset",
-    "load_dataset",
-    "load_robot_log",
-    "log_chain",
-    "log_trajectories",
-    "sample_start_states",
-    "simulate_log",
-    "spline_controls",
-    "trajectory_buffer",
-]
+from torchrl_gn.data.collect import collect_trajectories as collect_trajectories
+from torchrl_gn.data.controls import spline_controls as spline_controls
+from torchrl_gn.data.dataset import TrajectoryDataset as TrajectoryDataset
+from torchrl_gn.data.dataset import create_dataset as create_dataset
+from torchrl_gn.data.dataset import load_dataset as load_dataset
+from torchrl_gn.data.errors import DatasetError as DatasetError
+from torchrl_gn.data.errors import UnstableSimulationError as UnstableSimulationError
+from torchrl_gn.data.logs import LogReport as LogReport
+from torchrl_gn.data.logs import RobotLog as RobotLog
+from torchrl_gn.data.logs import load_robot_log as load_robot_log
+from torchrl_gn.data.logs import log_chain as log_chain
+from torchrl_gn.data.logs import log_trajectories as log_trajectories
+from torchrl_gn.data.logs import simulate_log as simulate_log
+from torchrl_gn.data.replay import TrajectoryStorage as TrajectoryStorage
+from torchrl_gn.data.replay import WindowSampler as WindowSampler
+from torchrl_gn.data.replay import trajectory_buffer as trajectory_buffer
+from torchrl_gn.data.simulate import Simulator as Simulator
+from torchrl_gn.data.start_states import sample_start_states as sample_start_states

@@ -34,16 +34,14 @@ def collect_trajectories(
     simulator: Simulator | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> TensorDict:
-    """Simulate a scene under random control (paper, SM "Datasets").
+    """Simulate a scene under random control (paper, SM "Datasets"), independently of the number of threads.
 
     Starts come from :func:`~torchrl_gn.data.sample_start_states`, actions from
-    :func:`~torchrl_gn.data.spline_controls`. The result does not depend on the number of threads.
+    :func:`~torchrl_gn.data.spline_controls`.
 
     Args:
         scene: the scene, or variants of one, which the sequences take in turn.
-        num: number of sequences.
         steps: control steps ``T`` of each.
-        seed: seed of starts and actions.
         split: index of an independent split; :func:`~torchrl_gn.data.create_dataset` uses 0, 1, 2.
         knot_interval: control steps between the knots of the random actions.
         simulator: simulator of the same scenes, to reuse its threads.
@@ -51,12 +49,11 @@ def collect_trajectories(
 
     Returns:
         TensorDict ``[num]``, float64: ``state`` ``[num, T+1, N, 13]``, ``action`` ``[num, T, A]``, ``physics``
-        ``[num, T+1, S]``; with variants also ``parameters``, the physical parameters of each sequence's scene
-        (:class:`~torchrl_gn.scenes.PhysicalParameters`).
+        ``[num, T+1, S]``; with variants also ``parameters`` (:class:`~torchrl_gn.scenes.PhysicalParameters`).
 
     Raises:
         ValueError: if ``num`` or ``steps`` is below one, or ``simulator`` is of another scene.
-        UnstableSimulationError: if over a tenth, and over ten, of a chunk's simulations become unstable; fewer are
+        UnstableSimulationError: if over a tenth, and over ten, of a chunk's simulations are unstable; fewer are
             redrawn.
     """
     if num < 1 or steps < 1:
@@ -78,26 +75,18 @@ def collect_trajectories(
 
 
 def variant_parameters(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDict:
-    """Return the physical parameters ``[n]`` of the scenes with indices ``[n]``."""
+    """Physical parameters ``[n]`` of the scenes with indices ``[n]``."""
     which, row = np.unique(variant, return_inverse=True)
     values = torch.stack([PhysicalParameters.of(scenes[index]).tensordict() for index in which])
     return cast(TensorDict, values[torch.from_numpy(row)])
 
 
 def collect_chunk(
-    simulator: Simulator,
-    variant: np.ndarray,
-    steps: int,
-    seed: int,
-    key: tuple[int, ...],
-    *,
-    knot_interval: float,
+    simulator: Simulator, variant: np.ndarray, steps: int, seed: int, key: tuple[int, ...], *, knot_interval: float
 ) -> tuple[TensorDict, int]:
     """Simulate sequences of the scenes ``variant`` ``[count]`` with the one seed of (``seed``, ``key``).
 
-    Returns:
-        TensorDict ``[count]`` of ``state``, ``action`` and ``physics``, and the number of unstable, redrawn
-        simulations.
+    Returns a TensorDict ``[count]`` of ``state``, ``action`` and ``physics``, and the number of redrawn simulations.
     """
     scene, count = simulator.scene, len(variant)
     result, rejected, pending = None, 0, torch.arange(count)

@@ -18,17 +18,9 @@ def spline_controls(
     """Draw smooth action sequences ``[num, T, A]``, float64, in the actuators' units (paper, SM "Random control").
 
     Cubic splines through knots that are uniform within each action's bounds, from a random phase on, clipped to the
-    bounds. Paper: the distance of knots is not given; 10 control steps is our choice.
+    bounds. ``knot_interval`` is in control steps; the paper does not give it. ``rng`` is a generator or a seed.
 
-    Args:
-        scene: the scene.
-        num: number of sequences.
-        steps: control steps ``T`` of each.
-        rng: generator or seed.
-        knot_interval: control steps between knots, above 0.
-
-    Raises:
-        ValueError: if ``num`` or ``steps`` is negative, or ``knot_interval`` is not above 0 and finite.
+    Raises ValueError if ``num`` or ``steps`` is negative, or ``knot_interval`` is not above 0 and finite.
     """
     if num < 0 or steps < 0:
         raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")

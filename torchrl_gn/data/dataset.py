@@ -18,52 +18,32 @@ from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.scenes.errors import SceneError
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.parameter_names import ParameterNames, take_columns
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters
-
-__all__ = ["TrajectoryDataset", "create_dataset", "load_dataset"]
 
 
 @dataclass(frozen=True)
 class TrajectoryDataset:
     """Trajectories of a scene under random control, in three splits.
 
-    Each split is a TensorDict ``[M]``, float64: ``state`` ``[M, T+1, N, 13]``, ``action`` ``[M, T, A]`` and
-    ``physics`` ``[M, T+1, S]``; of variants also ``parameters``, a TensorDict ``[M]`` of the entries of
-    :class:`~torchrl_gn.scenes.PhysicalParameters`, and ``parameters`` ``[M, P]``, in the order of
-    :func:`~torchrl_gn.scenes.parameter_ranges`. They are mapped from disk, read when needed; writing to them
-    changes memory only, never the files.
-
-    Attributes:
-        scene: the scene; of variants, the standard one.
-        train: sequences to train on.
-        validation: sequences to stop early on.
-        test: sequences to report errors on.
-        rejected: for each split, how many simulations were unstable and drawn again.
-        manifest: the data set's manifest: seed, steps, package versions, checksums.
-        features: names of the static features in ``parameters``, for :meth:`ForwardModel.bind
-            <torchrl_gn.dynamics.ForwardModel.bind>`: those of this version of the library, in its order, that the data
-            set was made with; None if it is not of variants.
+    Each split is a TensorDict ``[M]``, float64: ``state`` ``[M, T+1, N, 13]``, ``action`` ``[M, T, A]`` and ``physics``
+    ``[M, T+1, S]``; of variants also ``parameters``, a TensorDict of :class:`~torchrl_gn.scenes.PhysicalParameters`,
+    and ``variant_parameters`` ``[M, P]``, in the order of :func:`~torchrl_gn.scenes.parameter_ranges`. They are mapped
+    from disk, read when needed; writing to them changes memory only, never the files.
     """
 
-    scene: Scene
+    scene: Scene  # of variants, the standard one
     train: TensorDict
     validation: TensorDict
     test: TensorDict
-    rejected: dict[str, int]
-    manifest: dict = field(repr=False)
-    features: ParameterNames | None = field(default=None, repr=False)
+    rejected: dict[str, int]  # unstable, redrawn simulations of each split
+    manifest: dict = field(repr=False)  # seed, steps, package versions, checksums
+    features: ParameterNames | None = field(default=None, repr=False)  # columns of ``parameters``, for binding a model
 
     def scene_of(self, split: str, index: int) -> Scene:
-        """The scene of one sequence, built again if it is a variant.
-
-        Args:
-            split: ``"train"``, ``"validation"`` or ``"test"``.
-            index: which sequence of it.
-        """
+        """The scene of one sequence of ``"train"``, ``"validation"`` or ``"test"``, rebuilt if it is a variant."""
         if split not in SPLITS:
             raise ValueError(f"split={split!r} is not known; use one of {list(SPLITS)}.")
         parameters = getattr(self, split).get("variant_parameters", None)
@@ -85,36 +65,25 @@ def create_dataset(
     progress: Callable[[int, int], None] | None = None,
     map_chunks: Callable[[Callable, Iterable], Iterable] = map,
 ) -> TrajectoryDataset:
-    """Simulate a data set onto disk, or finish or load the one that is there.
+    """Simulate a data set onto disk, or finish or load the one that is there. The default sizes are the paper's.
 
-    The default sizes are the paper's. Data depend on the scene, sizes, ``steps``, ``seed``, ``variants``
-    and ``knot_interval`` alone. They are written in chunks; after an interruption the same call goes on
-    where it stopped and gives the same bits. Of several processes that want one data set at a time the
-    first makes it and the others wait. Splits have independent seeds. Unstable simulations
-    are drawn again and counted.
+    Data depend on the scene, sizes, ``steps``, ``seed``, ``variants`` and ``knot_interval`` alone. They are written in
+    chunks; after an interruption the same call continues and gives the same bits. Other processes wait for the first.
 
     Args:
         path: folder of the data set, new, empty or begun by an equal call.
-        scene: the scene.
-        train: number of training sequences.
-        validation: number of validation sequences.
-        test: number of test sequences.
-        steps: control steps of each sequence.
-        seed: seed, not negative.
-        variants: number of random variants of the scene's system that the sequences of each split take in turn,
-            no split another's; at least as many as sequences give each sequence its own. Default: all are of
-            the scene itself. The paper does not say how many variants its 20000 sequences are of.
+        seed: not negative; splits are independent.
+        variants: number of random variants that the sequences of each split take in turn, no split another's; at least
+            as many as sequences: one each. Default: all are of the scene itself. The paper does not give it.
         knot_interval: control steps between the knots of the random actions.
-        num_threads: threads of the simulation. Default: the cores this process may use.
+        num_threads: threads of the simulation; default: the cores this process may use.
         progress: called with sequences done and wanted, after every chunk.
-        map_chunks: what does the work on the chunks, like the built-in ``map`` and in its order: ``imap`` of a pool of
-            processes or of a :class:`~torchrl_gn.training.RayCluster`. The data are the same.
+        map_chunks: works like ``map`` and in its order, such as ``imap`` of a pool of processes or of a
+            :class:`~torchrl_gn.training.RayCluster`. The data are the same.
 
     Raises:
-        ValueError: a size, ``steps`` or ``variants`` is below one, ``seed`` below zero or ``knot_interval`` not
-            above 0 and finite, or the scene is of no system that has variants.
-        DatasetError: the folder holds something else, another or a damaged data set; nothing of it
-            is changed.
+        ValueError: an argument is out of range, or the scene is of no system that has variants.
+        DatasetError: the folder holds something else, another or a damaged data set, which is not changed.
         UnstableSimulationError: more than a tenth of a chunk's simulations, and more than ten, become unstable.
     """
     sizes = dict(zip(SPLITS, map(index, (train, validation, test)), strict=True))
@@ -141,7 +110,7 @@ def create_dataset(
     with files.lock():
         if not files.find(request):
             features = None if variants is None else asdict(ParameterNames.of(scene))
-            described = _description(scene)
+            described = scene.description() if scene.origin else None  # made from an MjSpec
             files.create(request=request, description=described, features=features, versions=simulation_versions())
         if not files.is_complete():
             _collect_missing(files, scene, num_threads, progress, map_chunks)
@@ -152,13 +121,12 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
     """Open a finished data set.
 
     Args:
-        path: folder of the data set.
-        scene: the scene it must be of. Default: the one it was made with, built again.
+        scene: the scene it must be of; default: the one it was made with, rebuilt.
         verify: compare every file with its checksums (reads all of it once).
 
     Raises:
-        DatasetError: it is missing, unfinished, damaged, of another scene, of other physics of it or made by an older
-            or newer version of this library. The message names the file and what to do.
+        DatasetError: it is missing, unfinished, damaged, or of another scene, physics or version of the format. The
+            message names the file and what to do.
     """
     files = DatasetFiles(Path(path))
     files.read()
@@ -215,7 +183,7 @@ def _collect_missing(
 
 
 def _missing_chunks(files: DatasetFiles, scene: Scene) -> Iterator[tuple]:
-    """Seed key, number of sequences, and for variants the parameters of each, of chunks that are to be made."""
+    """Seed key, number of sequences and, for variants, the parameters of each chunk that is not done."""
     request = files.manifest["request"]
     for number, (split, size) in enumerate(request["sizes"].items()):
         parameters = None
@@ -245,11 +213,7 @@ def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple)
 
 
 def _system(scene: Scene) -> str:
-    """Name of the system that variants of a scene are of.
-
-    Raises:
-        ValueError: if there is none, or the scene is itself a variant.
-    """
+    """Name of the system that variants of a scene are of; ValueError if there is none, or the scene is a variant."""
     if "parameters" in scene.origin:
         raise ValueError(f"Scene {scene.name!r} is a variant already; give the standard system, without parameters.")
     if "system" not in scene.origin:
@@ -282,15 +246,8 @@ def _stored_features(files: DatasetFiles) -> ParameterNames | None:
 
 
 def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
-    """Keep some columns of the static features, in another order; what is right already stays mapped from disk."""
+    """Select columns of the static features in place; right ones stay mapped from disk."""
     for part, wanted in columns.items():
         values = data["parameters", part]
         if wanted != list(range(values.shape[-1])):
             data["parameters", part] = take_columns(values, wanted)
-
-
-def _description(scene: Scene) -> dict | None:
-    try:
-        return scene.description()
-    except SceneError:  # made from an MjSpec
-        return None

@@ -40,12 +40,6 @@ class DatasetFiles:
 
     A chunk enters the manifest once its rows are on disk, and the manifest is replaced atomically: an interruption
     leaves every chunk in the manifest whole.
-
-    Args:
-        root: the folder.
-
-    Attributes:
-        manifest: empty until :meth:`read` or :meth:`create`.
     """
 
     def __init__(self, root: Path):
@@ -54,7 +48,7 @@ class DatasetFiles:
         self.manifest: dict = {}
 
     def lock(self) -> AbstractContextManager:
-        """Make other processes that want the same data set wait; does nothing where nothing can be written."""
+        """Lock out other processes that want the same data set; does nothing where nothing can be written."""
         root = self.root.absolute()
         root.parent.mkdir(parents=True, exist_ok=True)
         writable = os.access(root.parent, os.W_OK)
@@ -63,8 +57,7 @@ class DatasetFiles:
     def find(self, request: dict) -> bool:
         """Whether the data set of a request is there, finished or begun; reads its manifest and checks all its files.
 
-        Raises:
-            DatasetError: something else is there, another or a damaged data set.
+        Raises DatasetError if something else is there, another or a damaged data set.
         """
         if not self.manifest_path.is_file():
             if self.root.exists() and not self.root.is_dir():
@@ -87,11 +80,7 @@ class DatasetFiles:
         return True
 
     def read(self) -> None:
-        """Read the manifest.
-
-        Raises:
-            DatasetError: it is missing, damaged or of another format.
-        """
+        """Read the manifest; DatasetError if it is missing, damaged or of another format."""
         file = self.manifest_path
         try:
             manifest = json.loads(file.read_text(encoding="utf-8"))
@@ -138,13 +127,7 @@ class DatasetFiles:
         return all(self.rows_done(split) == size for split, size in self.manifest["request"]["sizes"].items())
 
     def append(self, split: str, rows: TensorDict, rejected: int) -> None:
-        """Write the next chunk of a split, then the manifest with its checksums.
-
-        Args:
-            split: name of the split.
-            rows: the chunk, ``[rows]``.
-            rejected: simulations that were drawn again for this chunk.
-        """
+        """Write the next chunk of a split, then the manifest with its checksums and number of redrawn simulations."""
         folder, chunks, first = self.root / split, self.manifest["chunks"][split], self.rows_done(split)
         if not chunks:
             size = self.manifest["request"]["sizes"][split]
@@ -164,12 +147,7 @@ class DatasetFiles:
     def open(self, split: str, *, checksums: bool) -> TensorDict:
         """A split that was begun, mapped from disk copy-on-write: writing to it never reaches the files.
 
-        Args:
-            split: name of the split.
-            checksums: compare the finished chunks with their checksums.
-
-        Raises:
-            DatasetError: a file is missing, changed or of another size.
+        Raises DatasetError if a file is missing, changed, of another size or, of a finished chunk, fails its checksum.
         """
         folder, chunks, count = self.root / split, self.manifest["chunks"][split], self.manifest["request"]["chunk"]
         for name, expected in chunks[0]["crc32"].items():
@@ -195,7 +173,7 @@ class DatasetFiles:
 
 
 def _checksums(rows: TensorDict) -> dict[str, int]:
-    """Checksum of each file's rows, by its name; a tensor without elements has no file."""
+    """Checksum of each file's rows; a tensor without elements has no file."""
     leaves = rows.flatten_keys("/").items()
     return {f"{name}.memmap": zlib.crc32(leaf.contiguous().numpy().data) for name, leaf in leaves if leaf.numel()}
 

@@ -48,14 +48,6 @@ def trajectory_buffer(
     Raises:
         KeyError: if ``state`` or ``action`` is missing.
         ValueError: if there is no trajectory, one is shorter than ``window``, or an argument does not fit.
-
-    Example:
-        >>> from torchrl_gn.data import collect_trajectories
-        >>> from torchrl_gn.scenes import load_scene
-        >>> trajectories = collect_trajectories(load_scene("pendulum"), num=4, steps=10)
-        >>> buffer = trajectory_buffer(trajectories, batch_size=32, window=5, seed=0)
-        >>> buffer.sample()["next", "state"].shape
-        torch.Size([32, 5, 2, 13])
     """
     if batch_size < 1 or window < 1:
         raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
@@ -101,7 +93,7 @@ class TrajectoryStorage(TensorStorage):
         return self.trajectories.get("action").shape[1]
 
     def get(self, index: Any) -> TensorDictBase:
-        """Return transitions at ``(trajectory, time)``: integers ``[B]`` or ``[B, W]`` each, or one ``[..., 2]``.
+        """Transitions at ``(trajectory, time)``: integers ``[B]`` or ``[B, W]`` each, or one ``[..., 2]``.
 
         Rows of ``[B, W]`` must each be of one trajectory. Other indices give whole trajectories.
         """
@@ -118,8 +110,11 @@ class TrajectoryStorage(TensorStorage):
             "next": TensorDict({"state": _rows(stored.get("state"), here + 1)}, batch_size=here.shape),
         }
         parameters = stored.get("parameters", None)
-        if parameters is not None:
-            entries["parameters"] = _of_trajectory(parameters, trajectory)
+        if parameters is not None and trajectory.ndim == 1:
+            entries["parameters"] = parameters[trajectory]
+        elif parameters is not None:
+            rows = parameters[trajectory[:, 0]].unsqueeze(1)
+            entries["parameters"] = rows.expand(*trajectory.shape, *parameters.shape[1:])
         return TensorDict(entries, batch_size=here.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
@@ -127,20 +122,16 @@ class TrajectoryStorage(TensorStorage):
         super().set(cursor, data.select(*self.trajectories.keys()), set_cursor=set_cursor)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the trajectories if writable, else nothing."""
+        """The trajectories if writable, else nothing."""
         return super().state_dict() if self.writable else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore :meth:`state_dict`."""
         if self.writable:
             super().load_state_dict(state_dict)
 
 
 class WindowSampler(Sampler):
-    """TorchRL sampler of (trajectory, time) of a :class:`TrajectoryStorage`, uniform over all windows.
-
-    Args are those of :func:`trajectory_buffer`.
-    """
+    """TorchRL sampler of (trajectory, time) of a :class:`TrajectoryStorage`, uniform over all windows."""
 
     def __init__(
         self,
@@ -184,11 +175,10 @@ class WindowSampler(Sampler):
         """Do nothing: draws are independent."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the random state."""
+        """The random state."""
         return {"generator": self._generator.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the random state."""
         self._generator.set_state(state_dict["generator"])
 
     def dumps(self, path: str) -> None:
@@ -207,12 +197,6 @@ def _rows(values: Tensor, row: Tensor) -> Tensor:
     else:
         picked = flat.index_select(0, row.reshape(-1).to(flat.device))
     return picked.view(*row_shape, *values.shape[2:])
-
-
-def _of_trajectory(parameters: Tensor | TensorDictBase, trajectory: Tensor) -> Tensor | TensorDictBase:
-    if trajectory.ndim == 1:
-        return parameters[trajectory]
-    return parameters[trajectory[:, 0]].unsqueeze(1).expand(*trajectory.shape, *parameters.shape[1:])
 
 
 def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:

@@ -35,17 +35,6 @@ class Simulator:
 
     Raises:
         ValueError: if there is no scene, topologies differ, or ``num_threads`` is below one.
-
-    Example:
-        >>> import numpy as np
-        >>> from torchrl_gn.data import sample_start_states, spline_controls
-        >>> from torchrl_gn.scenes import load_scene
-        >>> scene = load_scene("swimmer6")
-        >>> rng = np.random.default_rng(0)
-        >>> physics = sample_start_states(scene, 3, rng)
-        >>> actions = spline_controls(scene, 3, 50, rng)
-        >>> Simulator(scene).rollout(physics, actions)["state"].shape
-        torch.Size([3, 51, 7, 13])
     """
 
     def __init__(self, scenes: Scene | Sequence[Scene], num_threads: int | None = None, *, memory: int | None = None):
@@ -62,12 +51,9 @@ class Simulator:
         self._data = [mujoco.MjData(self.scene.model) for _ in range(num_threads)]
 
     def rollout(
-        self,
-        physics: Tensor | np.ndarray,
-        actions: Tensor | np.ndarray,
-        variant: Tensor | np.ndarray | None = None,
+        self, physics: Tensor | np.ndarray, actions: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None
     ) -> TensorDict:
-        """Simulate action sequences from given states.
+        """Simulate action sequences from given states, without gradients.
 
         Args:
             physics: ``[*B, S]`` float64, full MuJoCo states (``mjSTATE_FULLPHYSICS``).
@@ -76,7 +62,8 @@ class Simulator:
 
         Returns:
             TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, 13]`` and ``physics`` ``[*B, T+1, S]``, float64, given
-            states first, and ``stable`` ``[*B]`` bool. Quaternion signs are MuJoCo's. No gradients.
+                states
+            first, and ``stable`` ``[*B]`` bool. Quaternion signs are MuJoCo's.
 
         Raises:
             ValueError: if a shape is wrong, or a value not finite (the message has its index).
@@ -121,10 +108,7 @@ class Simulator:
         return TensorDict(result, batch_size=batch)
 
     def observe(self, physics: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None) -> Tensor:
-        """Return the body states ``[*B, N, 13]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`.
-
-        Computes kinematics alone. Raises as :meth:`rollout`.
-        """
+        """Body states ``[*B, N, 13]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`; kinematics alone."""
         start = self._checked_physics(physics)
         batch = start.shape[:-1]
         which = self._variants(variant, batch)
@@ -144,15 +128,10 @@ class Simulator:
     def step(
         self, physics: np.ndarray, actions: np.ndarray, variant: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Advance states by one control step.
+        """Advance states ``[n, S]``, float64, by one control step with actions ``[n, A]``, float64.
 
         Saves the physics step that :meth:`rollout` adds to see the last state, so does not detect if that one is
         unstable.
-
-        Args:
-            physics: ``[n, S]`` float64; states that are not finite count as unstable.
-            actions: ``[n, A]`` float64.
-            variant: as for :meth:`rollout`.
 
         Returns:
             Next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, 13]``, float64.
@@ -178,8 +157,7 @@ class Simulator:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advance states ``[n, S]``, float64, by physics steps without control, and keep their time.
 
-        Returns:
-            States ``[n, S]`` and whether they are stable ``[n]``.
+        Returns states ``[n, S]`` and whether they are stable ``[n]``.
         """
         start = self._checked_physics(physics)
         which = self._variants(variant, start.shape[:-1])
@@ -194,7 +172,7 @@ class Simulator:
     def _advance(
         self, start: np.ndarray, controls: np.ndarray, which: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return physics ``[n, t, S]`` after and sensors ``[n, t, nsensordata]`` before each step, and stability."""
+        """Physics ``[n, t, S]`` after and sensors ``[n, t, nsensordata]`` before each step, and stability ``[n]``."""
         # Instability shows in the time, which MuJoCo's reset sets to 0: start above 0.
         zero = start[:, 0] == 0
         if zero.any():

@@ -13,7 +13,7 @@ class Float64Buffers(nn.Module):
     """Module whose tensors keep their dtype whatever a network around it is cast to: only the device follows."""
 
     def constants(self, values: Mapping[str, Any]) -> None:
-        """Register arrays or tensors as buffers that are no part of a checkpoint: they follow from the scene."""
+        """Register arrays or tensors as buffers that are no part of a checkpoint."""
         for name, value in values.items():
             self.register_buffer(name, torch.as_tensor(value), persistent=False)
 

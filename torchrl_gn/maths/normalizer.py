@@ -13,24 +13,14 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 class Normalizer(Float64Buffers):
     """Scale features to zero mean and unit variance (paper, SM "Data normalization").
 
-    Statistics are one count, mean and sum of squared deviations a feature, shared
-    by all nodes or edges, in float64, updated in batches by Chan's parallel
-    formula, so that they can also be merged from several processes.
-
-    Paper: the sum and squared sum that the paper accumulates cancel
-    catastrophically when the mean is large against the spread.
-
-    A feature that never varied maps to exactly 0, and back to its mean.
+    Keeps one count, mean and sum of squared deviations a feature, float64, shared by all nodes or edges and updated by
+    Chan's parallel formula. Paper: its sum and squared sum cancel when the mean is large against the standard
+    deviation. A feature that never varied maps to exactly 0, and back to its mean.
 
     Args:
         size: number of features ``F``.
-        floor: standard deviations up to this are rounding noise: the feature counts as
-            constant. (Spreads below 1e-7 of the mean always do.)
-        limit: normalised features are cut off at plus and minus this, so that a network is never asked about
-            what is far outside of all that it learned from.
-
-    Raises:
-        ValueError: if the floor is negative or not finite, or the limit is not positive.
+        floor: standard deviations up to this count as constant, as do those below 1e-7 of the mean.
+        limit: normalised features are clamped to plus and minus this.
     """
 
     count: Tensor
@@ -54,24 +44,19 @@ class Normalizer(Float64Buffers):
 
     @property
     def fitted(self) -> bool:
-        """Whether it has seen data, or has no features. Waits for the device: not for every step."""
+        """Whether it has data, or no features. Waits for the device: not for every step."""
         return self.size == 0 or bool((self.count > 0).any())
 
     @property
     def constant(self) -> Tensor:
-        """``[F]`` bool, features that never varied in what was seen."""
+        """``[F]`` bool, features that never varied."""
         return self.std == 0
 
     @torch.no_grad()
     def update(self, features: Tensor, mask: Tensor | None = None) -> None:
-        """Take a batch into the statistics.
+        """Add a batch ``[..., F]`` to the statistics, but for entries where the bool ``mask``, broadcast, is False.
 
-        Args:
-            features: ``[..., F]``.
-            mask: bool, broadcast against ``features``; entries that are False are not counted.
-
-        Raises:
-            ValueError: if the size is wrong or a counted entry is not finite.
+        Raises ValueError if the size is wrong or a counted entry is not finite.
         """
         if features.shape[-1] != self.size:
             raise ValueError(f"Normalizer of {self.size} features got {features.shape[-1]} in {tuple(features.shape)}.")
@@ -91,7 +76,7 @@ class Normalizer(Float64Buffers):
 
     @torch.no_grad()
     def merge(self, other: Normalizer) -> None:
-        """Add the statistics of another normaliser, as if this one had seen its data too."""
+        """Add the statistics of another normaliser."""
         if other.size != self.size:
             raise ValueError(f"Cannot merge a normaliser of {other.size} features into one of {self.size}.")
         self._combine(*(getattr(other, name).to(self.mean.device) for name in ("count", "mean", "m2")))
@@ -115,15 +100,7 @@ class Normalizer(Float64Buffers):
         self.inverse_std.copy_(torch.where(constant, 0.0, 1 / torch.where(constant, 1.0, std)))
 
     def forward(self, features: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        """Normalise.
-
-        Args:
-            features: ``[..., F]``; the mean is subtracted in their own dtype.
-            dtype: dtype of the result, by default that of ``features``.
-
-        Returns:
-            ``[..., F]``.
-        """
+        """Normalise ``[..., F]``; the mean is subtracted in the features' dtype, ``dtype`` is the result's."""
         normalized = (features - self.mean.to(features.dtype)) * self.inverse_std.to(features.dtype)
         if self.limit < math.inf:
             normalized = normalized.clamp(-self.limit, self.limit)

@@ -13,16 +13,11 @@ from torchrl_gn.processor import onednn_precision, product_speeds
 
 @contextmanager
 def fast_matmul(*, rounding: bool = False) -> Iterator[None]:
-    """Let the hardware choose how float32 matrices are multiplied.
+    """Let the hardware choose how float32 matrices are multiplied, until the block ends.
 
     On a CPU the products go through oneDNN where that was timed to be faster with the same digits
-    (:func:`~torchrl_gn.processor.product_speeds`; nearly twice on an AMD EPYC with AVX-512, no gain with AVX2).
-    Processors with matrix units (AMX) would round to bfloat16 there, which no training to errors below a millionth
-    survives, so that is asked for by ``rounding``, and so is TF32 on an NVIDIA GPU. The settings are put back after.
-    Before torch 2.9, which has no such setting for a CPU, its products stay as they are.
-
-    Args:
-        rounding: allow products of factors that are rounded to 8 (CPU) or 11 (GPU) bits.
+    (:func:`~torchrl_gn.processor.product_speeds`; before torch 2.9 nothing changes). With ``rounding``, factors may be
+    rounded to 8 bits on a CPU with AMX (bfloat16) and 11 on an NVIDIA GPU (TF32).
     """
     with ExitStack() as settings:
         cpu, cuda = onednn_precision(), torch.backends.cuda.matmul

@@ -1,7 +1,6 @@
 """Unit quaternions as tensors ``[..., 4]``, w first, and rotation vectors ``[..., 3]`` in radians.
 
-Every function is differentiable with finite gradients everywhere it is used
-on unit quaternions, at the zero rotation and at half a turn included.
+Every function has finite gradients on unit quaternions, at the zero rotation and at half a rotation included.
 """
 
 from __future__ import annotations
@@ -34,8 +33,7 @@ def _table(columns: tuple[str, ...], dtype: torch.dtype, device: torch.device) -
 
 
 @functools.cache
-def _no_turn(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The identity matrix ``[9]``."""
+def _identity(dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
         return torch.eye(3, dtype=dtype, device="cpu").flatten().to(device)
 
@@ -50,15 +48,7 @@ def _sums(a: Tensor, b: Tensor, columns: tuple[str, ...]) -> Tensor:
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product ``a * b``: rotates by ``b`` first, then by ``a``.
-
-    Args:
-        a: ``[..., 4]`` quaternions.
-        b: ``[..., 4]`` quaternions, broadcast against ``a``.
-
-    Returns:
-        ``[..., 4]`` quaternions.
-    """
+    """Hamilton product ``a * b`` of ``[..., 4]``, broadcast: rotates by ``b`` first, then by ``a``."""
     if _few(a) and _few(b):
         return _sums(a, b, _PRODUCT)
     a, b = torch.broadcast_tensors(a, b)
@@ -80,11 +70,7 @@ def conjugate(q: Tensor) -> Tensor:
 
 
 def normalize(q: Tensor) -> Tensor:
-    """Scale quaternions ``[..., 4]`` to unit norm; the zero quaternion becomes the identity.
-
-    A quaternion of norm zero has no orientation. It is mapped to "no rotation"
-    so that one bad input cannot fill a batch with NaN.
-    """
+    """Scale quaternions ``[..., 4]`` to unit norm; zero becomes the identity, as it must not fill a batch with NaN."""
     # Dividing by the largest entry first keeps the squares from overflowing or vanishing.
     largest = q.abs().amax(dim=-1, keepdim=True)
     zero = largest == 0
@@ -96,14 +82,7 @@ def normalize(q: Tensor) -> Tensor:
 
 
 def exp(rotation_vector: Tensor) -> Tensor:
-    """Unit quaternion of a rotation vector (axis times angle).
-
-    Args:
-        rotation_vector: ``[..., 3]``, radians.
-
-    Returns:
-        ``[..., 4]`` unit quaternions ``(cos(a / 2), sin(a / 2) * axis)``.
-    """
+    """Unit quaternions ``[..., 4]`` of rotation vectors ``[..., 3]``: ``(cos(a / 2), sin(a / 2) * axis)``."""
     half = 0.5 * rotation_vector
     square = half.square().sum(-1, keepdim=True)
     small = square < 1e-8
@@ -115,14 +94,7 @@ def exp(rotation_vector: Tensor) -> Tensor:
 
 
 def log(q: Tensor) -> Tensor:
-    """Rotation vector of unit quaternions, the shorter way round.
-
-    Args:
-        q: ``[..., 4]`` unit quaternions; ``q`` and ``-q`` give the same result.
-
-    Returns:
-        ``[..., 3]`` rotation vectors with angles in ``[0, pi]`` radians.
-    """
+    """Rotation vectors ``[..., 3]``, angles in ``[0, pi]``, of quaternions ``[..., 4]``; equal for ``q`` and ``-q``."""
     w, v = q[..., :1], q[..., 1:]
     sign = torch.where(w < 0, -torch.ones_like(w), torch.ones_like(w))
     w, v = w * sign, v * sign
@@ -137,18 +109,10 @@ def log(q: Tensor) -> Tensor:
 
 
 def angle(a: Tensor, b: Tensor) -> Tensor:
-    """Angle of the rotation from ``b`` to ``a``, radians in ``[0, pi]``.
+    """Angle ``[...]`` in ``[0, pi]`` between unit quaternions ``[..., 4]`` of any sign.
 
-    Computed as ``2 atan2(|v|, |w|)`` of ``conj(b) * a``: accurate for tiny angles,
-    where ``acos`` loses half the digits, and blind to the sign of either quaternion.
-    The gradient is finite everywhere, and zero where the rotations agree.
-
-    Args:
-        a: ``[..., 4]`` unit quaternions.
-        b: ``[..., 4]`` unit quaternions.
-
-    Returns:
-        ``[...]`` angles.
+    Computed as ``2 atan2(|v|, |w|)`` of ``conj(b) * a``: accurate for tiny angles, where ``acos`` loses half the
+    digits. The gradient is finite everywhere, and zero where the rotations agree.
     """
     difference = product(conjugate(b), a)
     w, v = difference[..., 0], difference[..., 1:]
@@ -160,18 +124,11 @@ def angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def to_matrix(q: Tensor) -> Tensor:
-    """Rotation matrices of quaternions of any length, row by row; the identity for zero.
-
-    Args:
-        q: ``[..., 4]`` quaternions.
-
-    Returns:
-        ``[..., 9]`` entries of the matrices in row-major order.
-    """
+    """Rotation matrices ``[..., 9]``, row-major, of quaternions ``[..., 4]`` of any length; the identity for zero."""
     if _few(q):
         sums = _sums(q, q, _MATRIX)
         scale = 2 / torch.where(sums[..., 9:] > 0, sums[..., 9:], 1)
-        return torch.addcmul(_no_turn(q.dtype, q.device), scale, sums[..., :9])
+        return torch.addcmul(_identity(q.dtype, q.device), scale, sums[..., :9])
     square = q.square().sum(-1)
     # 1 for zero: all products below vanish and leave the identity.
     scale = 2 / torch.where(square > 0, square, 1)
@@ -194,28 +151,12 @@ def to_matrix(q: Tensor) -> Tensor:
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
-    """Vectors turned by quaternions.
-
-    Args:
-        q: ``[..., 4]`` quaternions.
-        v: ``[..., 3]`` vectors, broadcast against ``q``.
-
-    Returns:
-        ``[..., 3]`` vectors.
-    """
+    """Rotate vectors ``[..., 3]`` by quaternions ``[..., 4]``, broadcast."""
     return (to_matrix(q).unflatten(-1, (3, 3)) @ v.unsqueeze(-1)).squeeze(-1)
 
 
 def rotate_by(rotation_vector: Tensor, v: Tensor) -> Tensor:
-    """Vectors turned by rotation vectors (Rodrigues' formula), the same as ``rotate(exp(rotation_vector), v)``.
-
-    Args:
-        rotation_vector: ``[..., 3]``, radians.
-        v: ``[..., 3]`` vectors, broadcast against it.
-
-    Returns:
-        ``[..., 3]`` vectors.
-    """
+    """Rotate vectors ``[..., 3]`` by rotation vectors (Rodrigues' formula): ``rotate(exp(rotation_vector), v)``."""
     square = rotation_vector.square().sum(-1, keepdim=True)
     small = square < 1e-8
     # As in exp: nothing divides by zero, not even in the branch that is not taken.

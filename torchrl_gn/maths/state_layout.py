@@ -1,4 +1,4 @@
-"""What the channels of a state mean and how each is updated by a predicted change."""
+"""Channels of a state, and how a predicted change updates each."""
 
 from __future__ import annotations
 
@@ -22,20 +22,15 @@ _SIZES: dict[str, tuple[int | None, int | None]] = {"add": (None, None), "rotati
 class Component:
     """One named group of state channels that is updated in one way.
 
-    Attributes:
-        name: standard name, for example ``"position"``.
-        size: number of channels in the state.
-        kind: ``"add"`` channels change by addition; ``"rotation"`` is a unit quaternion
-            turned by a rotation vector (3 delta channels, Hamilton product, paper SM
-            "Prediction of dynamic state change"); ``"circle"`` is a ``(cos, sin)`` pair
-            turned by an angle (1 delta channel).
-        rate: name of the component that is this one's time derivative, if the state has it.
+    ``"add"`` channels change by addition; ``"rotation"`` is a unit quaternion, rotated by a rotation vector (3 delta
+    channels, Hamilton product, paper SM "Prediction of dynamic state change"); ``"circle"`` is a ``(cos, sin)`` pair,
+    rotated by an angle (1 delta channel).
     """
 
-    name: str
-    size: int
+    name: str  # standard name, such as "position"
+    size: int  # channels in the state
     kind: Kind = "add"
-    rate: str | None = None
+    rate: str | None = None  # component that is this one's time derivative, if the state has it
 
     def __post_init__(self) -> None:
         if self.kind not in _SIZES:
@@ -54,17 +49,10 @@ class Component:
 
 @dataclass(frozen=True)
 class StateLayout:
-    """The channels of a state, as components one after another.
-
-    Every part that must know what a channel means reads it here: state change,
-    noise, loss, normalisers, errors and movable channels.
-
-    Attributes:
-        components: the components in the order of the channels.
+    """The components of a state, in the order of their channels.
 
     Raises:
-        ValueError: if two components share a name, or a ``rate`` names none that is added and
-            has no rate itself.
+        ValueError: if two components share a name, or a ``rate`` names none that is added and has no rate itself.
     """
 
     components: tuple[Component, ...]
@@ -112,15 +100,7 @@ class StateLayout:
         return _slices((c.name, c.delta_size) for c in self.components)
 
     def delta(self, state: Tensor, next_state: Tensor) -> Tensor:
-        """Change that leads from one state to the next.
-
-        Args:
-            state: ``[..., size]``.
-            next_state: ``[..., size]``.
-
-        Returns:
-            ``[..., delta_size]``; rotations as world-frame rotation vectors in radians.
-        """
+        """Change ``[..., delta_size]`` between states ``[..., size]``; rotations as world-frame rotation vectors."""
         parts = []
         for component in self.components:
             where = self.slices[component.name]
@@ -135,15 +115,7 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def apply(self, state: Tensor, delta: Tensor) -> Tensor:
-        """State after a change, the inverse of :meth:`delta`; rotations keep unit norm.
-
-        Args:
-            state: ``[..., size]``.
-            delta: ``[..., delta_size]``.
-
-        Returns:
-            ``[..., size]``.
-        """
+        """State ``[..., size]`` after a change ``[..., delta_size]``: inverse of :meth:`delta`, of unit norm."""
         parts = []
         for component in self.components:
             old = state[..., self.slices[component.name]]
@@ -154,26 +126,13 @@ class StateLayout:
                 parts.append(quaternion.normalize(quaternion.product(quaternion.exp(change), old)))
             else:
                 cos, sin = change.cos(), change.sin()
-                turned = torch.cat(
-                    (old[..., :1] * cos - old[..., 1:] * sin, old[..., :1] * sin + old[..., 1:] * cos), dim=-1
-                )
-                parts.append(turned / turned.norm(dim=-1, keepdim=True))
+                x, y = old[..., :1], old[..., 1:]
+                rotated = torch.cat((x * cos - y * sin, x * sin + y * cos), dim=-1)
+                parts.append(rotated / rotated.norm(dim=-1, keepdim=True))
         return torch.cat(parts, dim=-1)
 
     def integrate(self, state: Tensor, delta: Tensor, timestep: float) -> Tensor:
-        """Add to a state change what the rates alone would do (trapezoidal rule).
-
-        A component with a ``rate`` moves by ``timestep * (rate + rate') / 2`` and the
-        change given here is only what is left over: small and easier to learn.
-
-        Args:
-            state: ``[..., size]``.
-            delta: ``[..., delta_size]``; for components with a rate, the residual.
-            timestep: seconds.
-
-        Returns:
-            ``[..., delta_size]`` full change.
-        """
+        """Add the change due to the rates, ``timestep * (rate + rate') / 2``, to a residual ``[..., delta_size]``."""
         return delta + self._rate_term(state, delta, timestep)
 
     def residual(self, state: Tensor, delta: Tensor, timestep: float) -> Tensor:
@@ -186,23 +145,17 @@ class StateLayout:
             if component.rate is None:
                 parts.append(torch.zeros_like(delta[..., self.delta_slices[component.name]]))
             else:
-                rate, change = (
-                    state[..., self.slices[component.rate]],
-                    delta[..., self.delta_slices[component.rate]],
-                )
+                rate, change = state[..., self.slices[component.rate]], delta[..., self.delta_slices[component.rate]]
                 parts.append(timestep * (rate + 0.5 * change))
         return torch.cat(parts, dim=-1)
 
     def rotate(self, state: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
-        """State as seen when all of space is turned about the origin.
+        """Rotate states about the origin.
 
         Args:
             state: ``[*B, N, size]``.
             rotation: ``[*B, 4]`` unit quaternions, one for all ``N`` items.
-            matrix: ``[*B, 3, 3]`` of that rotation, if it is known already.
-
-        Returns:
-            ``[*B, N, size]``.
+            matrix: ``[*B, 3, 3]`` of that rotation, if known.
 
         Raises:
             ValueError: if a component is no vector or rotation in space.
@@ -219,7 +172,7 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def rotate_delta(self, delta: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
-        """State change ``[*B, N, delta_size]`` as seen when all of space is turned, see :meth:`rotate`."""
+        """Rotate state changes ``[*B, N, delta_size]`` as :meth:`rotate` does states."""
         self._check_spatial()
         matrix = (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
         vectors = delta.reshape(*delta.shape[:-2], delta.shape[-2] * len(self.components), 3)
@@ -233,17 +186,12 @@ class StateLayout:
                 )
 
     def encode(self, state: Tensor, encoding: Encoding = "matrix", matrices: Tensor | None = None) -> Tensor:
-        """Features of a state that the network sees.
+        """Features ``[..., encoded_size(encoding)]`` of states ``[..., size]`` for a network.
 
         Args:
             state: ``[..., size]``.
-            encoding: a rotation as its ``"quaternion"`` (paper) or as the 9 entries of its
-                rotation ``"matrix"``: the same for ``q`` and ``-q``, and linear in how
-                body-fixed vectors turn.
-            matrices: ``[..., 3, 3]`` of the only rotation that the state has, if they are known already.
-
-        Returns:
-            ``[..., encoded_size(encoding)]``.
+            encoding: a rotation as its ``"quaternion"`` (paper) or its ``"matrix"`` (9), the same for ``q`` and ``-q``.
+            matrices: ``[..., 3, 3]`` of the state's only rotation, if known.
         """
         if encoding == "quaternion":
             return state
@@ -256,13 +204,13 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def encoded_size(self, encoding: Encoding = "matrix") -> int:
-        """Number of features that :meth:`encode` gives."""
+        """Number of features of :meth:`encode`."""
         return sum(where.stop - where.start for where in self.encoded_slices(encoding).values())
 
     def encoded_slices(self, encoding: Encoding = "matrix") -> dict[str, slice]:
-        """Where each component lies in the features that :meth:`encode` gives."""
-        turned = 9 if encoding == "matrix" else 4
-        return _slices((c.name, turned if c.kind == "rotation" else c.size) for c in self.components)
+        """Slice of each component in the features of :meth:`encode`."""
+        rotation = 9 if encoding == "matrix" else 4
+        return _slices((c.name, rotation if c.kind == "rotation" else c.size) for c in self.components)
 
 
 def _slices(sizes) -> dict[str, slice]:
@@ -285,13 +233,6 @@ BODY_STATE = StateLayout(
 
 
 def joint_layout(extras: Sequence[str] = ()) -> StateLayout:
-    """State of a robot's body by its joint alone (paper, SM "Real JACO").
-
-    Args:
-        extras: names of further channels that were logged of every joint.
-
-    Returns:
-        Cosine and sine of the joint's angle, its velocity in rad/s, and the extras (``3 + extras`` channels).
-    """
+    """State of a joint (paper, SM "Real JACO"): cosine and sine of its angle, velocity in rad/s, the named extras."""
     angle, velocity = Component("angle", 2, "circle", rate="velocity"), Component("velocity", 1)
     return StateLayout((angle, velocity, *(Component(name, 1) for name in extras)))

@@ -8,42 +8,48 @@ from typing import Any, Literal, cast
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
 
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.policies.graph_policy import GraphPolicy
-from torchrl_gn.policies.learned_reward import LearnedReward
 from torchrl_gn.policies.observation_model import ObservationModel
-from torchrl_gn.policies.output_normalization import OutputNormalization
 from torchrl_gn.scenes import ObservationGraph
 
 
-class Agent(nn.Module):
-    """Policy, value and, to plan with, a forward model and a reward, on one task's flat observations.
+class LearnedReward(nn.Module):
+    """Reward ``[*B, 1]`` as a network of observation, action and next observation, differentiable in all three."""
 
-    Each is a module of its own, to be wired into TorchRL's losses and collectors; this class only makes them alike
-    every time and describes them for checkpoints. Actions lie in -1 to 1, as in the suite: policies end in
+    def __init__(self, num_observations: int, num_actions: int, hidden: Sequence[int] = (128, 128)) -> None:
+        super().__init__()
+        self.mlp = MLP(2 * num_observations + num_actions, 1, num_cells=list(hidden), activation_class=nn.SiLU)
+
+    def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+        return self.mlp(torch.cat((observation, action, next_observation), dim=-1))
+
+
+class OutputNormalization(nn.Module):
+    r"""Bounded location :math:`\mu / \sqrt{1 + \overline{\mu^2}}`, with a mean square of at most 1.
+
+    Keeps Adam from driving a policy into the flat ends of its tanh, where it explores no more. Wang et al. 2020
+    ("Striving for simplicity") divide by the mean magnitude where it is above 1; this is the same, smoothly.
+    """
+
+    def forward(self, location: Tensor) -> Tensor:
+        return location * (1 + location.square().mean(-1, keepdim=True)).rsqrt()
+
+
+class Agent(nn.Module):
+    """Policy, value and, to plan with, forward model and reward, on one task's flat observations.
+
+    Each is a module for TorchRL's losses and collectors. Actions lie in -1 to 1, as in the suite: policies end in
     :class:`OutputNormalization` and a tanh.
 
     Args:
-        graph: the task's observations and actions.
         stochastic: a Gaussian policy, squashed by a tanh (SVG), or a deterministic one (DDPG).
-        policy: ``"mlp"``, or ``"graph"``: a :class:`~torchrl_gn.policies.GraphPolicy`.
+        policy: ``"mlp"``, or ``"graph"``: a :class:`~torchrl_gn.policies.GraphPolicy`, which must be stochastic.
         hidden: hidden sizes of policy and value (:class:`LayerNormMLP`).
         min_scale: smallest standard deviation of a stochastic policy, before the tanh.
-        model: forward model: ``"gn"``, ``"mlp"`` or None.
-        model_options: further options of :class:`~torchrl_gn.policies.ObservationModel`.
-        policy_options: of the graph policy.
-        learned_reward: whether there is a network for the reward.
-
-    Raises:
-        ValueError: if ``policy`` is not known, or a graph policy shall be deterministic.
-
-    Attributes:
-        policy: TensorDict module from ``observation`` ``[*B, O]`` to ``action`` ``[*B, A]``.
-        value: TensorDict module from both to ``state_action_value`` ``[*B, 1]``.
-        model: :class:`~torchrl_gn.policies.ObservationModel` or None.
-        reward: :class:`~torchrl_gn.policies.LearnedReward` or None.
+        model: ``"gn"`` or ``"mlp"`` for a :class:`~torchrl_gn.policies.ObservationModel`, or None.
     """
 
     def __init__(
@@ -104,10 +110,9 @@ class Agent(nn.Module):
         return next((module for module in self.policy.modules() if isinstance(module, GraphPolicy)), None)
 
     def policy_for(self, graph: ObservationGraph) -> ProbabilisticActor:
-        """The policy for another body, sharing the weights: of a swimmer of another length, say.
+        """The policy for another body, such as a swimmer of another length, sharing the weights.
 
-        Raises:
-            ValueError: if the policy is no graph network, or has identities of this body's nodes.
+        Raises ValueError if the policy is no graph network, or has identities of this body's nodes.
         """
         if self.graph_policy is None:
             raise ValueError("Only a graph network drives other bodies; build the agent with policy='graph'.")
@@ -115,23 +120,19 @@ class Agent(nn.Module):
 
     @torch.no_grad()
     def update_normalizers(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> None:
-        """Take newly collected transitions ``[*B, O]``, ``[*B, A]`` and ``[*B, O]`` into all statistics, each once.
-
-        Raises:
-            ValueError: if a number is not finite.
-        """
+        """Add transitions ``[*B, O]``, ``[*B, A]``, ``[*B, O]`` to all statistics; ValueError if one is not finite."""
         if self.model is not None:
             self.model.update_normalizers(observation, action, next_observation)
         if self.graph_policy is not None:
             self.graph_policy.update_normalizers(observation)
 
     def description(self) -> dict:
-        """Everything needed to build this agent again, as plain JSON-able values."""
+        """JSON-able values from which :meth:`from_description` rebuilds the agent."""
         return {"graph": self.graph.description(), "options": self.options}
 
     @classmethod
     def from_description(cls, description: dict) -> Agent:
-        """Build the agent that :meth:`description` described, with fresh weights."""
+        """Build the agent of a :meth:`description`, with fresh weights."""
         return cls(ObservationGraph.from_description(description["graph"]), **description["options"])
 
 

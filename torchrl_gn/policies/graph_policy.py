@@ -1,4 +1,4 @@
-"""Policy that is a graph network."""
+"""Policies that are graph networks."""
 
 from __future__ import annotations
 
@@ -13,15 +13,10 @@ from torchrl_gn.scenes import ObservationGraph
 
 
 class GraphPolicy(nn.Module):
-    """Parameters of a Gaussian policy from a graph network: each joint's actions are read at the node it moves.
+    """Location and scale of a Gaussian policy from a graph network: each joint's actions are read at the node it moves.
 
-    Without identities in the graph the same weights drive bodies of any number of joints (:meth:`for_graph`), which the
-    paper does not try. Use it as the module of a TorchRL ``ProbabilisticActor``, in place of an MLP.
-
-    Args:
-        graph: where observations and actions belong.
-        min_scale: smallest standard deviation; TorchRL's own floor is 0.01.
-        **options: of :class:`ObservationNetwork`.
+    For TorchRL's ``ProbabilisticActor``. Without identities in the graph the same weights serve bodies of any number of
+    joints (:meth:`for_graph`), which the paper does not try. ``options`` are those of :class:`ObservationNetwork`.
 
     Raises:
         ValueError: if the graph has no actions.
@@ -45,7 +40,7 @@ class GraphPolicy(nn.Module):
         return policy
 
     def update_normalizers(self, observation: Tensor) -> None:
-        """Take observations ``[*B, O]`` into the statistics."""
+        """Add observations ``[*B, O]`` to the statistics."""
         self.network.update_normalizers(observation)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:

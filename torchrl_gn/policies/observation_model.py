@@ -18,18 +18,10 @@ from torchrl_gn.scenes import ObservationGraph
 class ObservationModel(TensorDictModuleBase):
     """Predict a task's next observation (paper, SM "SVG": the model of the agents that learn by planning).
 
-    Reads ``observation`` ``[*B, O]`` and ``action`` ``[*B, A]``, writes ``("next", "observation")``. The network
-    predicts changes, of node, joint and global features, in their normalised scale. Those of a joint are read at the
-    node that the joint moves and those of the whole graph as a sum over its nodes: what the paper reads at edges and
-    globals of the second graph network, with one output for all, so that everything folds as it does for bodies.
-
-    Differentiable in observations, actions and weights.
-
-    Args:
-        graph: where observations and actions belong.
-        observation_key: where to read the observation.
-        action_key: where to read the action.
-        **options: of :class:`ObservationNetwork`.
+    Reads ``observation`` ``[*B, O]`` and ``action`` ``[*B, A]``, writes ``("next", "observation")``; differentiable in
+    both and in the weights. The network predicts normalised changes of node, joint and global features. A joint's are
+    read at the node that it moves, the globals as a sum over nodes: one output for all, so that the network folds.
+    ``options`` are those of :class:`ObservationNetwork`.
     """
 
     take: Tensor
@@ -53,7 +45,6 @@ class ObservationModel(TensorDictModuleBase):
 
     @property
     def graph(self) -> ObservationGraph:
-        """The graph that observations are arranged as."""
         return self.network.graph
 
     def for_graph(self, graph: ObservationGraph) -> ObservationModel:
@@ -65,13 +56,12 @@ class ObservationModel(TensorDictModuleBase):
 
     @property
     def fitted(self) -> bool:
-        """Whether the normalisers have seen data. Waits for the device."""
-        changes = self.change_normalizer, self.global_change_normalizer
-        return self.network.fitted and all(each.fitted for each in changes)
+        """Whether the normalisers have data. Waits for the device."""
+        return self.network.fitted and self.change_normalizer.fitted and self.global_change_normalizer.fitted
 
     @property
     def change_std(self) -> Tensor:
-        """``[O]`` spread of each number's change, 0 where it never varied."""
+        """``[O]`` standard deviation of each number's change, 0 where it never varied."""
         return self._flat(self.change_normalizer.std, self.global_change_normalizer.std)
 
     def _flat(self, slots: Tensor, globals_: Tensor) -> Tensor:
@@ -81,10 +71,9 @@ class ObservationModel(TensorDictModuleBase):
 
     @torch.no_grad()
     def update_normalizers(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> None:
-        """Take transitions, ``[*B, O]``, ``[*B, A]`` and ``[*B, O]``, into the statistics.
+        """Add transitions ``[*B, O]``, ``[*B, A]``, ``[*B, O]`` to the statistics.
 
-        Raises:
-            ValueError: if a shape does not fit the graph or a number is not finite.
+        Raises ValueError if a shape does not fit the graph or a number is not finite.
         """
         places = self.network.places
         if next_observation.shape != observation.shape:
@@ -100,29 +89,24 @@ class ObservationModel(TensorDictModuleBase):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the predicted next observation into ``tensordict`` and return it."""
         observation, action = (tensordict[key] for key in self.in_keys)
         return tensordict.set(self.out_keys[0], self.step(observation, action))
 
     def step(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Next observation ``[*B, O]``.
-
-        Raises:
-            ValueError: if a shape does not fit the graph.
-        """
+        """Next observation ``[*B, O]``; ValueError if a shape does not fit the graph."""
         mean = self._flat(self.change_normalizer.mean, self.global_change_normalizer.mean)
         change = self._change(observation, action) * self.change_std.to(observation.dtype)
         return observation + change + mean.to(observation.dtype)
 
     def normalized_change(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Predicted change ``[*B, O]`` in its spread, nothing to go by where the change never varied."""
+        """Predicted change ``[*B, O]`` in standard deviations, 0 where the change never varied."""
         change = self._change(observation, action)
         mean = self._flat(self.change_normalizer.mean, self.global_change_normalizer.mean)
         inverse = self._flat(self.change_normalizer.inverse_std, self.global_change_normalizer.inverse_std)
         return change + (mean * inverse).to(change.dtype)
 
     def _change(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Predicted change ``[*B, O]`` in its spread, about its mean."""
+        """Predicted change ``[*B, O]`` in standard deviations from its mean."""
         out = self.network(observation, action).to(observation.dtype)
         slots = self.network.places.slots.shape[1]
         nodes, globals_ = out[..., :slots], out[..., slots:].sum(-2)

@@ -21,31 +21,25 @@ from torchrl_gn.scenes import ObservationGraph
 
 M = TypeVar("M", bound=nn.Module)
 
-# Spreads below this are rounding noise of float32 observations.
-_FLOOR = 1e-6
+_FLOOR = 1e-6  # standard deviation, rounding noise of float32 observations
 
 
 class ObservationNetwork(nn.Module):
     """Two graph networks, or their baseline, from flat observations to features of every node.
 
-    The first linear layers see normalised observations, arranged as the :class:`~torchrl_gn.scenes.ObservationGraph`
-    says, with the actions at their joints' edges, a feature 1 or -1 for the direction of an edge, and which node is
-    which if the graph shows identities. Everything constant is folded away at each call
-    (:func:`~torchrl_gn.networks.fold_gn_core.fold_gn_core`), exactly and differentiably in the weights.
+    Reads normalised observations, arranged as the :class:`~torchrl_gn.scenes.ObservationGraph` says, actions at their
+    joints' edges, the direction of edges (1 or -1), and one-hot nodes if the graph shows identities. Everything
+    constant is folded away at each call (:func:`~torchrl_gn.networks.fold_gn_core.fold_gn_core`), differentiably in
+    the weights.
 
     Args:
-        graph: where observations and actions belong.
+        graph: place of observations and actions.
         out_nodes: features of every output node.
-        actions: whether actions are seen.
+        actions: whether to read actions.
         core: ``"gn"``, or ``"mlp"``, one MLP over the flattened graph.
         latent: features between the two graph networks.
         hidden: hidden sizes of all their MLPs.
-        mlp_hidden: hidden sizes of the MLP.
-        activation: between the layers.
-        plain: evaluate the core as the paper writes it, by message passing: the same function, slowly.
-
-    Raises:
-        ValueError: if the core is not known.
+        plain: evaluate the core by message passing: the same function, slowly.
     """
 
     def __init__(
@@ -81,11 +75,10 @@ class ObservationNetwork(nn.Module):
         self.graph, self.places = graph, _Places(graph)
 
     def for_graph(self, graph: ObservationGraph) -> ObservationNetwork:
-        """The same weights and normalisers for another graph, a swimmer of another length, say.
+        """The same weights and normalisers for another graph, such as a swimmer of another length.
 
-        Raises:
-            ValueError: if its nodes, joints or globals have other numbers of features, or the weights are tied to one
-                graph: by identities, or an MLP.
+        Raises ValueError if its nodes, joints or globals have other numbers of features, or the weights are tied to one
+        graph: by identities, or an MLP.
         """
         own, other = _widths(self.graph), _widths(graph)
         if own != other:
@@ -104,15 +97,14 @@ class ObservationNetwork(nn.Module):
 
     @property
     def fitted(self) -> bool:
-        """Whether the normalisers have seen data. Waits for the device."""
+        """Whether the normalisers have data. Waits for the device."""
         return all(each.fitted for each in (self.node_normalizer, self.edge_normalizer, self.global_normalizer))
 
     @torch.no_grad()
     def update_normalizers(self, observation: Tensor, action: Tensor | None = None) -> None:
-        """Take observations ``[*B, O]`` and actions ``[*B, A]`` into the statistics.
+        """Add observations ``[*B, O]`` and actions ``[*B, A]`` to the statistics.
 
-        Raises:
-            ValueError: if a shape does not fit the graph or a number is not finite.
+        Raises ValueError if a shape does not fit the graph or a number is not finite.
         """
         nodes, edges, globals_ = self._arrange(observation, action)
         mask_nodes, mask_edges = self._masks()
@@ -147,11 +139,7 @@ class ObservationNetwork(nn.Module):
         return cast(nn.Linear, mlp[0]).weight
 
     def dynamic_graph(self, observation: Tensor, action: Tensor | None = None) -> Graph:
-        """Normalised graph ``[*B, ...]`` of observations ``[*B, O]`` and actions ``[*B, A]``.
-
-        Raises:
-            ValueError: if a shape does not fit the graph.
-        """
+        """Normalised graph ``[*B, ...]`` of observations ``[*B, O]`` and actions ``[*B, A]`` that fit the graph."""
         dtype = self._weight.dtype
         nodes, edges, globals_ = self._arrange(observation, action)
         mask_nodes, mask_edges = self._masks()
@@ -163,7 +151,7 @@ class ObservationNetwork(nn.Module):
         )
 
     def static_graph(self) -> Graph:
-        """What is the same for every sample: directions of edges, identities of nodes."""
+        """Directions of edges and identities of nodes, equal for every sample."""
         like = self._weight
         count = self.graph.num_nodes
         nodes = torch.eye(count).to(like) if self.graph.identity else like.new_zeros(count, 0)
@@ -171,7 +159,7 @@ class ObservationNetwork(nn.Module):
         return Graph(nodes, direction, like.new_zeros(0), self.places.incidence.edge_index)
 
     def forward(self, observation: Tensor, action: Tensor | None = None) -> Tensor:
-        """Features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if they are seen, actions ``[*B, A]``."""
+        """Features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if they are read, actions ``[*B, A]``."""
         dynamic, static = self.dynamic_graph(observation, action), self.static_graph()
         folded = UnfoldedCore(self.core, static) if self.plain else self.core.fold(self.places.incidence, static)
         return folded.predict(dynamic)
@@ -190,16 +178,10 @@ def _widths(graph: ObservationGraph) -> tuple[int, int, int, int]:
 
 
 class _Places(Float64Buffers):
-    """Tables that arrange the numbers of one observation graph.
+    """Tables that arrange the numbers of one observation graph."""
 
-    Attributes:
-        incidence: all nodes are predicted.
-        slots: ``[N, F_n + F_j]`` index in the observation, its length where there is none.
-        mask: bool like ``slots``, where there is one.
-    """
-
-    slots: Tensor
-    mask: Tensor
+    slots: Tensor  # [N, F_n + F_j] index in the observation, its length where there is none
+    mask: Tensor  # bool like slots, where there is one
     actions: Tensor
     globals_: Tensor
     moved: Tensor
@@ -210,24 +192,24 @@ class _Places(Float64Buffers):
         super().__init__()
         slots, actions, self.split = graph.node_entries, graph.node_actions, graph.num_node_features
         moved = graph.moved.repeat(2)
-        there = slots >= 0
+        filled = slots >= 0
         self.incidence = Incidence(torch.as_tensor(graph.edge_index), graph.num_nodes)
         self.constants(
             {
                 "slots": torch.as_tensor(slots) % (graph.num_observations + 1),
-                "mask": there,
+                "mask": filled,
                 "actions": torch.as_tensor(actions) % (graph.num_actions + 1),
                 "globals_": graph.global_entries,
                 "moved": moved,
-                "node_mask": there[:, : self.split],
+                "node_mask": filled[:, : self.split],
                 "edge_mask": torch.cat(
-                    [torch.as_tensor(part) for part in (there[moved, self.split :], actions[moved] >= 0)], dim=1
+                    [torch.as_tensor(part) for part in (filled[moved, self.split :], actions[moved] >= 0)], dim=1
                 ),
             }
         )
 
     def arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Node ``[*B, N, F_n]``, edge ``[*B, E, F_j + C]`` and global features ``[*B, F_g]``, 0 where there is none."""
+        """Node ``[*B, N, F_n]``, edge ``[*B, E, F_j + C]`` and global features ``[*B, F_g]``; padding is 0."""
         slots = F.pad(observation, (0, 1))[..., self.slots]
         edges = slots[..., self.moved, self.split :]
         if action is not None:

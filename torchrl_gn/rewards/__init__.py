@@ -1,11 +1,11 @@
 """Differentiable task rewards on states, for environments, planners and losses."""
 
-from torchrl_gn.rewards.arm_reach import arm_reach as arm_reach
 from torchrl_gn.rewards.balance import Balance as Balance
 from torchrl_gn.rewards.bodies import Bodies as Bodies
 from torchrl_gn.rewards.bodies import find_body as find_body
 from torchrl_gn.rewards.freeze_goal import FreezeGoal as FreezeGoal
 from torchrl_gn.rewards.imitate_pose import ImitatePose as ImitatePose
+from torchrl_gn.rewards.imitate_pose import arm_reach as arm_reach
 from torchrl_gn.rewards.motion import AngularSpeed as AngularSpeed
 from torchrl_gn.rewards.motion import Position as Position
 from torchrl_gn.rewards.motion import Velocity as Velocity

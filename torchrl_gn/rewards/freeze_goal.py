@@ -12,34 +12,11 @@ from torchrl_gn.rewards.reward import Reward
 
 
 class FreezeGoal(TensorDictModuleBase):
-    """Write the ``task`` that a reward reads at every step of a plan: ``reward.task_of(state, target)``.
+    """Write ``task = reward.task_of(state, target)``, which a reward reads at every step of a plan.
 
-    Put it before any planner: ``TensorDictSequential(FreezeGoal(reward), planner)``. Every plan then gets a new task;
-    for :class:`Reach` the direction from the body's current position (paper, SM "Planning configuration": "at the first
-    planning timestep"). To keep one task for a whole episode, apply the module to the episode's first TensorDict and
-    leave it out of the policy.
-
-    Reads ``state`` ``[*B, N, 13]`` and ``target`` ``[*B, *reward.target_shape]``, writes ``task``. Differentiable where
-    ``reward.task_of`` is; nothing is detached.
-
-    Args:
-        reward: reward that needs a target.
-
-    Raises:
-        TypeError: ``reward`` is no :class:`Reward`.
-        ValueError: the reward has no target; when called, the target has a wrong shape, is not finite or out of reach.
-        KeyError: when called, no ``state`` or ``target``.
-
-    Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_gn.rewards import make_reward
-        >>> from torchrl_gn.scenes import load_scene
-        >>> scene = load_scene("swimmer6")
-        >>> freeze = FreezeGoal(make_reward("reach", scene))
-        >>> state, target = torch.zeros(4, scene.num_nodes, 13), torch.ones(4, 3)
-        >>> freeze(TensorDict({"state": state, "target": target}, batch_size=[4]))["task"].shape
-        torch.Size([4, 3])
+    Before a planner, ``TensorDictSequential(FreezeGoal(reward), planner)``, every plan gets a new task. To keep one for
+    an episode, apply it to the episode's first TensorDict. Reads ``state`` ``[*B, N, 13]`` and ``target``
+    ``[*B, *reward.target_shape]`` (KeyError if missing, ValueError as of ``task_of``). Nothing is detached.
     """
 
     def __init__(self, reward: Reward):
@@ -54,7 +31,6 @@ class FreezeGoal(TensorDictModuleBase):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``task`` into the TensorDict and return it."""
         state, target = tensordict.get("state", None), tensordict.get("target", None)
         if state is None:
             raise KeyError(f"FreezeGoal({self.reward}) needs an entry 'state'; an environment's reset() writes it")

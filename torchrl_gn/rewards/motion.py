@@ -15,26 +15,9 @@ Axis = Literal["x", "y", "z"]
 
 
 class Velocity(Reward):
-    r"""Velocity of a body along a world axis, or a power of it.
+    """Velocity of a body's frame along a world axis after the step, m/s, to a power of at least 1.
 
-    .. math:: r = (v'_a)^k
-
-    with :math:`v'` the velocity of the body's frame after the step, m/s (paper, SM "Planning configuration":
-    horizontal velocity of Cheetah's and Walker2d's torso, squared vertical speed of Cheetah's torso).
-
-    Args:
-        scene: scene whose states are judged.
-        body: name of the body.
-        axis: ``"x"``, ``"y"`` or ``"z"``; z is up.
-        power: the exponent, at least 1; odd powers keep the sign.
-
-    Raises:
-        ValueError: the scene has no such body, or ``axis`` or ``power`` is invalid.
-
-    Example:
-        >>> from torchrl_gn.scenes import load_scene
-        >>> Velocity(load_scene("cheetah"), "torso", "z", power=2)
-        Velocity(scene='cheetah', body='torso', axis='z', power=2)
+    Paper, SM "Planning configuration": Cheetah and Walker2d "forward", Cheetah "vertical speed" (``power=2``).
     """
 
     def __init__(self, scene: Scene, body: str, axis: Axis, *, power: int = 1):
@@ -45,7 +28,6 @@ class Velocity(Reward):
         self.component = _component(axis)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        """Reward ``[*B, 1]``, m/s to the power; see :class:`Reward`. Only ``next_state`` is read."""
         return self.bodies.linear_velocity(next_state)[..., self.component] ** self.power
 
     def extra_repr(self) -> str:
@@ -53,18 +35,7 @@ class Velocity(Reward):
 
 
 class Position(Reward):
-    """Position of a body along a world axis after the step, metres.
-
-    Paper, SM "Planning configuration": vertical position of Cheetah's and Walker2d's torso (``axis="z"``).
-
-    Args:
-        scene: scene whose states are judged.
-        body: name of the body.
-        axis: ``"x"``, ``"y"`` or ``"z"``; z is up.
-
-    Raises:
-        ValueError: the scene has no such body, or ``axis`` is invalid.
-    """
+    """Position of a body along a world axis after the step, metres (paper: height of the torso)."""
 
     def __init__(self, scene: Scene, body: str, axis: Axis):
         super().__init__()
@@ -72,7 +43,6 @@ class Position(Reward):
         self.component = _component(axis)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        """Reward ``[*B, 1]``, metres; see :class:`Reward`. Only ``next_state`` is read."""
         return self.bodies.position(next_state)[..., self.component]
 
     def extra_repr(self) -> str:
@@ -80,27 +50,13 @@ class Position(Reward):
 
 
 class AngularSpeed(Reward):
-    r"""Squared angular speed of a body.
-
-    .. math:: r = |\omega'|^2
-
-    with :math:`\omega'` the angular velocity after the step, rad/s (paper, SM "Planning configuration",
-    Cheetah "Squared angular speed").
-
-    Args:
-        scene: scene whose states are judged.
-        body: name of the body.
-
-    Raises:
-        ValueError: the scene has no such body.
-    """
+    """Squared angular speed of a body after the step, rad^2/s^2 (paper: Cheetah "Squared angular speed")."""
 
     def __init__(self, scene: Scene, body: str):
         super().__init__()
         self.bodies = Bodies(scene, [body])
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        """Reward ``[*B, 1]``, rad^2/s^2; see :class:`Reward`. Only ``next_state`` is read."""
         return self.bodies.angular_velocity(next_state).square().sum(-1)
 
     def extra_repr(self) -> str:
@@ -108,27 +64,13 @@ class AngularSpeed(Reward):
 
 
 class VerticalDistance(Reward):
-    r"""Squared vertical distance between bodies and a reference body.
-
-    .. math:: r = \sum_i (z'_i - z'_\text{reference})^2
-
-    after the step (paper, SM "Planning configuration", Walker2d "Feet to head height", with the torso as the head).
-
-    Args:
-        scene: scene whose states are judged.
-        bodies: names of the bodies, summed over.
-        reference: name of the reference body.
-
-    Raises:
-        ValueError: the scene has no such body, or ``bodies`` is no list of different names.
-    """
+    """Sum of squared vertical distances to a reference body after the step, m^2 (paper: "Feet to head height")."""
 
     def __init__(self, scene: Scene, bodies: Sequence[str], reference: str):
         super().__init__()
         self.bodies, self.reference = Bodies(scene, bodies), Bodies(scene, [reference])
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        """Reward ``[*B, 1]``, square metres; see :class:`Reward`. Only ``next_state`` is read."""
         height = self.bodies.position(next_state)[..., 2]
         return (height - self.reference.position(next_state)[..., 2]).square().sum(-1, keepdim=True)
 

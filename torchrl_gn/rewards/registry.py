@@ -45,36 +45,17 @@ def available_rewards() -> tuple[tuple[str, str], ...]:
 
 
 def make_reward(task: str, scene: Scene) -> Reward:
-    """Reward of a task of the paper, bound to a scene (paper, SM "Planning configuration").
+    """Build a reward of the paper by its task's name, such as ``"balance"``, for a system's scene or variant.
 
-    Paper: Walker2d's ``"inverse_verticality"`` follows the paper's text, "same as Pendulum-Balance summed for torso,
-    thighs and legs": it is largest for a standing walker, despite its name. For a walker on its head use
-    ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
+    Paper: Walker2d's ``"inverse_verticality"`` is largest for a standing walker, as in the paper's text. For a walker
+    on its head use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
 
-    Args:
-        task: the task's name, for example ``"balance"``.
-        scene: a scene of one of the paper's systems, or a variant. For your own scene build the reward directly:
-            ``Balance(scene, ["my_pole"])``.
-
-    Returns:
-        The reward, bound to the scene's bodies.
-
-    Raises:
-        TypeError: ``scene`` is a robot known by its joints alone.
-        ValueError: the system has no such task (the message lists all), or the scene lacks a body that the task needs.
-
-    Example:
-        >>> from torchrl_gn.scenes import load_scene
-        >>> make_reward("balance", load_scene("pendulum"))
-        Balance(scene='pendulum', bodies=('pole',))
-        >>> make_reward("reach", load_scene("swimmer3"))
-        Reach(scene='swimmer3', body='head', shaping=0.01)
+    Raises ValueError for an unknown task (the message lists all), TypeError for a robot known by its joints alone.
     """
     require_bodies(scene)
-    system = scene.origin.get("system", scene.name)
-    family = "swimmerN" if re.fullmatch(r"swimmer\d+", system) else system
-    builder = _REWARDS.get((family, task))
+    system = re.sub(r"^swimmer\d+$", "swimmerN", scene.origin.get("system", scene.name))
+    builder = _REWARDS.get((system, task))
     if builder is None:
-        known = ", ".join(f"{name} ({of})" for of, name in available_rewards())
+        known = ", ".join(f"{name} ({of})" for of, name in _REWARDS)
         raise ValueError(f"no reward {task!r} for scene {scene.name!r}; there are: {known}")
     return builder(scene)

@@ -10,55 +10,30 @@ from torchrl_gn.finite import require_finite
 
 
 class Reward(nn.Module):
-    """Reward of one control step, a differentiable function of tensors.
+    """Reward of one control step for one scene, differentiable in all tensors; constants are buffers.
 
-    A subclass is built for one scene and looks up its bodies there. Constants (target orientations, say) are buffers,
-    so that ``reward.to(device)`` moves them. Environments accept any callable with the signature of :meth:`forward`.
-
-    Goals that vary between episodes are the entry ``target`` of an episode's TensorDict. When planning starts,
-    :meth:`task_of` turns the target and the current state into the ``task`` that :meth:`forward` reads at every step of
-    the plan; :class:`~torchrl_gn.rewards.FreezeGoal` does this before a planner.
-
-    Gradients flow to ``state``, ``action``, ``next_state``, ``task`` and ``target``; nothing is detached.
-
-    Attributes:
-        target_shape: shape of a target without batch; None if the reward needs none.
+    When planning starts, :meth:`task_of` makes the ``task``, which :meth:`forward` reads at every step of the plan,
+    from the episode's ``target`` (:class:`~torchrl_gn.rewards.FreezeGoal`). Environments accept any callable with the
+    signature of :meth:`forward`. Subclasses raise ValueError for bodies that the scene does not have.
     """
 
-    target_shape: tuple[int, ...] | None = None
+    target_shape: tuple[int, ...] | None = None  # of a target without batch; None if the reward needs none
 
     @abstractmethod
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        """Reward for taking ``action`` in ``state`` and arriving in ``next_state``.
+        """Reward ``[*B, 1]``, in the dtype of ``next_state``, for arriving there.
 
         Args:
-            state: ``[*B, N, 13]`` states before the step (position 3, w-first quaternion 4,
-                linear velocity 3, angular velocity 3; SI, world frame).
+            state: ``[*B, N, 13]`` before the step (position 3, w-first quaternion 4, velocity 3, angular velocity 3).
             action: ``[*B, A]`` controls during the step.
-            next_state: ``[*B, N, 13]`` states after the step.
-            task: goal of the episode, such as a direction, if the reward needs one; broadcasts against ``*B``.
-
-        Returns:
-            ``[*B, 1]`` rewards in the dtype of ``next_state``.
-
-        Raises:
-            ValueError: the reward needs a ``task`` and gets none, or one of a wrong shape.
+            next_state: ``[*B, N, 13]`` after the step.
+            task: goal of the episode, if the reward needs one; broadcasts against ``*B``. ValueError if it misfits.
         """
 
     def task_of(self, state: Tensor, target: Tensor) -> Tensor:
-        """Task of a plan that starts in ``state``; the target itself, unless a subclass overrides this.
+        """Task of a plan that starts in ``state`` ``[*B, N, 13]``: here the target ``[*B, *target_shape]`` itself.
 
-        Synchronises with a GPU to check the target.
-
-        Args:
-            state: ``[*B, N, 13]`` states that planning starts from.
-            target: ``[*B, *target_shape]``.
-
-        Returns:
-            The ``task`` that :meth:`forward` reads.
-
-        Raises:
-            ValueError: the reward needs no target, or the target has a wrong shape, is not finite or out of reach.
+        Waits for a GPU to check the target. ValueError if there must be none, or it is misshapen or not finite.
         """
         name = type(self).__name__
         if self.target_shape is None:
@@ -72,18 +47,7 @@ class Reward(nn.Module):
         return target
 
     def require_task(self, task: Tensor | None, next_state: Tensor) -> Tensor:
-        """Checked task, for a subclass's :meth:`forward`.
-
-        Args:
-            task: ``[*B, *target_shape]``, or broadcastable to it.
-            next_state: ``[*B, N, 13]``.
-
-        Returns:
-            ``task`` in the dtype of ``next_state``.
-
-        Raises:
-            ValueError: there is no task, or its shape does not fit.
-        """
+        """Task in the dtype of ``next_state``, for a subclass's :meth:`forward`; ValueError if missing or misshapen."""
         name, shape, batch = type(self).__name__, self.target_shape or (), next_state.shape[:-2]
         if task is None:
             raise ValueError(

@@ -10,19 +10,10 @@ from torchrl_gn.scenes import ObservationGraph
 
 
 class TargetDistance(nn.Module):
-    """The suite's reward for reaching a target, from the observed vector to the target.
+    """The suite's reward for reaching a target: 1 within ``radius`` of the target, less at larger distances.
 
-    1 within ``radius``; at larger distances ``d`` it is ``1 / (1 + (3 (d - radius) / margin)^2)``
-    (``dm_control.utils.rewards.tolerance`` with a long tail). The gradient at the target is 0.
-
-    Args:
-        graph: graph of the observations.
-        entry: entry of the observation that holds the vector to the target.
-        radius: size of the target, metres; 0.1 for the suite's swimmers.
-        margin: metres beyond the radius at which the reward is 0.1.
-
-    Raises:
-        ValueError: there is no such entry, or a length is not positive and finite.
+    At a distance ``d``, ``1 / (1 + (3 (d - radius) / margin)^2)``, as ``dm_control.utils.rewards.tolerance`` with a
+    long tail. ``entry`` of the observation is the vector to the target. The gradient there is 0.
     """
 
     def __init__(
@@ -38,7 +29,6 @@ class TargetDistance(nn.Module):
         self.where, self.radius, self.margin = slice(start, start + graph.observation[entry]), radius, margin
 
     def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-        """Reward ``[*B, 1]`` of the observation ``[*B, O]`` after the step."""
         square = next_observation[..., self.where].square().sum(-1, keepdim=True)
         # Clamp before the root: its gradient stays finite at 0.
         beyond = square.clamp(min=self.radius**2).sqrt() - self.radius

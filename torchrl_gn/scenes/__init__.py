@@ -7,35 +7,23 @@ Example:
     (7, 16, 5)
 """
 
-from torchrl_gn.scenes.errors import SceneChangedWarning, SceneError, UnsupportedSceneError
-from torchrl_gn.scenes.kinematic_tree import KinematicTree, tree_states
-from torchrl_gn.scenes.load import load_scene, scene_from_description
-from torchrl_gn.scenes.observation_graph import ObservationGraph
-from torchrl_gn.scenes.parameter_names import ParameterNames
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters
-from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
-from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange
-from torchrl_gn.scenes.variants import has_variants, make_variants, parameter_ranges, sample_parameters, sample_variants
-
-__all__ = [
-    "SYSTEMS",
-    "Attachment",
-    "ParameterNames",
-    "KinematicTree",
-    "ObservationGraph",
-    "ParameterRange",
-    "Scene",
-    "SceneChangedWarning",
-    "SceneError",
-    "PhysicalParameters",
-    "StaticGraph",
-    "UnsupportedSceneError",
-    "tree_states",
-    "has_variants",
-    "load_scene",
-    "make_variants",
-    "parameter_ranges",
-    "sample_parameters",
-    "sample_variants",
-    "scene_from_description",
-]
+from torchrl_gn.scenes.errors import SceneChangedWarning as SceneChangedWarning
+from torchrl_gn.scenes.errors import SceneError as SceneError
+from torchrl_gn.scenes.errors import UnsupportedSceneError as UnsupportedSceneError
+from torchrl_gn.scenes.kinematic_tree import KinematicTree as KinematicTree
+from torchrl_gn.scenes.kinematic_tree import tree_states as tree_states
+from torchrl_gn.scenes.load import load_scene as load_scene
+from torchrl_gn.scenes.load import scene_from_description as scene_from_description
+from torchrl_gn.scenes.observation_graph import ObservationGraph as ObservationGraph
+from torchrl_gn.scenes.parameter_names import ParameterNames as ParameterNames
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters as PhysicalParameters
+from torchrl_gn.scenes.scene import Attachment as Attachment
+from torchrl_gn.scenes.scene import Scene as Scene
+from torchrl_gn.scenes.scene import StaticGraph as StaticGraph
+from torchrl_gn.scenes.systems import SYSTEMS as SYSTEMS
+from torchrl_gn.scenes.systems import ParameterRange as ParameterRange
+from torchrl_gn.scenes.variants import has_variants as has_variants
+from torchrl_gn.scenes.variants import make_variants as make_variants
+from torchrl_gn.scenes.variants import parameter_ranges as parameter_ranges
+from torchrl_gn.scenes.variants import sample_parameters as sample_parameters
+from torchrl_gn.scenes.variants import sample_variants as sample_variants

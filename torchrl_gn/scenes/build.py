@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import mujoco
 import numpy as np
 
@@ -24,12 +26,7 @@ _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the sta
 
 
 def build_scene(
-    spec: mujoco.MjSpec,
-    *,
-    name: str,
-    timestep: float | None = None,
-    settle_steps: int = 0,
-    origin: dict | None = None,
+    spec: mujoco.MjSpec, *, name: str, timestep: float | None = None, settle_steps: int = 0, origin: dict | None = None
 ) -> Scene:
     """Read a scene from an MJCF model.
 
@@ -38,7 +35,6 @@ def build_scene(
 
     Args:
         spec: the MJCF model, left as it is.
-        name: name of the scene.
         timestep: control step, seconds, a multiple of the physics step; None: one physics step.
         settle_steps: physics steps without control after a reset.
         origin: source of the model, part of :meth:`Scene.description`.
@@ -50,7 +46,7 @@ def build_scene(
     model, graph = _compile(spec, name)
     actuator_of_joint = _actuator_of_joint(model)
     substeps = _substeps(model, timestep, name)
-    named = _namer(model)
+    named = partial(_named, model)
     node_names = tuple(named(mujoco.mjtObj.mjOBJ_BODY, body) for body in graph.body)
     joint_names = tuple(named(mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in range(model.njnt))
     static = static_graph(model, graph, actuator_of_joint, substeps * model.opt.timestep)
@@ -108,16 +104,13 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     return model, graph
 
 
-def _namer(model: mujoco.MjModel):
-    def named(kind: mujoco.mjtObj, element: int) -> str:
-        return mujoco.mj_id2name(model, kind, int(element)) or f"{kind.name.removeprefix('mjOBJ_').lower()}{element}"
-
-    return named
+def _named(model: mujoco.MjModel, kind: mujoco.mjtObj, element: int) -> str:
+    return mujoco.mj_id2name(model, kind, int(element)) or f"{kind.name.removeprefix('mjOBJ_').lower()}{element}"
 
 
 def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
-    """Return the actuator ``[J]`` of each joint, -1 without; refuse actuators that an edge cannot represent."""
-    named = _namer(model)
+    """Actuator ``[J]`` of each joint, -1 without; refuse actuators that an edge cannot represent."""
+    named = partial(_named, model)
     transmission = mujoco.mjtTrn
     actuators = np.full(model.njnt, -1, dtype=np.int64)
     # MuJoCo before 3.11 has one control an actuator, and before 3.5 no delays.

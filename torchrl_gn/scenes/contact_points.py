@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _GEOM = mujoco.mjtGeom
 
 SLOTS = 4
-"""Contact points per node that models see: the ones farthest from the node's origin."""
+"""Contact points per node that models read: the ones farthest from the node's origin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,7 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
     """Find the points that can touch a scene's first reachable plane; None if there are none.
 
     Takes spheres, ends of capsules, corners of boxes and ends of ellipsoid axes; cylinders and meshes give no points.
-
-    Args:
-        model: compiled model.
-        data: of that model at its reference, kinematics done.
-        graph: topology of the model.
+    ``data`` must be at its reference, kinematics done.
     """
     of_geom = graph.node_of_body[model.geom_bodyid]
     for plane in np.flatnonzero((model.geom_type == _GEOM.mjGEOM_PLANE) & (of_geom == 0)):
@@ -65,7 +61,7 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
 
 
 def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """Return centres and radii in the geom's frame."""
+    """Centres and radii in the geom's frame."""
     if kind == _GEOM.mjGEOM_SPHERE:
         return [(np.zeros(3), float(size[0]))]
     if kind == _GEOM.mjGEOM_CAPSULE:
@@ -80,7 +76,7 @@ def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
 
 
 def contact_slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the kept points as offsets ``[N, 4, 3]``, radii ``[N, 4]`` and mask ``[N, 4]``."""
+    """Offsets ``[N, 4, 3]``, radii ``[N, 4]`` and mask ``[N, 4]`` of the kept points."""
     offset, radius = np.zeros((scene.num_nodes, SLOTS, 3)), np.zeros((scene.num_nodes, SLOTS))
     mask, points = np.zeros((scene.num_nodes, SLOTS), dtype=bool), scene.contact_points
     if points is None:

@@ -44,7 +44,7 @@ _FLEXES = (
 
 
 def fingerprint(scene: Scene) -> str:
-    """Return the hash of :func:`physics`."""
+    """Hash of :func:`physics`."""
     return hashlib.sha256("\n".join(physics(scene)).encode()).hexdigest()[:16]
 
 
@@ -225,11 +225,11 @@ class _Names:
         return mujoco.mj_id2name(self.model, kind, element) or ""
 
     def body(self, body: int) -> str:
-        """Return the name of a body's node."""
+        """Name of a body's node."""
         return self.nodes[int(self.graph.node_of_body[body])]
 
     def pose(self, body: int, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return position ``[3]`` and rotation ``[3, 3]`` in the node's frame of an element fixed to a body."""
+        """Position ``[3]`` and rotation ``[3, 3]`` in the node's frame of an element fixed to a body."""
         origin, orientation = offset(self.model, body, int(self.graph.body[self.graph.node_of_body[body]]))
         frame = _matrix(orientation).reshape(3, 3)
         return origin + frame @ pos, frame @ _matrix(quat).reshape(3, 3)
@@ -260,7 +260,7 @@ def _arrays(of: str, model: mujoco.MjModel, prefix: str, index: int | slice, nam
 
 
 def _field(owner: mujoco.MjModel | mujoco.MjOption, name: str, index: int | slice | None = None) -> Any:
-    """Return a field, or zero if this version of MuJoCo lacks it."""
+    """A field, or zero if this version of MuJoCo lacks it."""
     values = getattr(owner, name, None)
     return 0.0 if values is None else values if index is None else values[index]
 
@@ -294,7 +294,7 @@ def _clean_digits(values, scale: float = 1.0) -> list[str]:
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix ``[9]``, which unlike the quaternion has no ambiguous sign."""
+    """Rotation matrix ``[9]``, which unlike the quaternion has no ambiguous sign."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quat)
     return matrix

@@ -12,19 +12,11 @@ _Disable = mujoco.mjtDisableBit
 
 
 def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> np.ndarray:
-    """Return the axes along which the dynamics do not depend on where the scene is.
+    """Axes ``[3]``, bool, along which the dynamics do not depend on where the scene is.
 
     Along such an axis, slide or free joints without limit, spring or position actuator move every root, contacts with
     fixed geoms are with parallel planes alone, and no equality constraint or tendon acts on the world or those joints.
-    Scenes with plugins or flexes count as not invariant.
-
-    Args:
-        model: compiled model.
-        data: of that model at its reference, kinematics done.
-        graph: topology of the model.
-
-    Returns:
-        ``[3]`` bool.
+    Scenes with plugins or flexes count as not invariant. ``data`` must be at its reference, kinematics done.
     """
     return np.array([_invariant_along(model, data, graph, axis) for axis in np.eye(3)])
 
@@ -46,7 +38,7 @@ def _invariant_along(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology
 
 
 def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[int] | None:
-    """Return the joints that shift a root body along ``axis``; None if it cannot move along it."""
+    """Joints that shift a root body along ``axis``; None if it cannot move along it."""
     slides, directions = [], []
     frame = reference_rotation(model, body)
     first = model.body_jntadr[body]
@@ -68,7 +60,7 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
 
 
 def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
-    """Return the world orientation ``[3, 3]`` at the reference of a body below fixed bodies."""
+    """World orientation ``[3, 3]`` at the reference of a body below fixed bodies."""
     rotation = np.eye(3)
     while body:
         matrix = np.empty(9)
@@ -87,11 +79,8 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
     for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
         gain = gains(model.actuator_gaintype[actuator])
         bias = biases(model.actuator_biastype[actuator])
-        if gain not in (gains.mjGAIN_FIXED, gains.mjGAIN_AFFINE):
-            return True
-        if bias not in (biases.mjBIAS_NONE, biases.mjBIAS_AFFINE):
-            return True
-        if gain == gains.mjGAIN_AFFINE and model.actuator_gainprm[actuator, 1]:
+        known = gain in (gains.mjGAIN_FIXED, gains.mjGAIN_AFFINE) and bias in (biases.mjBIAS_NONE, biases.mjBIAS_AFFINE)
+        if not known or gain == gains.mjGAIN_AFFINE and model.actuator_gainprm[actuator, 1]:
             return True
         if bias == biases.mjBIAS_AFFINE and model.actuator_biasprm[actuator, 1]:
             return True

@@ -33,12 +33,9 @@ class JointAnchors:
 
 
 def find_joint_anchors(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> JointAnchors:
-    """Find the joint anchors of a model: bodies whose joints are all hinges and balls about one point have one.
+    """Joint anchors of a model: bodies whose joints are all hinges and balls about one point have one.
 
-    Args:
-        model: compiled model.
-        data: of that model at its reference, kinematics done.
-        graph: topology of the model.
+    ``data`` must be at its reference, kinematics done.
     """
     count = len(graph.body)
     parent, root = np.arange(count), np.arange(count)

@@ -9,7 +9,7 @@ from torchrl_gn.scenes.scene import Scene
 
 
 def joint_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return the node ``[J]`` that each joint's axis is fixed to, and the unit axis ``[J, 3]`` in its frame.
+    """Node ``[J]`` that each joint's axis is fixed to, and the unit axis ``[J, 3]`` in its frame.
 
     The node is the parent if no rotation precedes the joint on its body, else the child (approximate for the middle one
     of three hinges). Axes of balls and free joints are 0.

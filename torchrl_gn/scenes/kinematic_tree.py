@@ -18,31 +18,21 @@ from torchrl_gn.scenes.scene import StaticGraph
 class KinematicTree:
     """Kinematic tree of a robot known by its joint encoders (paper, SM "Real JACO").
 
-    Node 0 is the base, the others the joints' bodies; node states follow :func:`~torchrl_gn.maths.joint_layout`.
-    Takes the place of a :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors.
-
-    Args:
-        name: name of the robot.
-        joint_names: names of its ``J`` joints, from the base on.
-        timestep: control step, seconds.
-        commands: commands that act on each joint, by index; none for a joint without motor.
-        extras: names of further channels, one number per joint each.
-        action_low: ``[A]`` lower bounds of the commands; default: unbounded.
-        action_high: ``[A]`` upper bounds.
-        joint_parents: parent of each joint, -1 for the base; default: the joint before it.
+    Node 0 is the base, the others the joints' bodies; node states follow :func:`~torchrl_gn.maths.joint_layout`. Takes
+    the place of a :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors.
 
     Raises:
         ValueError: if there is no joint, or an argument does not fit.
     """
 
     name: str
-    joint_names: tuple[str, ...]
-    timestep: float
-    commands: tuple[tuple[int, ...], ...]
-    extras: tuple[str, ...] = ()
-    action_low: np.ndarray = field(default_factory=lambda: np.empty(0))
+    joint_names: tuple[str, ...]  # of the J joints, from the base on
+    timestep: float  # control step, seconds
+    commands: tuple[tuple[int, ...], ...]  # indices of the commands that act on each joint; none without motor
+    extras: tuple[str, ...] = ()  # further channels, one number per joint each
+    action_low: np.ndarray = field(default_factory=lambda: np.empty(0))  # [A]; default: unbounded
     action_high: np.ndarray = field(default_factory=lambda: np.empty(0))
-    joint_parents: tuple[int, ...] = ()
+    joint_parents: tuple[int, ...] = ()  # parent of each joint, -1 for the base; default: the joint before it
 
     yaw_frame = None
     contact_points = None
@@ -167,7 +157,7 @@ class KinematicTree:
         )
 
     def values(self) -> PhysicalParameters:
-        """Return the physical parameters: static features, and zeros for those of bodies in space."""
+        """Physical parameters: static features, and zeros for those of bodies in space."""
         n, e = self.num_nodes, self.num_edges
         static = self.static
         arrays = (static.nodes, static.edges, static.globals_, np.zeros((e, 3)), np.array([1.0, 0, 0, 0]), np.zeros(3))
@@ -175,7 +165,7 @@ class KinematicTree:
         return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     def description(self) -> dict:
-        """Return JSON-able values from which :func:`~torchrl_gn.scenes.scene_from_description` rebuilds it."""
+        """JSON-able values from which :func:`~torchrl_gn.scenes.scene_from_description` rebuilds it."""
         tree = {
             "name": self.name,
             "joint_names": list(self.joint_names),
@@ -192,36 +182,20 @@ class KinematicTree:
     @classmethod
     def from_description(cls, description: dict) -> KinematicTree:
         """Rebuild from :meth:`description`."""
-        tree = description["joint_chain"]
-        bounds = {
-            which: np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
-            for which, infinite in (("action_low", -np.inf), ("action_high", np.inf))
-        }
-        return cls(
-            name=tree["name"],
-            joint_names=tuple(tree["joint_names"]),
-            timestep=tree["timestep"],
-            commands=tuple(tuple(indices) for indices in tree["commands"]),
-            extras=tuple(tree["extras"]),
-            joint_parents=tuple(tree["joint_parents"]),
-            **bounds,
-        )
+        tree = dict(description["joint_chain"])
+        for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
+            tree[which] = np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
+        for which in ("joint_names", "extras"):
+            tree[which] = tuple(tree[which])
+        return cls(**tree)
 
     def fingerprint(self) -> str:
-        """Return a hash of all arguments."""
-        text = [
-            self.name,
-            *self.joint_names,
-            f"{self.timestep:.6g}",
-            str(self.commands),
-            str(self.joint_parents),
-            *self.extras,
-        ]
-        text += [f"{value:.6g}" for value in (*self.action_low, *self.action_high)]
-        return hashlib.sha256("\n".join(text).encode()).hexdigest()[:16]
+        """Hash of all arguments."""
+        text = (self.name, *self.joint_names, f"{self.timestep:.6g}", str(self.commands), str(self.joint_parents))
+        bounds = (f"{value:.6g}" for value in (*self.action_low, *self.action_high))
+        return hashlib.sha256("\n".join((*text, *self.extras, *bounds)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
-        """Summarise joints, parents and commands."""
         lines = [
             f"Robot {self.name}: {self.num_joints} joints, {self.num_actions} commands, step {1e3 * self.timestep:g} ms"
         ]
@@ -232,16 +206,10 @@ class KinematicTree:
 
 
 def tree_states(angle: np.ndarray, velocity: np.ndarray, extras: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """Return the node states of a kinematic tree.
+    """Node states ``[..., J + 1, 3 + extras]``, float64, from angles and velocities ``[..., J]`` (radians, rad/s).
 
-    Args:
-        angle: ``[..., J]`` radians.
-        velocity: ``[..., J]`` rad/s.
-        extras: ``[..., J]`` each, in the order of :attr:`KinematicTree.extras`.
-
-    Returns:
-        ``[..., J + 1, 3 + extras]`` float64: cosine and sine of the angle, velocity, extras; the base's are 1, 0, 0,
-        ...
+    Cosine and sine of the angle, velocity, and ``extras`` ``[..., J]``, in the order of :attr:`KinematicTree.extras`;
+    the base's are 1, 0, 0, ...
     """
     bodies = np.stack((np.cos(angle), np.sin(angle), velocity, *extras), axis=-1).astype(np.float64)
     base = np.zeros((*bodies.shape[:-2], 1, bodies.shape[-1]))

@@ -43,10 +43,6 @@ def load_scene(
         FileNotFoundError: if the file does not exist.
         SceneError: if the MJCF is invalid or ``timestep`` does not fit.
         UnsupportedSceneError: if the graph cannot represent an element, which the message names.
-
-    Example:
-        >>> load_scene("swimmer6").timestep
-        0.02
     """
     if parameters is not None:
         return make_variant(source, parameters, timestep=timestep, name=name)
@@ -67,7 +63,7 @@ def load_scene(
                 settle_steps=system.settle_steps,
                 origin={"system": system.name},
             )
-        if not _looks_like_path(source):
+        if not (source.endswith((".xml", ".mjcf")) or set("/\\") & set(source) or Path(source).is_file()):
             raise ValueError(_unknown(source))
     spec, origin = read_mjcf(source if isinstance(source, str) else Path(source))
     own_name = spec.modelname if isinstance(source, str) and is_mjcf_text(source) else Path(source).stem
@@ -77,8 +73,7 @@ def load_scene(
 def scene_from_description(description: dict) -> Scene:
     """Rebuild the scene of a :meth:`Scene.description`.
 
-    Warns:
-        SceneChangedWarning: if its physics differ, as with another version of MuJoCo or of the model files.
+    Warns SceneChangedWarning if its physics differ, as with another version of MuJoCo or of the model files.
     """
     if "joint_chain" in description:
         # It has every attribute of a scene that models and errors read.
@@ -106,10 +101,6 @@ def scene_from_description(description: dict) -> Scene:
             stacklevel=2,
         )
     return scene
-
-
-def _looks_like_path(source: str) -> bool:
-    return source.endswith((".xml", ".mjcf")) or any(sep in source for sep in "/\\") or Path(source).is_file()
 
 
 def _unknown(name: str) -> str:

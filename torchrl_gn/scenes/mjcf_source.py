@@ -12,14 +12,9 @@ from torchrl_gn.scenes.errors import SceneError
 
 
 def read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
-    """Parse an MJCF file or MJCF text.
+    """Parse an MJCF file or text; also return ``{"mjcf": text, "assets": {path: base64}}`` for :func:`rebuild_mjcf`.
 
-    Returns:
-        The parsed model, and ``{"mjcf": text, "assets": {path: base64}}`` for :func:`rebuild_mjcf`.
-
-    Raises:
-        FileNotFoundError: if the file does not exist.
-        SceneError: if MuJoCo cannot parse the text.
+    Raises FileNotFoundError if the file does not exist, SceneError if MuJoCo cannot parse it.
     """
     path = None if isinstance(source, str) and is_mjcf_text(source) else Path(source)
     if path is not None and not path.is_file():

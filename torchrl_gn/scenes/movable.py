@@ -9,11 +9,10 @@ _TOLERANCE = 1e-9
 
 
 def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray, *, samples: int = 8) -> np.ndarray:
-    """Return the mask ``[N, 12]`` of movable components for root bodies ``[N]``; ``data`` is overwritten.
+    """Mask ``[N, 12]`` of movable components for root bodies ``[N]``; ``data`` is overwritten.
 
-    Components, world frame: position 3, rotation vector 3, linear velocity 3, angular velocity 3. A row of the analytic
-    body Jacobian that vanishes at random configurations vanishes everywhere. Constraints, which only remove motion, are
-    ignored.
+    Components, world frame: position 3, rotation vector 3, linear velocity 3, angular velocity 3. A row of the body
+    Jacobian that vanishes at random configurations vanishes everywhere. Constraints are ignored.
     """
     rng = np.random.default_rng(0)
     largest = np.zeros((len(body), 6))  # largest entry of every Jacobian row

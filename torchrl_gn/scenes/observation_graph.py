@@ -22,31 +22,18 @@ class ObservationGraph:
     observation, ``"joints[0]"`` one number of it, ``"body_velocities[3:6]"`` several. Every number has exactly one
     place; nodes and joints with fewer numbers than others are padded with zeros.
 
-    Args:
-        name: name of the task, for messages.
-        observation: size of each entry of the flat observation, in order.
-        nodes: entries of every node, by its name.
-        joints: entries of every joint, by its (parent, child) bodies.
-        globals_: entries of the whole graph.
-        actions: indices of the actions at each joint that has any, by (parent, child).
-        identity: show networks each node's index, one-hot; not for networks that serve graphs of several sizes.
-
     Raises:
         ValueError: if an entry is unknown or used other than once, a joint names an unknown node, the joints do not
             form trees, or an action has no place.
-
-    Example:
-        >>> ObservationGraph.swimmer(6).num_observations
-        25
     """
 
-    name: str
-    observation: Mapping[str, int]
-    nodes: Mapping[str, tuple[str, ...]]
-    joints: Mapping[tuple[str, str], tuple[str, ...]]
-    globals_: tuple[str, ...] = ()
-    actions: Mapping[tuple[str, str], tuple[int, ...]] = field(default_factory=dict)
-    identity: bool = False
+    name: str  # of the task, for messages
+    observation: Mapping[str, int]  # size of each entry of the flat observation, in order
+    nodes: Mapping[str, tuple[str, ...]]  # entries of every node
+    joints: Mapping[tuple[str, str], tuple[str, ...]]  # entries of every joint, by its (parent, child) bodies
+    globals_: tuple[str, ...] = ()  # entries of the whole graph
+    actions: Mapping[tuple[str, str], tuple[int, ...]] = field(default_factory=dict)  # indices of each joint's actions
+    identity: bool = False  # show networks each node's index, one-hot; not for graphs of several sizes
 
     def __post_init__(self) -> None:
         for index, node in enumerate(self.node_names):
@@ -69,7 +56,7 @@ class ObservationGraph:
 
     @classmethod
     def swimmer(cls, num_links: int) -> ObservationGraph:
-        """Return the paper's mapping of the suite's swimmers, with any number of links."""
+        """The paper's mapping of the suite's swimmers, with any number of links."""
         links = ["head", *(f"segment_{link}" for link in range(num_links - 1))]
         pairs = list(zip(links[:-1], links[1:], strict=True))
         return cls(
@@ -83,11 +70,7 @@ class ObservationGraph:
 
     @classmethod
     def of_task(cls, domain: str, task: str, declared: dict | None = None) -> ObservationGraph:
-        """Return the mapping of a Control Suite task: the ``declared`` :meth:`description`, or the built-in one.
-
-        Raises:
-            ValueError: if none is declared or built in.
-        """
+        """Mapping of a Control Suite task: ``declared`` (a :meth:`description`) or built in; else ValueError."""
         if declared is not None:
             return cls.from_description(declared)
         links = task.removeprefix("swimmer")
@@ -215,7 +198,7 @@ class ObservationGraph:
         raise IndexError(index)
 
     def description(self) -> dict:
-        """Return JSON-able values from which :meth:`from_description` rebuilds the graph."""
+        """JSON-able values from which :meth:`from_description` rebuilds the graph."""
         return {
             "name": self.name,
             "observation": dict(self.observation),
@@ -230,8 +213,7 @@ class ObservationGraph:
     def from_description(cls, description: dict) -> ObservationGraph:
         """Rebuild from :meth:`description`; ``globals``, ``actions`` and ``identity`` are optional.
 
-        Raises:
-            ValueError: if a key is missing, unknown or declared twice, or the values make no graph.
+        Raises ValueError if a key is missing, unknown or declared twice, or the values make no graph.
         """
         needed, optional = ["name", "observation", "nodes", "joints"], ["globals", "actions", "identity"]
         for wrong, what in (
@@ -251,7 +233,6 @@ class ObservationGraph:
         )
 
     def __str__(self) -> str:
-        """Summarise the entries and actions of nodes, joints and globals."""
         lines = [
             f"Observation graph {self.name}: {self.num_observations} observations, {self.num_actions} actions,"
             f" {self.num_nodes} nodes, {len(self.joints)} joints"
@@ -264,7 +245,7 @@ class ObservationGraph:
 
 
 def _by_joint(rows: Sequence[Sequence], what: str) -> dict[tuple[str, str], tuple]:
-    """Return the entries of each (parent, child) from rows ``[parent, child, entries]``."""
+    """Entries of each (parent, child) from rows ``[parent, child, entries]``."""
     found: dict[tuple[str, str], tuple] = {}
     for row in rows:
         if len(row) != 3 or isinstance(row[2], str):
@@ -276,7 +257,7 @@ def _by_joint(rows: Sequence[Sequence], what: str) -> dict[tuple[str, str], tupl
 
 
 def _positions(entries: np.ndarray) -> np.ndarray:
-    """Return the positions of 0, 1, ... in ``entries``, ignoring -1."""
+    """Positions of 0, 1, ... in ``entries``, ignoring -1."""
     (valid,) = np.nonzero(entries >= 0)
     return valid[np.argsort(entries[valid])]
 

@@ -22,11 +22,6 @@ class ParameterNames:
     """Names of the physical-parameter columns of a scene, a data set or a model.
 
     Matching by name lets data sets and weights outlive changes of the columns.
-
-    Attributes:
-        nodes: names of the node features.
-        edges: names of the edge features.
-        globals_: names of the global features.
     """
 
     nodes: tuple[str, ...] = ()
@@ -35,7 +30,7 @@ class ParameterNames:
 
     @classmethod
     def of(cls, scene: Scene) -> ParameterNames:
-        """Return the names of a scene."""
+        """Names of a scene."""
         static = scene.static
         return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
 
@@ -45,7 +40,7 @@ class ParameterNames:
         return cls(**{part: tuple(columns) for part, columns in names.items()})
 
     def common(self, other: ParameterNames) -> ParameterNames:
-        """Return the names that ``other`` has too, in the order of this set."""
+        """Names that ``other`` has too, in the order of this set."""
         others = asdict(other)
         return ParameterNames(
             **{part: tuple(name for name in names if name in others[part]) for part, names in asdict(self).items()}
@@ -62,17 +57,14 @@ class ParameterNames:
         ]
 
     def columns_in(self, other: ParameterNames) -> dict[str, list[int]]:
-        """Return each name's column in ``other``, by part, for :func:`take_columns`; -1 where missing."""
+        """Each name's column in ``other``, by part, for :func:`take_columns`; -1 where missing."""
         columns = {part: {name: column for column, name in enumerate(names)} for part, names in asdict(other).items()}
         return {part: [columns[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
 
     def select(self, scene: Scene) -> PhysicalParameters:
-        """Return a scene's physical parameters with these columns alone.
+        """A scene's physical parameters with these columns alone; ValueError if it lacks one.
 
         Types and flags that this MuJoCo version does not know are 0.
-
-        Raises:
-            ValueError: if the scene lacks another column.
         """
         values, available = PhysicalParameters.of(scene), ParameterNames.of(scene)
         if missing := self.missing_in(available):

@@ -18,35 +18,22 @@ if TYPE_CHECKING:
 
 
 class PhysicalParameters(NamedTuple):
-    """Physical parameters of a scene (lengths, masses, ...), float64, with or without a batch.
+    """Physical parameters of a scene (lengths, masses, ...), float64, with or without a batch."""
 
-    Attributes:
-        nodes: ``[*B, N, F_n]`` static node features, true or inferred, all or those that a model reads.
-        edges: ``[*B, E, F_e]``.
-        globals_: ``[*B, F_g]``.
-        joint_axis: ``[*B, E, 3]`` joint axis of each edge, in the frame of the node it is fixed to.
-        rest: ``[*B, 4]`` the root's orientation at yaw 0.
-        pivot: ``[*B, 3]`` a point on the yaw axis, metres.
-        parent_anchor: ``[*B, N, 3]`` anchor of each node in the parent's frame, metres.
-        arm: ``[*B, N, 3]`` anchor of each node in its own frame, metres.
-        contact_offset: ``[*B, N, 4, 3]`` contact points in the node's frame, metres.
-        contact_radius: ``[*B, N, 4]`` metres.
-    """
-
-    nodes: Tensor
-    edges: Tensor
-    globals_: Tensor
-    joint_axis: Tensor
-    rest: Tensor
-    pivot: Tensor
-    parent_anchor: Tensor
-    child_anchor: Tensor
-    contact_offset: Tensor
-    contact_radius: Tensor
+    nodes: Tensor  # [*B, N, F_n] static node features, true or inferred, all or those that a model reads
+    edges: Tensor  # [*B, E, F_e]
+    globals_: Tensor  # [*B, F_g]
+    joint_axis: Tensor  # [*B, E, 3] joint axis of each edge, in the frame of the node it is fixed to
+    rest: Tensor  # [*B, 4] the root's orientation at yaw 0
+    pivot: Tensor  # [*B, 3] a point on the yaw axis, metres
+    parent_anchor: Tensor  # [*B, N, 3] anchor of each node in the parent's frame, metres
+    child_anchor: Tensor  # [*B, N, 3] anchor of each node in its own frame, metres
+    contact_offset: Tensor  # [*B, N, 4, 3] contact points in the node's frame, metres
+    contact_radius: Tensor  # [*B, N, 4] metres
 
     @classmethod
     def of(cls, scene: Scene | KinematicTree) -> PhysicalParameters:
-        """Return the parameters of a scene."""
+        """Parameters of a scene."""
         if not isinstance(scene, Scene):
             return scene.values()
         yaw_frame, (offset, radius, _) = scene.yaw_frame, contact_slots(scene)
@@ -66,12 +53,7 @@ class PhysicalParameters(NamedTuple):
 
     @classmethod
     def read(cls, static: TensorDictBase, own: PhysicalParameters) -> PhysicalParameters:
-        """Return the entries of a TensorDict, completed by a scene's ``own``.
-
-        Raises:
-            KeyError: if an entry is unknown.
-            ValueError: if an entry has a wrong shape.
-        """
+        """Entries of a TensorDict, completed by ``own``; KeyError if one is unknown, ValueError if misshapen."""
         unknown = sorted(set(map(str, static.keys())) - set(cls._fields))
         if unknown:
             raise KeyError(f"Physical parameters {unknown} are not known; use some of {list(cls._fields)}.")
@@ -85,12 +67,12 @@ class PhysicalParameters(NamedTuple):
         return cls(**values)
 
     def tensordict(self) -> TensorDict:
-        """Return a TensorDict without batch."""
+        """A TensorDict without batch."""
         return TensorDict(self._asdict())
 
 
 def topology(scene: Scene) -> dict[str, object]:
-    """Return what the variants of a scene have in common, as comparable values by name."""
+    """Everything that the variants of a scene have in common, as comparable values by name."""
     yaw_frame, joint_anchors = scene.yaw_frame, scene.joint_anchors
     return {
         "number of nodes": scene.num_nodes,

@@ -17,21 +17,12 @@ from torchrl_gn.scenes.yaw_frame import YawFrame
 
 @dataclass(frozen=True)
 class StaticGraph:
-    """Static graph ``G_s`` of a scene (paper, SM "Mujoco variables"), float64.
+    """Static graph ``G_s`` of a scene (paper, SM "Mujoco variables"), float64."""
 
-    Attributes:
-        nodes: ``[N, F_n]`` features of every node, in parent-relative frames.
-        edges: ``[E, F_e]`` features of every directed edge.
-        globals_: ``[F_g]`` features of the whole scene.
-        node_names: names of the ``F_n`` columns, for example ``"mass"`` or ``"inertia[0]"``.
-        edge_names: names of the ``F_e`` columns.
-        global_names: names of the ``F_g`` columns.
-    """
-
-    nodes: np.ndarray
-    edges: np.ndarray
-    globals_: np.ndarray
-    node_names: tuple[str, ...]
+    nodes: np.ndarray  # [N, F_n] features in parent-relative frames
+    edges: np.ndarray  # [E, F_e]
+    globals_: np.ndarray  # [F_g]
+    node_names: tuple[str, ...]  # names of the F_n columns, such as "mass" or "inertia[0]"
     edge_names: tuple[str, ...]
     global_names: tuple[str, ...]
 
@@ -51,55 +42,30 @@ class Scene:
 
     A node is a group of bodies welded together, its state the frame of the group's root body. Node 0 is the world.
     Every joint gives two directed edges, parent to child, then child to parent.
-
-    Attributes:
-        name: name of the system, for messages and files.
-        model: compiled model; its last sensors are the frame sensors of the nodes; warm starts are off.
-        node_names: ``N`` names, ``"world"`` first.
-        joint_names: names of the ``E / 2`` joints, in edge order.
-        actuator_names: ``A`` names, in the order of ``mjData.ctrl``.
-        body: ``[N]`` MuJoCo id of each node's root body.
-        parent: ``[N]`` parent node; the world's is -1.
-        senders: ``[E]`` sending node of each edge.
-        receivers: ``[E]`` receiving node of each edge.
-        edge_action: ``[E]`` action at the edge's joint, -1 without motor.
-        static: static graph.
-        movable: ``[N, 12]`` bool, movable components of the state change (position 3, rotation 3, linear velocity 3,
-            angular velocity 3; world frame).
-        translation_invariant: ``[3]`` bool, world axes along which the dynamics do not depend on position.
-        yaw_frame: yaw frame, if the dynamics do not depend on the yaw.
-        joint_anchors: joint anchors.
-        contact_points: points that can touch a plane fixed in the world.
-        action_low: ``[A]`` lower bounds of the actions.
-        action_high: ``[A]`` upper bounds of the actions.
-        substeps: physics steps in one control step.
-        attachments: named bodies that are not the root of a node, by name.
-        settle_steps: physics steps without control after a reset.
-        origin: source of the model, see :meth:`description`.
     """
 
     name: str
-    model: mujoco.MjModel
-    node_names: tuple[str, ...]
-    joint_names: tuple[str, ...]
-    actuator_names: tuple[str, ...]
-    body: np.ndarray
-    parent: np.ndarray
-    senders: np.ndarray
-    receivers: np.ndarray
-    edge_action: np.ndarray
+    model: mujoco.MjModel  # its last sensors are the frame sensors of the nodes; warm starts are off
+    node_names: tuple[str, ...]  # "world" first
+    joint_names: tuple[str, ...]  # in edge order, E / 2
+    actuator_names: tuple[str, ...]  # in the order of mjData.ctrl
+    body: np.ndarray  # [N] MuJoCo id of each node's root body
+    parent: np.ndarray  # [N] parent node; the world's is -1
+    senders: np.ndarray  # [E]
+    receivers: np.ndarray  # [E]
+    edge_action: np.ndarray  # [E] action at the edge's joint, -1 without motor
     static: StaticGraph
-    movable: np.ndarray
-    translation_invariant: np.ndarray
-    yaw_frame: YawFrame | None
+    movable: np.ndarray  # [N, 12] bool: position 3, rotation 3, linear velocity 3, angular velocity 3; world frame
+    translation_invariant: np.ndarray  # [3] bool, world axes along which the dynamics do not depend on position
+    yaw_frame: YawFrame | None  # if the dynamics do not depend on the yaw
     joint_anchors: JointAnchors
     contact_points: ContactPoints | None
-    action_low: np.ndarray
-    action_high: np.ndarray
-    substeps: int
-    attachments: dict[str, Attachment] = field(default_factory=dict)
-    settle_steps: int = 0
-    origin: dict = field(default_factory=dict, repr=False)
+    action_low: np.ndarray  # [A]
+    action_high: np.ndarray  # [A]
+    substeps: int  # physics steps in one control step
+    attachments: dict[str, Attachment] = field(default_factory=dict)  # named bodies that are not the root of a node
+    settle_steps: int = 0  # physics steps without control after a reset
+    origin: dict = field(default_factory=dict, repr=False)  # source of the model, part of description()
 
     @property
     def num_nodes(self) -> int:
@@ -142,10 +108,9 @@ class Scene:
         return np.any(self.movable, axis=1)
 
     def description(self) -> dict:
-        """Return JSON-able values from which :func:`scene_from_description` rebuilds the scene.
+        """JSON-able values from which :func:`scene_from_description` rebuilds the scene.
 
-        Raises:
-            SceneError: if the scene was made from an ``MjSpec``, whose XML would round its numbers.
+        Raises SceneError if it was made from an ``MjSpec``, whose XML would round its numbers.
         """
         if not self.origin:
             raise SceneError(
@@ -161,11 +126,10 @@ class Scene:
         }
 
     def fingerprint(self) -> str:
-        """Return a hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""
+        """Hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""
         return fingerprint(self)
 
     def __str__(self) -> str:
-        """Summarise time steps, nodes, joints, motors, movable components and invariances."""
         rotations = "no axis" if self.yaw_frame is None else "xyz"[self.yaw_frame.axis]
         rotations += " but for contacts with the world" * (self.yaw_frame is not None and not self.yaw_frame.exact)
         step, physics_step = 1e3 * self.timestep, 1e3 * self.model.opt.timestep

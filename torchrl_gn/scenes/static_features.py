@@ -25,13 +25,9 @@ Columns = list[tuple[str, np.ndarray]]
 
 
 def static_graph(model: mujoco.MjModel, graph: Topology, actuator_of_joint: np.ndarray, timestep: float) -> StaticGraph:
-    """Read the static features of every node and edge and of the scene.
+    """Static features of every node and edge and of the scene.
 
-    Args:
-        model: compiled model.
-        graph: topology of the model.
-        actuator_of_joint: ``[J]`` actuator of each joint, -1 without motor.
-        timestep: control step, seconds.
+    ``actuator_of_joint`` ``[J]`` is -1 without motor, ``timestep`` the control step in seconds.
     """
     nodes, node_names = _join(_node_columns(model, graph), len(graph.body))
     joints, joint_names = _join(_joint_columns(model, actuator_of_joint), model.njnt)
@@ -104,7 +100,7 @@ def _node_columns(model: mujoco.MjModel, graph: Topology) -> Columns:
 def _composite(
     model: mujoco.MjModel, bodies: np.ndarray, root: int
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Return mass, principal inertia ``[3]``, its origin ``[3]`` and frame ``[4]`` of welded bodies."""
+    """Mass, principal inertia ``[3]``, its origin ``[3]`` and frame ``[4]`` of welded bodies."""
     heavy = [int(body) for body in bodies if model.body_mass[body] > 0]
     if len(heavy) <= 1 and (not heavy or heavy[0] == root):
         return model.body_mass[root], model.body_inertia[root], model.body_ipos[root], model.body_iquat[root]

@@ -20,7 +20,7 @@ class Topology:
 
 
 def topology(model: mujoco.MjModel) -> Topology:
-    """Read the graph structure of a compiled model.
+    """Graph structure of a compiled model.
 
     A node is a group of bodies welded together (``body_weldid``). Bodies fixed to the world, mocap bodies too, belong
     to node 0.
@@ -41,10 +41,7 @@ def topology(model: mujoco.MjModel) -> Topology:
 
 
 def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a body's position ``[3]`` and quaternion ``[4]`` in an ancestor's frame, joints at their reference.
-
-    The ancestor is on the path from the body to the world, or the body itself.
-    """
+    """Position ``[3]`` and quaternion ``[4]`` of a body in an ancestor's (or its own) frame, joints at reference."""
     pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     while body != ancestor:
         rotated, product = np.empty(3), np.empty(4)

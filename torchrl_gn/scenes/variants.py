@@ -16,16 +16,10 @@ _TEXTURE = 16  # pixels
 
 
 def parameter_ranges(system: str) -> dict[str, ParameterRange]:
-    """Return the parameters in which random variants of a system differ, and their ranges (the SM's table).
+    """Parameters in which random variants of a system differ, and their ranges (the SM's table).
 
-    Lengths, thicknesses, masses and gears are factors of the standard system's; angles are radians.
-
-    Raises:
-        ValueError: if the system has no parameters.
-
-    Example:
-        >>> parameter_ranges("pendulum")["length"]
-        ParameterRange(low=0.2, high=1.0, standard=1.0)
+    Lengths, thicknesses, masses and gears are factors of the standard system's; angles are radians. Raises ValueError
+    if the system has no parameters.
     """
     return dict(_system_with_variants(system).ranges)
 
@@ -39,10 +33,8 @@ def has_variants(scene: Scene) -> bool:
 def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -> np.ndarray:
     """Draw independent uniform parameters ``[count, P]``, float64, columns in the order of :func:`parameter_ranges`.
 
-    ``rng`` is a generator or a seed, whose first draws are equal for every ``count``.
-
-    Raises:
-        ValueError: if the system has no parameters or ``count`` is negative.
+    ``rng`` is a generator or a seed, whose first draws are equal for every ``count``. Raises ValueError if the system
+    has no parameters or ``count`` is negative.
     """
     ranges = parameter_ranges(system).values()
     if count < 0:
@@ -54,13 +46,7 @@ def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -
 def sample_variants(
     system: str, count: int, rng: int | np.random.Generator, *, timestep: float | None = None
 ) -> list[Scene]:
-    """Build random variants of a system: :func:`make_variants` of :func:`sample_parameters`.
-
-    Example:
-        >>> variants = sample_variants("swimmer6", 3, rng=0)
-        >>> [round(scene.origin["parameters"]["thickness"], 1) for scene in variants]
-        [3.2, 0.7, 0.6]
-    """
+    """Build random variants of a system: :func:`make_variants` of :func:`sample_parameters`."""
     return make_variants(system, sample_parameters(system, count, rng), timestep=timestep)
 
 
@@ -69,10 +55,8 @@ def make_variants(
 ) -> list[Scene]:
     """Build variants of a system from parameters ``[count, P]``, which may lie outside of their ranges.
 
-    Name and control step (seconds) are the system's by default.
-
-    Raises:
-        ValueError: if the system has no parameters, or the given ones do not fit.
+    Name and control step (seconds) are the system's by default. Raises ValueError if the system has no parameters, or
+    the given ones do not fit.
     """
     ranges = parameter_ranges(system)
     parameters = np.asarray(parameters, dtype=np.float64)
@@ -85,11 +69,7 @@ def make_variants(
 def make_variant(
     system: object, parameters: Mapping[str, float], *, timestep: float | None = None, name: str | None = None
 ) -> Scene:
-    """Build one variant; parameters that are not given are the standard system's.
-
-    Raises:
-        ValueError: if the system does not have the parameters, or a value is invalid.
-    """
+    """Build one variant; parameters that are not given are the standard system's. ValueError if one is unknown."""
     found = _system_with_variants(system)
     standard = {key: one.standard for key, one in found.ranges.items()}
     if unknown := [key for key in parameters if key not in standard]:
@@ -108,7 +88,10 @@ def _build(
         # Every model would render and keep full textures: 12 MB and most of the time.
         texture.width = texture.height = _TEXTURE
     for values in rows:
-        _check_values(system, values)
+        for key, value in values.items():
+            if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
+                wanted = "a finite angle" if system.ranges[key].is_angle else "a finite factor above 0"
+                raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
         spec: mujoco.MjSpec = standard.copy()
         system.vary(spec, values)
         yield build_scene(
@@ -118,13 +101,6 @@ def _build(
             settle_steps=system.settle_steps,
             origin={"system": system.name, "parameters": dict(values)},
         )
-
-
-def _check_values(system: System, values: Mapping[str, float]) -> None:
-    for key, value in values.items():
-        if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
-            wanted = "a finite angle" if system.ranges[key].is_angle else "a finite factor above 0"
-            raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
 
 
 def _system_with_variants(source: object) -> System:

@@ -7,16 +7,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.invariance import (
-    acts_on_position,
-    collides_with_world,
-    depends_on_position,
-    reference_rotation,
-)
+from torchrl_gn.scenes.invariance import acts_on_position, collides_with_world, depends_on_position, reference_rotation
 from torchrl_gn.scenes.topology import Topology
 
 _TOLERANCE = 1e-9
-_Disable = mujoco.mjtDisableBit
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,18 +27,11 @@ class YawFrame:
 def find_yaw_frame(
     model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, movable: np.ndarray, translation_invariant: np.ndarray
 ) -> YawFrame | None:
-    """Return the yaw frame of a scene, or None if its dynamics depend on the yaw other than by contacts.
+    """Yaw frame of a scene, or None if its dynamics depend on the yaw other than by contacts.
 
     The scene must be one tree whose root has slides, if any, then a hinge about a world axis. Gravity and wind must be
     parallel to that axis. No limit, spring, tendon, equality constraint or position actuator may depend on the hinge,
-    and slides across the axis must be alike and without motors.
-
-    Args:
-        model: compiled model.
-        data: of that model at its reference, kinematics done.
-        graph: topology of the model.
-        movable: ``[N, 12]`` bool mask of movable components.
-        translation_invariant: ``[3]`` bool.
+    and slides across the axis must be alike and without motors. ``data`` must be at its reference, kinematics done.
     """
     roots = np.flatnonzero(graph.parent == 0)
     if len(roots) != 1 or model.nplugin or model.nflex:
@@ -61,7 +48,7 @@ def find_yaw_frame(
         return None
     across = [index for index in range(3) if index != axis]
     flow = model.opt.wind if model.opt.density or model.opt.viscosity else np.zeros(3)
-    weight = np.zeros(3) if model.opt.disableflags & _Disable.mjDSBL_GRAVITY else model.opt.gravity
+    weight = np.zeros(3) if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY else model.opt.gravity
     if np.abs(flow[across]).max() > _TOLERANCE or np.abs(weight[across]).max() > _TOLERANCE:
         return None
     lateral = [slide for slide in slides if abs((rest @ model.jnt_axis[slide])[axis]) < 1 - _TOLERANCE]
@@ -79,7 +66,7 @@ def find_yaw_frame(
 
 
 def _slides_then_hinge(model: mujoco.MjModel, body: int) -> tuple[list[int], int | None]:
-    """Return the slides a body's joints begin with, and the hinge that must end them; else no slide and None."""
+    """Slides that a body's joints begin with, and the hinge that must end them; else no slide and None."""
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     kinds = [mujoco.mjtJoint(model.jnt_type[joint]) for joint in joints]
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE

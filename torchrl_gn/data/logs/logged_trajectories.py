@@ -15,35 +15,20 @@ from torchrl_gn.scenes.kinematic_tree import tree_states
 
 @dataclass(frozen=True)
 class LogReport:
-    """Statistics of :func:`log_trajectories`.
-
-    Attributes:
-        rows: rows read.
-        episodes: episodes read.
-        kept: transitions in the trajectories.
-        trajectories: number of trajectories.
-        jumps: (episode, row before it) of each jump, an angle change that velocities do not explain.
-        gaps: (episode, row before it) of each gap in the time stamps; None without time stamps.
-        not_finite: rows with a number that is not finite.
-        short: rows of pieces too short for a trajectory.
-        timestep: step of the trajectories, seconds.
-        interpolated: whether states are interpolated between rows.
-        constant: commands that never vary.
-        unread: reason for each array of the file that was not read, by name.
-    """
+    """Statistics of :func:`log_trajectories`."""
 
     rows: int
     episodes: int
-    kept: int
+    kept: int  # transitions in the trajectories
     trajectories: int
-    jumps: tuple[tuple[int, int], ...]
-    gaps: tuple[tuple[int, int], ...] | None
-    not_finite: int
-    short: int
-    timestep: float
+    jumps: tuple[tuple[int, int], ...]  # (episode, row before it) of angle changes that velocities do not explain
+    gaps: tuple[tuple[int, int], ...] | None  # (episode, row before it) in the time stamps, if there are any
+    not_finite: int  # rows
+    short: int  # rows of pieces too short for a trajectory
+    timestep: float  # of the trajectories, seconds
     interpolated: bool
-    constant: tuple[int, ...] = ()
-    unread: dict[str, str] = field(default_factory=dict)
+    constant: tuple[int, ...] = ()  # commands that never vary
+    unread: dict[str, str] = field(default_factory=dict)  # reason for each array of the file that was not read
 
     def __str__(self) -> str:
         kept = f"{self.trajectories:,} trajectories, {self.kept:,} transitions"
@@ -81,11 +66,10 @@ def log_trajectories(
 ) -> tuple[TensorDict, LogReport]:
     """Cut a log into trajectories of equal length, none across a gap, a jump, an episode or a row that is not finite.
 
-    States lie at even steps from the first row of every piece; between rows they are interpolated linearly, angles the
-    short way round. The action of a step is the mean over it of the commands, each held until the next row.
+    States lie at even steps from the first row of every piece, interpolated linearly between rows. The action of a step
+    is the mean over it of the commands, each held until the next row.
 
     Args:
-        log: the log.
         steps: transitions in each trajectory.
         resample: time step of the trajectories, seconds; default: the log's.
         lag: rows by which commands act late: a state is paired with the command that many rows before.
@@ -151,7 +135,7 @@ def log_trajectories(
 
 
 def _stride(log: RobotLog, resample: float | None) -> float:
-    """Return the trajectories' time step in steps of the log, a whole number if within rounding errors."""
+    """Trajectories' time step in steps of the log, a whole number if within rounding errors."""
     if resample is None:
         return 1.0
     if not 0 < resample < np.inf:
@@ -175,7 +159,7 @@ def _pieces(
 
 
 def _places(found: np.ndarray, log: RobotLog, episodes: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Return (episode, row in it) of flags ``[R - 1]`` between rows."""
+    """(episode, row in it) of flags ``[R - 1]`` between rows."""
     begins = log.begins
     each = ((episode, np.flatnonzero(found[begins[episode] : begins[episode + 1] - 1])) for episode in episodes)
     return tuple((episode, int(row)) for episode, rows in each for row in rows)
@@ -184,8 +168,7 @@ def _places(found: np.ndarray, log: RobotLog, episodes: Sequence[int]) -> tuple[
 def _interpolated(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate ``channels`` ``[n, C, J]``, the first an angle, from rows at ``at`` ``[n]`` to a grid ``[K + 1]``.
 
-    Returns:
-        ``[C, K + 1, J]`` values, exact at rows, and ``[K + 1]`` numbers of rows needed up to each.
+    Returns values ``[C, K + 1, J]``, exact at rows, and numbers of rows needed up to each ``[K + 1]``.
     """
     row = np.searchsorted(at, grid, side="right") - 1
     after = np.minimum(row + 1, len(at) - 1)

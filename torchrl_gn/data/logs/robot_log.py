@@ -15,27 +15,16 @@ _EVEN = 0.01  # of a step, tolerance for rounded time stamps
 
 @dataclass(frozen=True, eq=False)
 class RobotLog:
-    """Joint-space log of a robot, ``R`` rows.
+    """Joint-space log of a robot, ``R`` rows."""
 
-    Attributes:
-        angle: ``[R, J]`` joint angles, radians.
-        velocity: ``[R, J]`` joint velocities, rad/s.
-        command: ``[R, A]`` commands given in each row's state; ``[R, 0]`` without motors.
-        length: ``[episodes]`` rows of each; their sum is ``R``.
-        timestep: (usual) time between rows, seconds.
-        extra: further channels by name, ``[R, J]`` each.
-        time: ``[R]`` time stamps, seconds; None: rows are evenly spaced and none is missing.
-        unread: reason for each array of the file that was not read, by name.
-    """
-
-    angle: np.ndarray
-    velocity: np.ndarray
-    command: np.ndarray
-    length: np.ndarray
-    timestep: float
-    extra: dict[str, np.ndarray] = field(default_factory=dict)
-    time: np.ndarray | None = None
-    unread: dict[str, str] = field(default_factory=dict)
+    angle: np.ndarray  # [R, J] radians
+    velocity: np.ndarray  # [R, J] rad/s
+    command: np.ndarray  # [R, A] given in each row's state; [R, 0] without motors
+    length: np.ndarray  # [episodes] rows of each; their sum is R
+    timestep: float  # (usual) time between rows, seconds
+    extra: dict[str, np.ndarray] = field(default_factory=dict)  # further channels by name, [R, J] each
+    time: np.ndarray | None = None  # [R] time stamps, seconds; None: rows are evenly spaced and none is missing
+    unread: dict[str, str] = field(default_factory=dict)  # reason for each array of the file that was not read
 
     @property
     def num_joints(self) -> int:
@@ -95,11 +84,7 @@ class RobotLog:
         return good & (residual > np.maximum(jump * usual, fastest)).any(1)
 
     def command_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return smallest and largest value ``[A]`` of each command.
-
-        Raises:
-            ValueError: if no row has finite commands.
-        """
+        """Smallest and largest value ``[A]`` of each command; ValueError if no row has finite commands."""
         finite = self.command[np.isfinite(self.command).all(1)]
         if not len(finite):
             raise ValueError("No row of the log has finite commands.")
@@ -119,14 +104,11 @@ def log_chain(
     commands: Sequence[Sequence[int]] | None = None,
     joint_parents: Sequence[int] = (),
 ) -> KinematicTree:
-    """Return the kinematic tree of a log's robot.
+    """Kinematic tree of a log's robot.
 
     Args:
-        log: the log.
-        name: name of the robot.
         resample: time step, seconds; default: the log's.
-        commands: commands that act on each joint, by index, none for a joint without motor; default: as many for each
-            joint, in order.
+        commands: indices of the commands of each joint, none without motor; default: as many for each joint, in order.
         joint_parents: parent of each joint, -1 for the base; default: the joint before it.
 
     Raises:

@@ -32,7 +32,6 @@ def load_robot_log(
     arrays are listed in :attr:`RobotLog.unread`.
 
     Args:
-        path: the file.
         timestep: time between rows, seconds, if the file does not have it.
         names: name in the file of each array, as ``{"angle": "q", "velocity": "dq"}``; ``""`` leaves an array out, and
             ``{"command": ""}`` means a robot without motors.

@@ -30,14 +30,11 @@ def simulate_log(
 ) -> RobotLog:
     """Simulate a robot's encoder log under random commands (:func:`spline_controls`), one row a control step.
 
-    Motors follow commands after ``delay`` steps, a play (hysteresis) and a first-order lag. Angles are noisy and
-    quantised; velocities are their backward differences.
+    Motors follow commands after ``delay`` control steps, a play (hysteresis) and a first-order lag. Angles are noisy
+    and quantised; velocities are their backward differences.
 
     Args:
         scene: a robot whose joints are all hinges.
-        episodes: number of episodes.
-        steps: control steps of each.
-        seed: seed of commands, starts and noise.
         delay: control steps until a command acts.
         time_constant: of the lag, seconds; 0: no lag.
         play: width of the play, as a fraction of the command's range.
@@ -74,7 +71,7 @@ def simulate_log(
 
 
 def _motors(command: np.ndarray, scene: Scene, delay: int, time_constant: float, play: float) -> np.ndarray:
-    """Return the actions ``[n, T, A]`` of motors under commands ``[n, T, A]``."""
+    """Actions ``[n, T, A]`` of motors under commands ``[n, T, A]``."""
     width = play * (scene.action_high - scene.action_low) / 2
     share = 1.0 if time_constant <= 0 else 1 - np.exp(-scene.timestep / time_constant)
     rest = np.clip(np.zeros(scene.num_actions), scene.action_low, scene.action_high)

@@ -31,10 +31,6 @@ SYSTEMS: tuple[str, ...] = tuple(_BY_NAME)
 
 
 def find_system(name: str) -> System | None:
-    """Return the system of that name, or None.
-
-    Raises:
-        ValueError: for ``swimmerN`` with ``N < 3``.
-    """
+    """The system of that name, or None; ValueError for ``swimmerN`` with ``N < 3``."""
     links = re.fullmatch(r"swimmer(\d+)", name)
     return swimmer(int(links[1])) if links else _BY_NAME.get(name)

@@ -27,7 +27,7 @@ _RANGES = {
 
 
 def _build() -> mujoco.MjSpec:
-    """Return the suite's model with densities for ``settotalmass``, which would give every variant the same mass."""
+    """The suite's model with densities for ``settotalmass``, which would give every variant the same mass."""
     spec = suite_model("cheetah")
     total = spec.compiler.settotalmass
     spec.compiler.settotalmass = -1.0
@@ -53,12 +53,12 @@ def _vary(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
 
 @cache
 def _clearance() -> float:
-    """Return the height of the standard cheetah's lowest point, metres."""
+    """Height of the standard cheetah's lowest point, metres."""
     return _lowest(_build())
 
 
 def _lowest(spec: mujoco.MjSpec) -> float:
-    """Return the height of the capsules' lowest point, all joints at zero, metres."""
+    """Height of the capsules' lowest point, all joints at zero, metres."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

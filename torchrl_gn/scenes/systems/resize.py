@@ -7,8 +7,6 @@ import math
 import mujoco
 import numpy as np
 
-_GEOM = mujoco.mjtGeom
-
 
 def resize_capsule(geom: mujoco.MjsGeom, length: float, thickness: float) -> None:
     """Scale a capsule's length (between cap centres) and position by ``length``, its radius by ``thickness``."""
@@ -31,8 +29,7 @@ def resize_along_y(geom: mujoco.MjsGeom, length: float, thickness: float) -> Non
 
 
 def _capsule_volume(geom: mujoco.MjsGeom) -> float:
-    """Return cubic metres."""
-    if geom.type != _GEOM.mjGEOM_CAPSULE:
+    if geom.type != mujoco.mjtGeom.mjGEOM_CAPSULE:
         raise ValueError(f"Geom {geom.name!r} is not a capsule.")
     radius, length = float(geom.size[0]), 2 * float(geom.size[1])
     if np.isfinite(geom.fromto).all():

@@ -1,4 +1,4 @@
-"""Swimmer: a chain of links in a viscous plane. 20 ms, ten suite physics steps of 2 ms.
+"""Swimmer: a row of links in a viscous plane. 20 ms, ten suite physics steps of 2 ms.
 
 The suite's file holds the head; the other links are added as ``dm_control.suite.swimmer`` does.
 
@@ -18,11 +18,7 @@ from torchrl_gn.scenes.systems.system import ParameterRange, System, suite_model
 
 
 def swimmer(links: int) -> System:
-    """Return the swimmer with ``links`` links, head included.
-
-    Raises:
-        ValueError: if there are fewer than 3 links.
-    """
+    """The swimmer with ``links`` links, head included; ValueError below 3."""
     if links < 3:
         raise ValueError(f"A swimmer has at least 3 links, got {links}.")
     ranges = {f"length_{name}": ParameterRange(0.3, 2.0) for name in _links(links)}
@@ -31,7 +27,7 @@ def swimmer(links: int) -> System:
 
 
 def _links(links: int) -> list[str]:
-    """Return the names of the bodies, head first."""
+    """Names of the bodies, head first."""
     return ["head", *(f"segment_{i}" for i in range(links - 1))]
 
 
@@ -46,12 +42,7 @@ def _build(links: int) -> mujoco.MjSpec:
         parent.add_geom(default["inertial"], name=f"inertial_{i}")
         parent.add_site(default["swimmer"], name=f"site_{i}")
         parent.add_joint(default["swimmer"], name=f"joint_{i}", range=[-limit, limit])
-        spec.add_actuator(
-            spec.default,
-            name=f"motor_{i}",
-            target=f"joint_{i}",
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        )
+        spec.add_actuator(spec.default, name=f"motor_{i}", target=f"joint_{i}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
     return spec
 
 

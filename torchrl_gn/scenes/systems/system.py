@@ -18,17 +18,11 @@ if sys.version_info >= (3, 13):
 
 @dataclass(frozen=True)
 class ParameterRange:
-    """Range of a parameter of random variants: a factor of the standard system's, or an angle in radians.
-
-    Attributes:
-        low: smallest value.
-        high: largest value.
-        standard: value of the standard system: 1 for factors, 0 for angles.
-    """
+    """Range of a parameter of random variants: a factor of the standard system's, or an angle in radians."""
 
     low: float
     high: float
-    standard: float = 1.0
+    standard: float = 1.0  # value of the standard system: 1 for factors, 0 for angles
 
     @property
     def is_angle(self) -> bool:
@@ -49,10 +43,9 @@ class System:
 
 
 def model_file(path: str) -> str:
-    """Return the path of a model file inside the ``dm_control`` package, such as ``"suite/cheetah.xml"``.
+    """Path of a model file inside the ``dm_control`` package, such as ``"suite/cheetah.xml"``.
 
-    Raises:
-        ModuleNotFoundError: if dm_control is not installed.
+    Raises ModuleNotFoundError if dm_control is not installed.
     """
     # Importing dm_control would choose an OpenGL backend and complain without a display.
     package = importlib.util.find_spec("dm_control")
@@ -62,5 +55,5 @@ def model_file(path: str) -> str:
 
 
 def suite_model(domain: str) -> mujoco.MjSpec:
-    """Return the MJCF model of a Control Suite domain."""
+    """MJCF model of a Control Suite domain."""
     return mujoco.MjSpec.from_file(model_file(f"suite/{domain}.xml"))
