@@ -23,14 +23,17 @@ PACKAGE = Path(__file__).parents[2] / "torchrl_gn"
 PARTS = {
     "scenes": "scenes.md",
     "data": "data.md",
-    "modules": "modules.md",
+    "maths": "maths.md",
+    "networks": "networks.md",
+    "dynamics": "dynamics.md",
+    "identification": "identification.md",
+    "policies": "policies.md",
     "rewards": "envs.md#rewards",
     "objectives": "objectives.md",
     "envs": "envs.md",
     "planners": "planning.md",
     "evaluation": "evaluation.md",
     "training": "training.md",
-    "pretrained": "training.md#trained-models-that-come-with-the-package",
 }
 """Public parts of the package, and the page that explains each."""
 
@@ -39,14 +42,10 @@ LINK = re.compile(r"\[([^\]]+)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
 
 
 def exported(part: str) -> list[str]:
-    """Public names of a part: what a package imports, or a module defines."""
-    folder = PACKAGE / part
-    body = ast.parse((folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")).read_text()).body
-    if folder.is_dir():
-        imports = (node for node in body if isinstance(node, ast.ImportFrom) and node.module != "__future__")
-        names = [alias.asname or alias.name for node in imports for alias in node.names]
-    else:
-        names = [node.name for node in body if isinstance(node, (ast.ClassDef, ast.FunctionDef))]
+    """Public names of a part: what its package imports."""
+    body = ast.parse((PACKAGE / part / "__init__.py").read_text()).body
+    imports = (node for node in body if isinstance(node, ast.ImportFrom) and node.module != "__future__")
+    names = [alias.asname or alias.name for node in imports for alias in node.names]
     return sorted(name for name in names if not name.startswith("_"))
 
 
