@@ -49,9 +49,15 @@ def exported(part: str) -> list[str]:
     return sorted(name for name in names if not name.startswith("_"))
 
 
-def hidden(part: str, name: str) -> bool:
-    """Whether a public name is that of the module that defines it, which static analysis sees in its place."""
-    return (PACKAGE / part / f"{name}.py").exists()
+def hidden(part: str, name: str) -> str | None:
+    """Path of a public name that a module of the same name hides from static analysis, or is; None of others."""
+    file = PACKAGE / part / f"{name}.py"
+    if not file.exists():
+        return None
+    defined = [
+        node.name for node in ast.parse(file.read_text()).body if isinstance(node, (ast.ClassDef, ast.FunctionDef))
+    ]
+    return f"{name}.{name}" if name in defined else name
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -61,8 +67,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         text = f"# torchrl_gn.{part}\n\n[What it is and how to use it](../{page}).\n\n"
         text += f"::: torchrl_gn.{part}\n    options: {{members: {names}}}\n"
         for name in exported(part):
-            if hidden(part, name):
-                text += f"\n::: torchrl_gn.{part}.{name}.{name}\n"
+            if path := hidden(part, name):
+                text += f"\n::: torchrl_gn.{part}.{path}\n"
                 text += (
                     "    options: {show_root_heading: true, show_root_toc_entry: true, show_root_full_path: false}\n"
                 )
@@ -90,7 +96,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     folder, _, part = page.file.src_uri.removesuffix(".md").rpartition("/")
     if folder == "reference":
         for name in exported(part):
-            if f'id="torchrl_gn.{part}.{name}{f".{name}" * hidden(part, name)}"' not in html:
+            if f'id="torchrl_gn.{part}.{hidden(part, name) or name}"' not in html:
                 LOG.warning(f"{page.file.src_uri} does not show torchrl_gn.{part}.{name}.")
         for role in re.findall(r":(?:func|class|meth|attr|data|mod|math):|\.\. \w+::", html):
             LOG.warning(f"{page.file.src_uri} shows {role!r}.")
