@@ -28,7 +28,7 @@ class PhysicalParameters(NamedTuple):
         rest: ``[*B, 4]`` the root's orientation at yaw 0.
         pivot: ``[*B, 3]`` a point on the yaw axis, metres.
         parent_anchor: ``[*B, N, 3]`` anchor of each node in the parent's frame, metres.
-        arm: ``[*B, N, 3]`` anchor of each node in its own frame, metres.
+        child_anchor: ``[*B, N, 3]`` anchor of each node in its own frame, metres.
         contact_offset: ``[*B, N, 4, 3]`` contact points in the node's frame, metres.
         contact_radius: ``[*B, N, 4]`` metres.
     """
