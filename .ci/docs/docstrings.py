@@ -20,10 +20,9 @@ class Markdown(griffe.Extension):
         """Rewrite them."""
         public: dict[str, str] = {}  # names, where they are exported and defined: where the reference shows them
         for part in pkg.modules.values():
-            if part.is_package:
-                inside = {name: at for name, at in part.imports.items() if at.startswith(f"{pkg.path}.")}
-            else:
-                inside = {name: one.path for name, one in part.functions.items() if part.name == "pretrained"}
+            if not part.is_package:
+                continue
+            inside = {name: at for name, at in part.imports.items() if at.startswith(f"{pkg.path}.")}
             for name, target in inside.items():
                 shown = target if name in part.modules else f"{part.path}.{name}"
                 public |= {name: shown, f"{part.path}.{name}": shown, target: shown}

@@ -23,14 +23,17 @@ PACKAGE = Path(__file__).parents[2] / "torchrl_gn"
 PARTS = {
     "scenes": "scenes.md",
     "data": "data.md",
-    "modules": "modules.md",
+    "maths": "maths.md",
+    "networks": "networks.md",
+    "dynamics": "dynamics.md",
+    "identification": "identification.md",
+    "policies": "policies.md",
     "rewards": "envs.md#rewards",
     "objectives": "objectives.md",
     "envs": "envs.md",
     "planners": "planning.md",
     "evaluation": "evaluation.md",
     "training": "training.md",
-    "pretrained": "training.md#trained-models-that-come-with-the-package",
 }
 """Public parts of the package, and the page that explains each."""
 
@@ -39,20 +42,22 @@ LINK = re.compile(r"\[([^\]]+)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
 
 
 def exported(part: str) -> list[str]:
-    """Public names of a part: what a package imports, or a module defines."""
-    folder = PACKAGE / part
-    body = ast.parse((folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")).read_text()).body
-    if folder.is_dir():
-        imports = (node for node in body if isinstance(node, ast.ImportFrom) and node.module != "__future__")
-        names = [alias.asname or alias.name for node in imports for alias in node.names]
-    else:
-        names = [node.name for node in body if isinstance(node, (ast.ClassDef, ast.FunctionDef))]
+    """Public names of a part: what its package imports."""
+    body = ast.parse((PACKAGE / part / "__init__.py").read_text()).body
+    imports = (node for node in body if isinstance(node, ast.ImportFrom) and node.module != "__future__")
+    names = [alias.asname or alias.name for node in imports for alias in node.names]
     return sorted(name for name in names if not name.startswith("_"))
 
 
-def hidden(part: str, name: str) -> bool:
-    """Whether a public name is that of the module that defines it, which static analysis sees in its place."""
-    return (PACKAGE / part / f"{name}.py").exists()
+def hidden(part: str, name: str) -> str | None:
+    """Path of a public name that a module of the same name hides from static analysis, or is; None of others."""
+    file = PACKAGE / part / f"{name}.py"
+    if not file.exists():
+        return None
+    defined = [
+        node.name for node in ast.parse(file.read_text()).body if isinstance(node, (ast.ClassDef, ast.FunctionDef))
+    ]
+    return f"{name}.{name}" if name in defined else name
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -62,8 +67,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         text = f"# torchrl_gn.{part}\n\n[What it is and how to use it](../{page}).\n\n"
         text += f"::: torchrl_gn.{part}\n    options: {{members: {names}}}\n"
         for name in exported(part):
-            if hidden(part, name):
-                text += f"\n::: torchrl_gn.{part}.{name}.{name}\n"
+            if path := hidden(part, name):
+                text += f"\n::: torchrl_gn.{part}.{path}\n"
                 text += (
                     "    options: {show_root_heading: true, show_root_toc_entry: true, show_root_full_path: false}\n"
                 )
@@ -91,7 +96,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     folder, _, part = page.file.src_uri.removesuffix(".md").rpartition("/")
     if folder == "reference":
         for name in exported(part):
-            if f'id="torchrl_gn.{part}.{name}{f".{name}" * hidden(part, name)}"' not in html:
+            if f'id="torchrl_gn.{part}.{hidden(part, name) or name}"' not in html:
                 LOG.warning(f"{page.file.src_uri} does not show torchrl_gn.{part}.{name}.")
         for role in re.findall(r":(?:func|class|meth|attr|data|mod|math):|\.\. \w+::", html):
             LOG.warning(f"{page.file.src_uri} shows {role!r}.")
