@@ -123,14 +123,13 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.envs import suite_env
 from torchrl_gn.evaluation import evaluate_errors, plot_errors, rollout_frames
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.scenes import ParameterNames
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, load_pretrained, make_optimizer, save_checkpoint
 
 scene = load_scene(MJCF)
 trajectories = collect_trajectories(scene, 4, seed=0)
-bound = ForwardModel(ParameterNames.of(scene), node_hidden=(8,), edge_hidden=(8,), global_hidden=(8,)).bind(scene)
+bound = ForwardModel.for_scene(scene, node_hidden=(8,), edge_hidden=(8,), global_hidden=(8,)).bind(scene)
 loss = ForwardModelLoss(bound)
 buffer = trajectory_buffer(trajectories, batch_size=8, seed=0)
 loss.fit_normalizers(buffer.sample())
