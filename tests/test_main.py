@@ -13,8 +13,8 @@ import torch
 from PIL import Image
 
 from torchrl_gn.__main__ import main
-from torchrl_gn.training import load_pretrained, pretrained_names
 from torchrl_gn.scenes import SYSTEMS, load_scene
+from torchrl_gn.training import load_pretrained, pretrained_names
 
 from . import zoo
 

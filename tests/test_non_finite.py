@@ -22,12 +22,13 @@ from torchrl_gn.data import (
     trajectory_buffer,
 )
 from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, guarded_rollout, rollout, rollout_video
 from torchrl_gn.maths import Normalizer
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.rewards.balance import Balance
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, load_pretrained, make_optimizer, save_checkpoint
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 
@@ -45,7 +46,7 @@ def given(scene, tmp_path, monkeypatch) -> SimpleNamespace:
     """Good numbers to spoil one of: trajectories, a batch, physics states, physical parameters, models."""
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
-    model = ForwardModel(ParameterNames.of(scene), **SMALL)
+    model = ForwardModel.for_scene(scene, **SMALL)
     trajectories = collect_trajectories(scene, 4, 6, seed=0)
     batch = trajectory_buffer(trajectories, batch_size=5, seed=0).sample().exclude("index")
     loss = ForwardModelLoss(model.bind(scene))
@@ -148,13 +149,13 @@ ENTRIES = [
     Entry("normaliser's floor", lambda g, bad: Normalizer(3, floor=bad), rf"floor={NUMBER}"),
     Entry(
         "statistics of physical parameters",
-        lambda g, bad: g.variants.update_parameter_normalizers(spoil(g.static, bad, "nodes")),
+        lambda g, bad: update_parameter_normalizers(g.variants, spoil(g.parameters, bad, "nodes")),
         "parameters 'nodes'" + AT_2,
     ),
     Entry(
         "statistics of transitions",
-        lambda g, bad: g.bound.update_dynamic_normalizers(
-            g.batch["state"], spoil(g.batch["action"], bad), g.batch["next", "state"]
+        lambda g, bad: update_dynamic_normalizers(
+            g.bound, g.batch["state"], spoil(g.batch["action"], bad), g.batch["next", "state"]
         ),
         "action" + AT_2,
     ),
@@ -173,14 +174,14 @@ ENTRIES = [
         for key in ("state", "action", ("next", "state"))
     ),
     Entry(
-        "loss static",
+        "loss parameters",
         lambda g, bad: ForwardModelLoss(g.variants)(spoil(g.own, bad, ("parameters", "edges"))),
         "'parameters' of the batch 'edges'" + AT_2,
     ),
     Entry(
-        "fitted static",
-        lambda g, bad: ForwardModelLoss(g.variants).fit_normalizers(spoil(g.own, bad, ("parameters", "arm"))),
-        "'parameters' of the batch 'arm'" + AT_2,
+        "fitted parameters",
+        lambda g, bad: ForwardModelLoss(g.variants).fit_normalizers(spoil(g.own, bad, ("parameters", "child_anchor"))),
+        "'parameters' of the batch 'child_anchor'" + AT_2,
     ),
     Entry("noise", lambda g, bad: ForwardModelLoss(g.bound, noise=bad), rf"noise={NUMBER}"),
     # Environments
@@ -199,7 +200,7 @@ ENTRIES = [
         r"ModelEnv\('pendulum'\): 'state'" + AT_2,
     ),
     Entry(
-        "imagined reset static",
+        "imagined reset parameters",
         lambda g, bad: ModelEnv(g.variants).reset(spoil(g.own, bad, ("parameters", "nodes")), set_state=True),
         r"ModelEnv\('pendulum'\): 'parameters' 'nodes'" + AT_2,
     ),
@@ -233,7 +234,7 @@ ENTRIES = [
         for key in ("state", "action")
     ),
     Entry(
-        "errors static",
+        "errors parameters",
         lambda g, bad: evaluate_errors(g.variants, spoil(g.own_trajectories, bad, ("parameters", "rest")), horizons=()),
         "parameters of the trajectories 'rest'" + AT_2,
     ),
@@ -247,7 +248,7 @@ ENTRIES = [
                     for name, value in (
                         ("state", g.batch["state"]),
                         ("actions", torch.zeros(5, 3, 1)),
-                        ("parameters", g.static),
+                        ("parameters", g.parameters),
                     )
                 },
             ),

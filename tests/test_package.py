@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from importlib import metadata
 from pathlib import Path
 
@@ -22,39 +24,93 @@ ORDER = (
     "scenes", "data", "maths", "networks", "dynamics", "identification", "policies", "rewards",
     "objectives", "envs", "planners", "evaluation", "training",
 )  # fmt: skip
-APART = {"data", "rewards"}  # nothing in the model's own folders imports these
-ALLOWED = {folder: set(ORDER[:index]) for index, folder in enumerate(ORDER)}
-for folder in ("maths", "networks", "dynamics", "identification", "policies"):
-    ALLOWED[folder] -= APART
-ALLOWED["data"] -= {"maths"}
-ALLOWED["rewards"] -= {"data", "networks", "dynamics", "identification", "policies"}
-ALLOWED["objectives"] -= {"data"}
-ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders
+# Earlier folders that a folder does not import either.
+APART = {
+    "maths": {"scenes", "data"},
+    "networks": {"scenes", "data"},
+    "dynamics": {"data"},
+    "identification": {"data"},
+    "policies": {"data", "dynamics", "identification"},
+    "rewards": {"data", "networks", "dynamics", "identification", "policies"},
+    "objectives": {"data", "rewards"},
+}
+ALLOWED = {folder: {*ORDER[:index], folder} - APART.get(folder, set()) for index, folder in enumerate(ORDER)}
+ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders, which import none of them
+ABOVE = {"__init__", "__main__", "doctor"}  # these may import all folders, and no folder imports them
+LONGEST = 300
 LATER = (ast.FunctionDef, ast.AsyncFunctionDef)  # what is imported in there is not when the package is
 WITH_PILLOW = {"drawing.py"}  # imported to draw a video, once Pillow was found
+# The names of ``import torchrl_gn``.
+PUBLIC = {
+    "data": ["collect_trajectories", "create_dataset", "load_dataset", "trajectory_buffer"],
+    "dynamics": ["ForwardModel", "export_step", "specialize"],
+    "envs": ["ModelEnv", "SceneEnv"],
+    "evaluation": ["evaluate_errors", "rollout_video"],
+    "identification": ["IdentifyingModel"],
+    "objectives": ["ForwardModelLoss", "IdentificationLoss", "SVGLoss"],
+    "planners": ["GradientPlanner", "ILQGPlanner"],
+    "rewards": ["make_reward"],
+    "scenes": ["load_scene"],
+    "training": ["fit", "load_pretrained", "pretrained_names", "save_checkpoint"],
+}
+NAMES = sorted(name for names in PUBLIC.values() for name in names)
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def module_of(file: Path) -> str:
+    """Dotted name of a file's module."""
+    return ".".join(("torchrl_gn", *file.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
+
+
+MODULES = {module_of(file): file for file in FILES}
 
 
 def imports(tree: ast.AST) -> list[str]:
     """Absolute names of all modules that a file imports, inside functions too."""
-    names = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are absolute"
-            names.append(node.module or "")
-    return names
+    return [name for node in ast.walk(tree) for name in imported(node)]
 
 
-@pytest.mark.parametrize("file", sorted(PACKAGE.rglob("*.py")), ids=lambda file: str(file.relative_to(PACKAGE)))
+def imported(node: ast.AST) -> list[str]:
+    """Absolute names of the modules that a statement imports."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if not isinstance(node, ast.ImportFrom):
+        return []
+    assert node.level == 0 and node.module, "imports are absolute"
+    inner = [f"{node.module}.{alias.name}" for alias in node.names]
+    return [name if name in MODULES else node.module for name in inner]
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
 def test_imports_point_one_way(file):
-    folder = file.relative_to(PACKAGE).parts[0]
-    if folder not in ALLOWED:
+    part = file.relative_to(PACKAGE).with_suffix("").parts[0]
+    if part in ABOVE:
         return
-    inside = [name.split(".") for name in imports(ast.parse(file.read_text())) if name.startswith("torchrl_gn")]
-    parts = {name[1] for name in inside if len(name) > 1}
-    wrong = parts - ALLOWED[folder] - ANYWHERE - {folder}
-    assert not wrong, f"torchrl_gn.{folder} must not import torchrl_gn.{', '.join(sorted(wrong))}"
+    tree = ast.parse(file.read_text())
+    # ``import torchrl_gn`` gives the package's place and version; names come from their folders.
+    front = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module == "torchrl_gn"]
+    assert all(name in MODULES for node in front for name in (f"torchrl_gn.{alias.name}" for alias in node.names))
+    inside = [name.split(".") for name in imports(tree) if name.startswith("torchrl_gn.")]
+    wrong = {name[1] for name in inside} - ALLOWED.get(part, set()) - ANYWHERE
+    assert not wrong, f"torchrl_gn.{part} must not import torchrl_gn.{', '.join(sorted(wrong))}"
+
+
+def test_no_module_imports_itself_through_others():
+    """Without what is imported for types, or later by a function."""
+
+    def at_import(node: ast.AST) -> list[str]:
+        if isinstance(node, LATER) or is_for_types(node):
+            return []
+        return imported(node) + [name for child in ast.iter_child_nodes(node) for name in at_import(child)]
+
+    graph = {module: set(at_import(ast.parse(file.read_text()))) & set(MODULES) for module, file in MODULES.items()}
+    assert sum(map(len, graph.values())) > len(graph)
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_files_are_short(file):
+    assert len(file.read_text().splitlines()) <= LONGEST
 
 
 def is_for_types(node: ast.AST) -> bool:
@@ -84,10 +140,11 @@ def test_what_is_imported_is_declared():
 
 def test_every_folder_has_a_place_in_the_order():
     folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
-    assert folders <= set(ALLOWED)
+    assert folders == set(ORDER)
+    assert {path.stem for path in PACKAGE.glob("*.py")} == ANYWHERE | ABOVE
 
 
-@pytest.mark.parametrize("file", sorted(PACKAGE.rglob("*.py")), ids=lambda file: str(file.relative_to(PACKAGE)))
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
 def test_library_does_not_print(file):
     if file.name == "__main__.py":  # the command line
         return
@@ -101,7 +158,7 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 def test_importing_everything_is_silent_and_leaves_the_recipes_libraries_alone():
-    folders = [f"torchrl_gn.{folder}" for folder in ALLOWED if (PACKAGE / folder / "__init__.py").exists()]
+    folders = [f"torchrl_gn.{folder}" for folder in ORDER]
     done = run(
         f"import sys, {', '.join(['torchrl_gn', *folders])}\n"
         "wanted = {'hydra', 'omegaconf', 'wandb', 'dm_control', 'gymnasium', 'matplotlib.pyplot'}\n"
@@ -123,14 +180,13 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.envs import suite_env
 from torchrl_gn.evaluation import evaluate_errors, plot_errors, rollout_frames
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.scenes import ParameterNames
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, load_pretrained, make_optimizer, save_checkpoint
 
 scene = load_scene(MJCF)
 trajectories = collect_trajectories(scene, 4, seed=0)
-bound = ForwardModel(ParameterNames.of(scene), node_hidden=(8,), edge_hidden=(8,), global_hidden=(8,)).bind(scene)
+bound = ForwardModel.for_scene(scene, node_hidden=(8,), edge_hidden=(8,), global_hidden=(8,)).bind(scene)
 loss = ForwardModelLoss(bound)
 buffer = trajectory_buffer(trajectories, batch_size=8, seed=0)
 loss.fit_normalizers(buffer.sample())
@@ -153,16 +209,14 @@ with pytest.raises(ImportError, match=r'pip install "torchrl_gn\\[suite\\]"'):
 def test_core_works_without_the_extras(tmp_path):
     mjcf, file = zoo.mjcf("pole"), str(tmp_path / "model.safetensors")
     code = WITHOUT_EXTRAS.replace("MJCF", repr(mjcf)).replace("FILE", repr(file))
-    done = run(code.replace("FOLDERS", ", ".join(f"torchrl_gn.{folder}" for folder in ALLOWED)))
+    done = run(code.replace("FOLDERS", ", ".join(f"torchrl_gn.{folder}" for folder in ORDER)))
     assert done.returncode == 0, done.stderr
 
 
 def exported(part: str) -> list[str]:
-    """Public names of a folder, or of the module ``pretrained``."""
-    if part == "pretrained":
-        return [node.name for node in tree(part).body if isinstance(node, ast.FunctionDef)]
-    imported = [node for node in tree(part).body if isinstance(node, ast.ImportFrom)]
-    return [alias.asname or alias.name for node in imported for alias in node.names]
+    """Public names of a folder."""
+    nodes = [node for node in tree(part).body if isinstance(node, ast.ImportFrom)]
+    return [alias.asname or alias.name for node in nodes for alias in node.names]
 
 
 def tree(module: str) -> ast.Module:
@@ -171,10 +225,12 @@ def tree(module: str) -> ast.Module:
 
 
 def described(module: str, name: str) -> bool:
-    """Whether a class or function has a docstring where it is defined, or a string stands behind a constant."""
+    """Whether a class, function or module has a docstring where it is defined, or a string stands behind a constant."""
     body = tree(module).body
     for node, behind in zip(body, [*body[1:], ast.Pass()], strict=True):
         if isinstance(node, ast.ImportFrom) and name in [alias.asname or alias.name for alias in node.names]:
+            if node.module == f"torchrl_gn.{module}":
+                return bool(ast.get_docstring(tree(f"{module}.{name}")))
             return described((node.module or "").removeprefix("torchrl_gn."), name)
         if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name == name:
             return bool(ast.get_docstring(node))
@@ -184,15 +240,42 @@ def described(module: str, name: str) -> bool:
     raise LookupError(f"{module} has no {name}")
 
 
-@pytest.mark.parametrize("part", [*ALLOWED, "pretrained"])
+@pytest.mark.parametrize("part", ORDER)
 def test_every_public_name_is_described(part):
     names = exported(part)
     assert names and not [name for name in names if not described(part, name)]
 
 
 def test_package_itself_is_light():
-    done = run("import sys, torchrl_gn; print(torchrl_gn.__version__, 'torch' in sys.modules)")
-    assert (done.stdout, done.stderr) == (f"{torchrl_gn.__version__} False\n", "")
+    done = run(
+        "import sys, torchrl_gn\n"
+        "names = dir(torchrl_gn), torchrl_gn.__all__, torchrl_gn.__version__\n"
+        "print([name for name in sys.modules if name == 'torch' or name.startswith('torchrl_gn.')])"
+    )
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+def test_the_front_door_has_these_names_alone():
+    assert torchrl_gn.__all__ == NAMES
+    assert dir(torchrl_gn) == sorted([*NAMES, "__version__"])
+    assert not hasattr(torchrl_gn, "no_such_name")
+    # Type checkers read the same names from imports of their own.
+    body = ast.parse((PACKAGE / "__init__.py").read_text()).body
+    (block,) = [node for node in body if isinstance(node, ast.If) and is_for_types(node)]
+    typed = [
+        (node.module, [alias.name for alias in node.names]) for node in block.body if isinstance(node, ast.ImportFrom)
+    ]
+    assert sorted(typed) == sorted(
+        (f"torchrl_gn.{folder}", [name]) for folder, names in PUBLIC.items() for name in names
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_the_front_door_are_those_of_their_folders(name, monkeypatch):
+    monkeypatch.delitem(vars(torchrl_gn), name, raising=False)  # as before its first use
+    (folder,) = [folder for folder, names in PUBLIC.items() if name in names]
+    assert getattr(torchrl_gn, name) is getattr(importlib.import_module(f"torchrl_gn.{folder}"), name)
+    assert name in vars(torchrl_gn)
 
 
 def test_warnings_of_the_package_fail_tests(pytestconfig):

@@ -7,9 +7,10 @@ import json
 
 import pytest
 import torch
-from torchrl_gn.modules import precision, specialized_model
 
 from torchrl_gn import processor
+from torchrl_gn.dynamics import specialized
+from torchrl_gn.maths import precision
 from torchrl_gn.maths.precision import fast_matmul
 from torchrl_gn.processor import ProductSpeeds, SlowDtypeWarning, product_speeds
 
@@ -98,11 +99,11 @@ def test_slow_dtypes_warn_and_say_what_to_do(monkeypatch):
 
     loaded = load_pretrained("pendulum")
     bound = loaded.model.bind(loaded.scene())
-    monkeypatch.setattr(specialized_model, "product_speeds", lambda: dataclasses.replace(SPEEDS, bfloat16=8.0))
+    monkeypatch.setattr(specialized, "product_speeds", lambda: dataclasses.replace(SPEEDS, bfloat16=8.0))
     with pytest.warns(
         SlowDtypeWarning, match="multiplies bfloat16 20.0 times more slowly than float32: leave out dtype"
     ):
-        specialized_model.specialize(bound, dtype=torch.bfloat16)
-    specialized_model.specialize(bound, dtype=torch.float64)
-    monkeypatch.setattr(specialized_model, "product_speeds", lambda: SPEEDS)
-    specialized_model.specialize(bound, dtype=torch.bfloat16)
+        specialized.specialize(bound, dtype=torch.bfloat16)
+    specialized.specialize(bound, dtype=torch.float64)
+    monkeypatch.setattr(specialized, "product_speeds", lambda: SPEEDS)
+    specialized.specialize(bound, dtype=torch.bfloat16)

@@ -13,8 +13,8 @@ from torchrl_gn.data import DatasetError, collect, create_dataset, dataset, load
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.training import load_pretrained
 from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants, static_features
+from torchrl_gn.training import load_pretrained
 
 from ..sizes import SMALL
 
@@ -66,8 +66,8 @@ def test_a_data_set_of_before_serves_a_model_of_before(tmp_path, model, monkeypa
         load_dataset(tmp_path / "d", load_scene("pendulum")),
         create_dataset(tmp_path / "d", load_scene("pendulum"), **SIZES),
     ):
-        assert opened.features == ParameterNames.of(opened.scene).common(model.features) != model.features
-        again = model.bind(opened.scene, parameters_key="parameters", static_features=opened.features)
+        assert opened.features == ParameterNames.of(opened.scene).common(model.parameter_names) != model.parameter_names
+        again = model.bind(opened.scene, parameters_key="parameters", parameter_names=opened.features)
         assert torch.equal(train_loss(again, opened.train), expected)
         assert evaluate_errors(again, opened.test, horizons=(5,)).to_metrics() == table.to_metrics()
 
@@ -77,7 +77,7 @@ def test_data_collected_now_serve_a_model_of_before(tmp_path, model, monkeypatch
     expected = train_loss(model.bind(before.scene, parameters_key="parameters"), before.train)
     variant = sample_variants("pendulum", 1, rng=1)[0]
     state, action = before.train["state"][:3, 0], before.train["action"][:3, 0]
-    moved = model.bind(variant).step(state, action)
+    moved, _ = model.bind(variant).step(state, action)
     gain(monkeypatch)
     made = create_dataset(tmp_path / "new", load_scene("pendulum"), **SIZES)
     assert made.train["parameters", "nodes"][0, :, 0].tolist() == [1, 2]
@@ -87,10 +87,10 @@ def test_data_collected_now_serve_a_model_of_before(tmp_path, model, monkeypatch
     variant = sample_variants("pendulum", 1, rng=1)[0]
     parameters = torch.stack([bound.parameters_of(variant)] * 3)
     assert parameters["nodes"].shape[-1] == len(made.features.nodes)
-    torch.testing.assert_close(bound.step(state, action, parameters), moved, rtol=0, atol=1e-12)
+    torch.testing.assert_close(bound.step(state, action, parameters)[0], moved, rtol=0, atol=1e-12)
     model.requires_grad_(False)
     quick = specialize(bound)
-    torch.testing.assert_close(quick.step(state, action, parameters), moved, rtol=0, atol=1e-12)
+    torch.testing.assert_close(quick.step(state, action, parameters)[0], moved, rtol=0, atol=1e-12)
     assert quick.own_parameters()["nodes"].shape[-1] == len(made.features.nodes)
 
 
@@ -108,9 +108,9 @@ def test_columns_in_another_order_are_put_right_when_a_data_set_is_opened(tmp_pa
 def test_what_is_missing_is_named(tmp_path, model, monkeypatch):
     gain(monkeypatch)
     opened = load_dataset(tmp_path / "d")
-    fresh = ForwardModel(ParameterNames.of(opened.scene), **SMALL).double()
-    with pytest.raises(ValueError, match=r"reads the static features \['charm'\], which samples of 'pendulum' do not"):
-        fresh.bind(opened.scene, parameters_key="parameters", static_features=opened.features)
+    fresh = ForwardModel.for_scene(opened.scene, **SMALL).double()
+    with pytest.raises(ValueError, match=r"reads the parameters \['charm'\], which samples of 'pendulum' do not"):
+        fresh.bind(opened.scene, parameters_key="parameters", parameter_names=opened.features)
     # The data set's names were not given.
     for each in (fresh, model):
         count = len(opened.features.nodes)
@@ -154,7 +154,7 @@ def test_shipped_weights_serve_a_library_with_more_features(name, monkeypatch):
             trained = checkpoint.trained.requires_grad_(False)
             bound = trained.bind(scene) if isinstance(trained, ForwardModel) else trained.bind(scene)[0]
             state = torch.eye(13, dtype=torch.float64)[3].expand(scene.num_nodes, 13)
-            predicted.append(bound.step(state, torch.ones(scene.num_actions, dtype=torch.float64)))
+            predicted.append(bound.step(state, torch.ones(scene.num_actions, dtype=torch.float64))[0])
         return predicted
 
     before = predict()

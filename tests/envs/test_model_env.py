@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.dynamics.model import ParameterNames
+from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.envs.specs import reward_of
 from torchrl_gn.rewards import make_reward
@@ -140,12 +140,12 @@ def test_steps_a_true_environments_tensordict(scene_env, model_env):
 
 def test_runs_a_bound_forward_model(swimmer):
     torch.manual_seed(0)
-    model = ForwardModel(ParameterNames.of(swimmer), **SMALL)
+    model = ForwardModel.for_scene(swimmer, **SMALL)
     env = ModelEnv(model.bind(swimmer), seed=0)
     check_env_specs(env)
     true = SceneEnv(swimmer, seed=0).rollout(4, tensordict=TensorDict(batch_size=[3]))
-    env.world_model.update_parameter_normalizers()
-    env.world_model.update_dynamic_normalizers(true["state"], true["action"], true["next", "state"])
+    update_parameter_normalizers(env.world_model)
+    update_dynamic_normalizers(env.world_model, true["state"], true["action"], true["next", "state"])
     actions = true["action"].clone().requires_grad_()
     played = rollout(env, true[:, 0].select("state"), actions)
     played["next", "state"].square().sum().backward()
@@ -154,7 +154,7 @@ def test_runs_a_bound_forward_model(swimmer):
 
 
 def test_samples_of_another_scene_are_refused(pendulum):
-    env = ModelEnv(ForwardModel(ParameterNames.of(pendulum), **SMALL).bind(pendulum), seed=0)
+    env = ModelEnv(ForwardModel.for_scene(pendulum, **SMALL).bind(pendulum), seed=0)
     start = env.rand_action(env.reset(TensorDict(batch_size=[2])))
     own, heavy = (
         PhysicalParameters.of(scene).tensordict().expand(2)
@@ -162,7 +162,7 @@ def test_samples_of_another_scene_are_refused(pendulum):
     )
     expected = env.step(start.clone())["next", "state"]
     assert torch.equal(env.step(start.clone().set("parameters", own))["next", "state"], expected)
-    with pytest.raises(ValueError, match="other static 'nodes' than scene 'pendulum'"):
+    with pytest.raises(ValueError, match="other parameters 'nodes' than scene 'pendulum'"):
         env.step(start.clone().set("parameters", heavy))
 
 
@@ -173,7 +173,7 @@ def test_specs_name_what_else_a_model_reads(swimmer, kind):
         "inferred": {"parameters": "inferred", "inferred": (4, 4, 4)},
         "recurrent": {"core": "recurrent", "hidden_state": [4, 4, 4]},
     }
-    model = ForwardModel(ParameterNames.of(swimmer), **options[kind], **SMALL)
+    model = ForwardModel.for_scene(swimmer, **options[kind], **SMALL)
     env = ModelEnv(model.bind(swimmer, parameters_key=None if kind == "recurrent" else "parameters"), seed=0)
     check_env_specs(env)
     assert ("hidden_state" in env.observation_spec.keys()) == (kind == "recurrent")

@@ -9,8 +9,9 @@ from tensordict.nn import TensorDictModule
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, Predictor
+from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.maths import quaternion
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import load_scene
 
 from ..sizes import SMALL
 
@@ -64,8 +65,8 @@ def simulated(scenes) -> TensorDict:
 def swimmer(scenes, simulated) -> Predictor:
     """A small untrained model of the swimmer that knows how its states vary."""
     torch.manual_seed(0)
-    bound = ForwardModel(ParameterNames.of(scenes["swimmer6"]), **SMALL).double().bind(scenes["swimmer6"])
-    bound.update_parameter_normalizers()
+    bound = ForwardModel.for_scene(scenes["swimmer6"], **SMALL).double().bind(scenes["swimmer6"])
+    update_parameter_normalizers(bound)
     state = simulated["state"]
-    bound.update_dynamic_normalizers(state[:, :-1], simulated["action"], state[:, 1:])
+    update_dynamic_normalizers(bound, state[:, :-1], simulated["action"], state[:, 1:])
     return bound

@@ -84,7 +84,7 @@ def test_errors_equal_a_plain_loop(scenes):
 
 
 @pytest.mark.parametrize("name", ["swimmer6", "cheetah"])
-def test_constant_prediction_is_exactly_one(scenes, name):
+def test_the_persistence_baseline_is_exactly_one(scenes, name):
     model = as_model(lambda state, action: state.clone(), scenes[name])
     table = evaluate_errors(model, random_trajectories(scenes[name], 7, 9), horizons=(4, 9), batch_size=5)
     for error in table.errors.values():

@@ -108,7 +108,7 @@ def test_training_curve_and_errors(tmp_path):
         ["a", "1.00e-02", "0.200"],
         ["b", "3.000", "inf"],
         ["c", "0.000", "1.000"],
-        ["constant", "prediction", "1.000", "1.000"],
+        ["persistence", "baseline", "1.000", "1.000"],
         *([["b,", "rollout_error_100:", *row.split()[2:]] for row in rows[6:]]),
     ]
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchrl_gn.dynamics import specialize
+from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.evaluation import evaluate_errors, guarded_rollout, rollout
 
 from .conftest import as_model, random_states
@@ -21,25 +21,26 @@ BAD_ACTIONS = {"not finite": 1e308, "out of range": 1e9}
 def no_limits(swimmer, monkeypatch) -> None:
     """Let actions through as they are, to make rollouts diverge when wanted."""
     for name, value in (("action_low", -math.inf), ("action_high", math.inf)):
-        monkeypatch.setitem(swimmer.frame._buffers, name, torch.full_like(getattr(swimmer.frame, name), value))
+        limits = torch.full_like(getattr(swimmer.controls, name), value)
+        monkeypatch.setitem(swimmer.controls._buffers, name, limits)
 
 
 @pytest.fixture
 def sizes(swimmer, monkeypatch) -> list[int]:
     """Batch sizes and lengths of the rollouts that the model is asked for."""
-    asked, plain = [], swimmer.rollout_and_hidden_state
+    asked, plain = [], swimmer.rollout
 
     def counted(state, actions, parameters=None, hidden_state=None):
         asked.append((len(state), actions.shape[-2]))
         return plain(state, actions, parameters, hidden_state)
 
-    monkeypatch.setattr(swimmer, "rollout_and_memory", counted)
+    monkeypatch.setattr(swimmer, "rollout", counted)
     return asked
 
 
 def test_what_does_not_diverge_is_the_rollout(swimmer, simulated, sizes):
     state, actions = simulated["state"][:, 0], simulated["action"]
-    expected = swimmer.rollout(state, actions).detach()
+    expected = swimmer.rollout(state, actions)[0].detach()
     sizes.clear()
     guarded = guarded_rollout(swimmer, state, actions, every=25)
     assert sizes == [(6, 25), (6, 25), (6, 10)]
@@ -73,9 +74,9 @@ def test_nothing_is_predicted_once_all_have_diverged(swimmer, simulated, sizes):
     assert guarded.states.isfinite().all()
 
 
-def test_a_compiled_model_keeps_its_batch(swimmer, simulated, sizes):
+def test_a_compiled_model_keeps_its_batch(swimmer, simulated, sizes, monkeypatch):
     # Every other batch size would be compiled anew.
-    swimmer.compile_steps = True
+    monkeypatch.setattr(type(swimmer), "fixed_batch", True)
     state, actions = simulated["state"][:, 0], simulated["action"].clone()
     actions[:2, 5] = 1e308
     guarded = guarded_rollout(swimmer, state, actions, every=30)
@@ -113,18 +114,20 @@ def test_where_an_invariant_scene_is_does_not_matter(swimmer, simulated):
 
 
 def test_before_training_only_finite_numbers_are_asked_for(swimmer, simulated):
-    fresh = type(swimmer.model)(swimmer.model.features, latent=4).bind(swimmer.scene)
+    fresh = ForwardModel.for_scene(swimmer.scene, latent=4).bind(swimmer.scene)
     state, actions = 1e30 * simulated["state"][:, 0], simulated["action"]
     assert not guarded_rollout(fresh, state, actions).diverged.any()
 
 
-def test_rollouts_with_static_values_of_their_own(swimmer, simulated, sizes):
+def test_rollouts_with_parameters_of_their_own(swimmer, simulated, sizes):
     state, actions = simulated["state"][:, 0].clone(), simulated["action"].clone()
     parameters = torch.stack([swimmer.parameters_of(swimmer.scene)] * 6)
     factors = torch.linspace(0.5, 1.5, 6, dtype=torch.float64)[:, None, None]
-    parameters = parameters.set("nodes", factors * parameters["nodes"]).set("arm", factors * parameters["arm"])
-    expected = swimmer.rollout(state, actions, parameters).detach()
-    assert (expected - swimmer.rollout(state, actions)).abs().max() > 1e-3
+    parameters = parameters.set("nodes", factors * parameters["nodes"]).set(
+        "child_anchor", factors * parameters["child_anchor"]
+    )
+    expected = swimmer.rollout(state, actions, parameters)[0].detach()
+    assert (expected - swimmer.rollout(state, actions)[0]).abs().max() > 1e-3
     actions[1, 30] = 1e308
     guarded = guarded_rollout(swimmer, state, actions, parameters)
     assert guarded.good_steps.tolist() == [STEPS, 30, *[STEPS] * 4]
@@ -181,10 +184,10 @@ def test_errors_count_what_diverged(swimmer, simulated):
     assert table.rollouts[2, :31].isfinite().all() and table.rollouts[2, 31:].isnan().all()
 
 
-def test_errors_of_samples_with_static_values_of_their_own(swimmer, simulated):
+def test_errors_of_samples_with_parameters_of_their_own(swimmer, simulated):
     bound = swimmer.model.bind(swimmer.scene, parameters_key="parameters")
     parameters = torch.stack([bound.parameters_of(swimmer.scene)] * 6)
-    parameters["arm"][3:] *= 1.5
+    parameters["child_anchor"][3:] *= 1.5
     own = simulated.clone().set("parameters", parameters)
     table = evaluate_errors(bound, own, horizons=(5,), batch_size=4)
     halves = [evaluate_errors(bound, half, horizons=(5,)) for half in (own[:3], own[3:])]
@@ -194,5 +197,5 @@ def test_errors_of_samples_with_static_values_of_their_own(swimmer, simulated):
         assert squared[0] != pytest.approx(squared[1], rel=1e-3)
     with pytest.raises(KeyError, match="physical parameters at 'parameters'"):
         evaluate_errors(bound, simulated, horizons=())
-    with pytest.raises(ValueError, match="other static 'arm' than scene 'swimmer6'"):
+    with pytest.raises(ValueError, match="other parameters 'child_anchor' than scene 'swimmer6'"):
         evaluate_errors(swimmer, own, horizons=())

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import ParameterNames, Scene
+from torchrl_gn.scenes import Scene
 
 from .. import zoo
 from ..sizes import SMALL
@@ -57,7 +57,7 @@ def make_loss(scenes, windows) -> Callable[..., ForwardModelLoss]:
 
     def make(name: str = "swimmer6", *, fitted: bool = True, model: dict | None = None, **options) -> ForwardModelLoss:
         torch.manual_seed(0)
-        network = ForwardModel(ParameterNames.of(scenes[name]), **(SMALL | (model or {}))).double()
+        network = ForwardModel.for_scene(scenes[name], **(SMALL | (model or {}))).double()
         loss = ForwardModelLoss(network.bind(scenes[name]), **options)
         if fitted:
             loss.fit_normalizers(windows[name].reshape(-1))

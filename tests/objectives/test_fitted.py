@@ -23,7 +23,7 @@ from torchrl_gn.objectives import (
     SVGLoss,
 )
 from torchrl_gn.policies import Agent
-from torchrl_gn.scenes import ObservationGraph, ParameterNames, load_scene
+from torchrl_gn.scenes import ObservationGraph, load_scene
 
 from ..sizes import SMALL
 
@@ -42,7 +42,7 @@ class Case(NamedTuple):
 
 def forward_model(**options) -> Case:
     scene = load_scene("pendulum")
-    loss = ForwardModelLoss(ForwardModel(ParameterNames.of(scene), **SMALL, **options).bind(scene))
+    loss = ForwardModelLoss(ForwardModel.for_scene(scene, **SMALL, **options).bind(scene))
     batch = transitions("pendulum")
     return Case(
         loss,
@@ -54,7 +54,7 @@ def forward_model(**options) -> Case:
 
 
 def several_scenes() -> Case:
-    model = ForwardModel(ParameterNames.of(load_scene("pendulum")), **SMALL)
+    model = ForwardModel.for_scene(load_scene("pendulum"), **SMALL)
     names = ("pendulum", "cartpole")
     loss = SeveralScenesLoss([ForwardModelLoss(model.bind(load_scene(name))) for name in names])
     batch = [transitions(name) for name in names]
@@ -63,7 +63,7 @@ def several_scenes() -> Case:
 
 def identification() -> Case:
     scene = load_scene("pendulum")
-    forward = ForwardModel(ParameterNames.of(scene), parameters="inferred", inferred=(3, 3, 3), **SMALL)
+    forward = ForwardModel.for_scene(scene, parameters="inferred", inferred=(3, 3, 3), **SMALL)
     loss = IdentificationLoss(IdentifyingModel(forward), scene, context_length=3)
     batch = transitions("pendulum", window=4)
     flat = transitions("pendulum")
@@ -99,7 +99,7 @@ def agent_case(kind: str) -> Case:
 
 CASES = {
     "forward model": forward_model,
-    "recurrent": lambda: forward_model(core="recurrent", memory=(3, 3, 3)),
+    "recurrent": lambda: forward_model(core="recurrent", hidden_state=(3, 3, 3)),
     "true parameters hidden": lambda: forward_model(parameters="none"),
     "several scenes": several_scenes,
     "identification": identification,
@@ -135,7 +135,9 @@ def test_statistics_that_came_with_weights_count(make):
     assert all(bool(value.isfinite().all()) for value in fresh.loss(fresh.batch).values())
 
 
-@pytest.mark.parametrize("part", ["node", "edge", "static_node", "static_edge", "static_global", "residual", "delta"])
+@pytest.mark.parametrize(
+    "part", ["node", "edge", "parameter_node", "parameter_edge", "parameter_global", "residual", "delta"]
+)
 def test_a_model_of_which_a_part_was_never_fitted_is_refused(part):
     """Fitted by hand, and one forgotten."""
     case = forward_model()
@@ -150,7 +152,7 @@ def test_predictions_need_no_data():
     """Of random weights, in a benchmark: without statistics bodies coast."""
     case = forward_model()
     bound = case.loss.model
-    state = bound.step(case.batch["state"], case.batch["action"])
+    state, _ = bound.step(case.batch["state"], case.batch["action"])
     assert bool(state.isfinite().all())
 
 

@@ -2,33 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_gn.data import create_dataset, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.dynamics import Canonicalizer, ForwardModel
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.normalization import dynamic_graph
+from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import load_scene
 
 from ..sizes import SMALL
 
 COMPONENTS = BODY_STATE.names
 
 
-def predict(loss: ForwardModelLoss, delta) -> list[Tensor]:
-    """Make the model predict ``delta(state, action)``; the list collects the states it is fed."""
-    fed: list[Tensor] = []
+@pytest.fixture
+def predict(monkeypatch) -> Callable[[Callable], list[Tensor]]:
+    """Make models predict ``delta(state, action)``; the list collects the states they are fed."""
 
-    def stub(state: Tensor, action: Tensor, _) -> Tensor:
-        fed.append(state)
-        return delta(state, action) * loss.model.movable
+    def predict(delta: Callable) -> list[Tensor]:
+        fed: list[Tensor] = []
 
-    loss.model.delta = stub
-    return fed
+        def stub(program: StepProgram, state: Tensor, action: Tensor, hidden: None) -> tuple[Tensor, None]:
+            fed.append(state)
+            return delta(state, action) * program.movable, hidden
+
+        monkeypatch.setattr(eager, "delta", stub)
+        return fed
+
+    return predict
 
 
 def unit_scale(loss: ForwardModelLoss) -> None:
@@ -74,7 +84,7 @@ def test_perfect_predictions_cost_nothing(make_loss, windows, name):
     loss = make_loss(name)
     batch = windows[name].reshape(-1)
     batch = TensorDict({"state": batch["state"], "action": batch["action"]}, batch.batch_size)
-    batch["next", "state"] = loss.model.step(batch["state"], batch["action"]).detach()
+    batch["next", "state"] = loss.model.step(batch["state"], batch["action"])[0].detach()
     assert loss(batch)["loss_forward_model"] < 1e-24
 
 
@@ -92,11 +102,11 @@ def test_the_value_is_the_mean_over_components_of_scaled_errors(make_loss, windo
     torch.testing.assert_close(out["loss_forward_model"], sum(movable) / len(movable), rtol=1e-12, atol=0)
 
 
-def test_predicting_the_mean_change_costs_one(make_loss, windows):
+def test_predicting_the_mean_change_costs_one(make_loss, windows, predict):
     """Errors are in units of the change's own variance, whatever the component."""
     loss = make_loss("falling")
     normalizer = loss.model.model.delta_normalizer
-    predict(loss, lambda state, action: normalizer.mean.expand(*state.shape[:-1], 12))
+    predict(lambda state, action: normalizer.mean.expand(*state.shape[:-1], 12))
     out = loss(windows["falling"].reshape(-1))
     for component in COMPONENTS:
         # Rotation vectors of 0.1 rad are the difference only to third order.
@@ -104,7 +114,7 @@ def test_predicting_the_mean_change_costs_one(make_loss, windows):
 
 
 @pytest.mark.parametrize("angle", [0.1, 1.0, 3.0])
-def test_the_orientation_error_is_the_papers_corrected_formula(make_loss, angle):
+def test_the_orientation_error_is_the_papers_corrected_formula(make_loss, angle, predict):
     """``4 (1 - (q_e . q_p)^2)``, spread over three channels, for moderate rotations in float64."""
     loss = make_loss("falling")
     unit_scale(loss)
@@ -115,14 +125,14 @@ def test_the_orientation_error_is_the_papers_corrected_formula(make_loss, angle)
     change = torch.zeros(50, 2, 12, dtype=torch.float64)
     change[:, 1, 3:6] = angle * turn[:, 1, 1:] / turn[:, 1, 1:].norm(dim=-1, keepdim=True)
     truth, guess = BODY_STATE.apply(state, change), BODY_STATE.apply(state, change.roll(1, 0))
-    predict(loss, lambda state, action: change.roll(1, 0))
+    predict(lambda state, action: change.roll(1, 0))
     batch = TensorDict({"state": state, "action": torch.zeros(50, 0), "next": {"state": truth}}, [50])
     cosine = (truth[:, 1, 3:7] * guess[:, 1, 3:7]).sum(-1)
     expected = (4 * (1 - cosine.square()) / 3).mean()
     torch.testing.assert_close(loss(batch)["error_orientation"], expected, rtol=1e-11, atol=0)
 
 
-def test_tiny_rotations_keep_their_digits_in_float32(make_loss):
+def test_tiny_rotations_keep_their_digits_in_float32(make_loss, predict):
     """1e-6 rad a step, where ``1 - (q_e . q_p)^2`` is exactly 0 in float32."""
     loss = make_loss("falling")
     unit_scale(loss)
@@ -133,7 +143,7 @@ def test_tiny_rotations_keep_their_digits_in_float32(make_loss):
     state[..., 3] = 1
     errors = {}
     for dtype in (torch.float64, torch.float32):
-        predict(loss, lambda state, action: guess.to(dtype))  # noqa: B023
+        predict(lambda state, action: guess.to(dtype))  # noqa: B023
         after = BODY_STATE.apply(state, true).to(dtype)
         batch = TensorDict({"state": state.to(dtype), "action": torch.zeros(50, 0), "next": {"state": after}}, [50])
         errors[dtype] = loss(batch)["error_orientation"]
@@ -167,7 +177,7 @@ def test_windows_feed_the_model_its_own_predictions(make_loss, windows, noise):
         delta = loss.model.delta(current, batch["action"][:, step])
         target = BODY_STATE.delta(current, batch["next", "state"][:, step])
         total = total + sum(by_hand(loss, delta, target).values()) / 4
-        current = loss.model.step(current, batch["action"][:, step])
+        current, _ = loss.model.step(current, batch["action"][:, step])
     torch.testing.assert_close(out["loss_forward_model"], total / batch.shape[1], rtol=1e-12, atol=0)
 
 
@@ -211,11 +221,11 @@ def test_backward_reaches_every_weight_of_the_core(make_loss, windows):
         assert parameter.grad is not None and parameter.grad.isfinite().all() and parameter.grad.abs().sum() > 0, name
 
 
-def test_noise_has_the_size_of_each_channels_spread(make_loss, windows):
+def test_noise_has_the_size_of_each_channels_spread(make_loss, windows, predict):
     generator = torch.Generator().manual_seed(0)
     loss = make_loss("swimmer6", noise=0.1, generator=generator)
     batch = windows["swimmer6"].reshape(-1)[:1].expand(20000).contiguous()
-    fed = predict(loss, lambda state, action: state.new_zeros(*state.shape[:-1], 12))
+    fed = predict(lambda state, action: state.new_zeros(*state.shape[:-1], 12))
     loss(batch)
     noise = BODY_STATE.delta(batch["state"], fed[0])
     movable = loss.model.movable
@@ -228,19 +238,19 @@ def test_noise_has_the_size_of_each_channels_spread(make_loss, windows):
     assert (mean[movable].abs() < 5 * expected[movable] / 20000**0.5).all()
     # Radians for orientations; each state channel's own spread for the rest.
     assert torch.equal(loss.noise_scale[3:6], torch.ones(3).double())
-    moving = loss.model.frame.recentered(windows["swimmer6"]["state"])[..., loss.model.incidence.predicted, :]
+    moving = loss.model.canonicalizer.recentered(windows["swimmer6"]["state"])[..., loss.model.incidence.predicted, :]
     position = moving[..., :3].flatten(0, -2)
     torch.testing.assert_close(loss.noise_scale[:3], position.std(0, correction=0), rtol=1e-10, atol=1e-9)
 
 
-def test_the_target_leads_from_the_noisy_input_to_the_clean_next_state(make_loss, windows):
+def test_the_target_leads_from_the_noisy_input_to_the_clean_next_state(make_loss, windows, predict):
     loss = make_loss("swimmer6", noise=0.1, generator=torch.Generator().manual_seed(0))
     batch = windows["swimmer6"].reshape(-1)
-    fed = predict(loss, lambda state, action: BODY_STATE.delta(state, batch["next", "state"]))
+    fed = predict(lambda state, action: BODY_STATE.delta(state, batch["next", "state"]))
     # Whatever the noise, the right answer is the change that repairs it.
     assert loss(batch)["loss_forward_model"] < 1e-24
     assert not torch.equal(fed[0], batch["state"])
-    predict(loss, lambda state, action: BODY_STATE.delta(batch["state"], batch["next", "state"]))
+    predict(lambda state, action: BODY_STATE.delta(batch["state"], batch["next", "state"]))
     assert loss(batch)["loss_forward_model"] > 1e-4
 
 
@@ -257,7 +267,15 @@ def test_noise_comes_from_the_generator_alone(make_loss, windows):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-@pytest.mark.parametrize("options", [{}, {"integrate": False}, {"recenter": False}, {"align": False}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"integrate": False},
+        {"canonicalizer": Canonicalizer(recenter=False)},
+        {"canonicalizer": Canonicalizer(yaw=False)},
+    ],
+)
 def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, noise, options):
     """The network's inputs and its targets have mean 0 and variance 1 over the noisy data."""
     loss = make_loss("swimmer6", noise=noise, generator=torch.Generator().manual_seed(0), model=options)
@@ -266,9 +284,9 @@ def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, no
     state = loss._perturb(batch["state"])
     target = BODY_STATE.delta(state, batch["next", "state"])
     if model.integrate:
-        target = BODY_STATE.residual(state, target, loss.model.timestep)
-    if model.align:
-        turn = loss.model.frame.yaw_rotation(state, loss.model.values).rotation
+        target = BODY_STATE.residual(state, target, loss.model.scene.timestep)
+    if model.canonicalizer.yaw:
+        turn = loss.model.canonicalizer.yaw_rotation(state, loss.model.scene_parameters).quaternion
         target = BODY_STATE.rotate_delta(target, quaternion.conjugate(turn))
     movable = loss.model.movable
     targets = model.residual_normalizer(target)
@@ -276,7 +294,7 @@ def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, no
         seen = targets[..., channel][:, movable[:, channel]]
         assert seen.mean().item() == pytest.approx(0, abs=1e-9)
         assert seen.var(correction=0).item() == pytest.approx(1, rel=1e-9)
-    dynamic = loss.model.dynamic_graph(state, batch["action"])
+    dynamic = dynamic_graph(loss.model, state, batch["action"])
     for features in (dynamic.nodes.flatten(0, -2), dynamic.edges.flatten(0, -2)):
         varies = features.std(0) > 0
         torch.testing.assert_close(features.mean(0), torch.zeros(len(varies)).double(), rtol=0, atol=1e-9)
@@ -350,7 +368,7 @@ def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
     torch.manual_seed(0)
     scene = load_scene(name)
     data = create_dataset(tmp_path, scene, train=6, validation=1, test=1, steps=4, variants=6)
-    model = ForwardModel(ParameterNames.of(scene), **SMALL).double()
+    model = ForwardModel.for_scene(scene, **SMALL).double()
     loss = ForwardModelLoss(model.bind(scene, parameters_key="parameters"))
     loss.fit_normalizers(trajectory_buffer(data.train, batch_size=200, seed=0).sample())
     for window in (1, 3):

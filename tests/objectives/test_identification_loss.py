@@ -10,7 +10,7 @@ from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import identification_errors, linear_probe
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss
-from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants
+from torchrl_gn.scenes import load_scene, sample_variants
 
 SMALL = {"edge_hidden": (16,), "node_hidden": (16,), "global_hidden": (16,)}
 
@@ -26,7 +26,7 @@ def make_loss(trajectories):
     def make(**options) -> IdentificationLoss:
         torch.manual_seed(0)
         scene = load_scene("pendulum")
-        forward_model = ForwardModel(ParameterNames.of(scene), parameters="inferred", latent=16, **SMALL)
+        forward_model = ForwardModel.for_scene(scene, parameters="inferred", latent=16, **SMALL)
         loss = IdentificationLoss(IdentifyingModel(forward_model, **SMALL), scene, **options)
         loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=500, seed=0).sample())
         return loss
@@ -128,7 +128,7 @@ def test_of_a_model_that_diverged_the_loss_is_nan(make_loss, trajectories):
 
 def test_a_model_that_reads_true_parameters_is_no_part_of_it():
     scene = load_scene("pendulum")
-    model = ForwardModel(ParameterNames.of(scene), latent=16, **SMALL)
+    model = ForwardModel.for_scene(scene, latent=16, **SMALL)
     loss = ForwardModelLoss(model.bind(scene))
     assert not isinstance(loss.trained, IdentifyingModel)
 

@@ -9,7 +9,7 @@ from torchrl.data import ReplayBufferEnsemble
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import load_scene
 
 from ..sizes import SMALL
 
@@ -20,7 +20,7 @@ NAMES = ("pendulum", "cartpole")  # both turn about one axis, at different speed
 def losses() -> list[ForwardModelLoss]:
     """Losses of two scenes that share a model."""
     torch.manual_seed(0)
-    model = ForwardModel(ParameterNames.of(load_scene("pendulum")), **SMALL).double()
+    model = ForwardModel.for_scene(load_scene("pendulum"), **SMALL).double()
     return [ForwardModelLoss(model.bind(load_scene(name))) for name in NAMES]
 
 

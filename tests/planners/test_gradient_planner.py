@@ -16,10 +16,12 @@ from torchrl.envs import StepCounter
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics.as_predictor import ModulePredictor
+from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import FreezeGoal, make_reward
-from torchrl_gn.scenes import ParameterNames, Scene, load_scene
+from torchrl_gn.scenes import Scene, load_scene
 
 from .. import zoo
 from ..sizes import SMALL
@@ -104,10 +106,10 @@ def check_that_it_imagines_what_stepping_gives(env: ModelEnv, start: TensorDict,
 def trained(scene, **options):
     """A forward model that has seen data, and no more."""
     torch.manual_seed(0)
-    bound = ForwardModel(ParameterNames.of(scene), **options).double().bind(scene)
+    bound = ForwardModel.for_scene(scene, **options).double().bind(scene)
     seen = collect_trajectories(scene, 5, 20, seed=0)
-    bound.update_parameter_normalizers()
-    bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
+    update_parameter_normalizers(bound)
+    update_dynamic_normalizers(bound, seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
     return bound
 
 
@@ -479,7 +481,7 @@ def test_bad_input_is_named():
 def test_a_compiled_model_sees_one_number_of_rows(monkeypatch):
     """Each other one would take minutes to compile for."""
     env = point_env(20.0)
-    monkeypatch.setattr(env.world_model, "compile_steps", True, raising=False)
+    monkeypatch.setattr(ModulePredictor, "fixed_batch", True)
     rows, imagine = [], env.imagine
 
     def watched(entries, actions):

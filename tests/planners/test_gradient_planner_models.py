@@ -8,10 +8,11 @@ from tensordict import TensorDict
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
+from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import make_reward
-from torchrl_gn.scenes import ParameterNames, Scene, load_scene
+from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 from ..sizes import SMALL
@@ -20,10 +21,10 @@ from ..sizes import SMALL
 def trained(scene: Scene, **options) -> Predictor:
     """A small model with random weights and true statistics."""
     torch.manual_seed(0)
-    bound = ForwardModel(ParameterNames.of(scene), **SMALL, **options).bind(scene)
+    bound = ForwardModel.for_scene(scene, **SMALL, **options).bind(scene)
     seen = collect_trajectories(scene, 5, 20, seed=0)
-    bound.update_parameter_normalizers()
-    bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
+    update_parameter_normalizers(bound)
+    update_dynamic_normalizers(bound, seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
     return bound
 
 
@@ -50,7 +51,7 @@ def test_samples_of_other_variants_are_refused():
     start = planner.imagined.reset(TensorDict(batch_size=[2]))
     planner(start.clone().set("parameters", bound.own_parameters().expand(2)))
     parameters = PhysicalParameters.of(other).tensordict().expand(2)
-    with pytest.raises(ValueError, match="other static 'globals_' than scene 'pendulum'"):
+    with pytest.raises(ValueError, match="other parameters 'globals_' than scene 'pendulum'"):
         planner(start.set("parameters", parameters))
 
 
@@ -65,7 +66,7 @@ def test_a_recurrent_model_remembers_what_was_played():
         acted.rollout(2, planner, tensordict=start.clone(), auto_reset=False)
     primed = batched(acted, 2).append_transform(planner.make_tensordict_primer())
     played = primed.rollout(4, planner)
-    _, hidden_state = bound.observe(played["state"], played["action"])
+    _, hidden_state = bound.teacher_forced(played["state"], played["action"])
     for key, value in hidden_state.items():
         torch.testing.assert_close(played["next", "hidden_state", key][:, -1], value)
         assert (played["hidden_state", key][:, 0] == 0).all()
@@ -74,12 +75,10 @@ def test_a_recurrent_model_remembers_what_was_played():
 def test_what_an_inference_model_wrote_is_planned_with(folds):
     scene = load_scene("pendulum")
     torch.manual_seed(0)
-    model = ForwardModel(
-        ParameterNames.of(scene), parameters="inferred", inferred=[3, 3, 3], project=False, **SMALL
-    ).double()
+    model = ForwardModel.for_scene(scene, parameters="inferred", inferred=[3, 3, 3], project=False, **SMALL).double()
     bound = model.bind(scene, parameters_key="parameters")
     seen = collect_trajectories(scene, 5, 20, seed=0)
-    bound.update_dynamic_normalizers(seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
+    update_dynamic_normalizers(bound, seen["state"][:, :-1], seen["action"], seen["state"][:, 1:])
     reward = make_reward("balance", scene)
     special = specialize(bound)
     planner = GradientPlanner(ModelEnv(special, reward), 3, 1, warm_up=2, samples=3, candidates=2, seed=0)

@@ -50,7 +50,7 @@ INERTIA = {f"inertia[{i}]" for i in range(3)}
 VARYING = {
     "pendulum": ({"mass", *INERTIA, "ipos[2]"}, {"actuator_acc0"}, set()),
     "cartpole": ({"mass", *INERTIA, "ipos[2]"}, {"actuator_acc0"}, set()),
-    "swimmer6": ({"mass", *INERTIA, "pos[1]"}, {"jnt_pos[1]", "actuator_acc0"}, {"parent_anchor", "arm"}),
+    "swimmer6": ({"mass", *INERTIA, "pos[1]"}, {"jnt_pos[1]", "actuator_acc0"}, {"parent_anchor", "child_anchor"}),
     "cheetah": (
         {"mass", *INERTIA, "pos[0]", "pos[2]", "quat[0]", "quat[2]", "ipos[0]", "ipos[2]"}
         | {f"iquat[{i}]" for i in range(4)},
@@ -190,7 +190,7 @@ def test_swimmer(variants):
         np.testing.assert_allclose(model.body_inertia[1:], (model.body_mass[1:] * extent / 3).T, rtol=1e-9)
         # Joints sit at the ends of both links.
         np.testing.assert_allclose(scene.joint_anchors.parent_anchor[2:], np.eye(3)[[1]] * half[:-1, None], atol=1e-15)
-        np.testing.assert_allclose(scene.joint_anchors.arm[2:], np.eye(3)[[1]] * -half[1:, None], atol=1e-15)
+        np.testing.assert_allclose(scene.joint_anchors.child_anchor[2:], np.eye(3)[[1]] * -half[1:, None], atol=1e-15)
 
 
 def test_cheetah(variants):

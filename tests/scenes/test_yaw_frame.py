@@ -118,7 +118,7 @@ def test_turned_start_gives_turned_trajectory(case):
     if not slides:
         across = [index for index in range(3) if index != yaw_frame.axis]
         np.testing.assert_allclose(yaw_frame.pivot[across], pivot[across], atol=1e-12)
-    expected = BODY_STATE.turn(states - pivot, quaternion.exp(rotation)) + pivot
+    expected = BODY_STATE.rotate(states - pivot, quaternion.exp(rotation)) + pivot
     sign = (turned[..., 3:7] * expected[..., 3:7]).sum(-1, keepdim=True).sign()
     expected[..., 3:7] *= sign
     np.testing.assert_allclose(turned[:, 1:], expected[:, 1:], atol=1e-7)

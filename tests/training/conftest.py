@@ -15,7 +15,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss, ObservationModelLoss, SVGLoss
 from torchrl_gn.policies import Agent
-from torchrl_gn.scenes import ObservationGraph, ParameterNames, Scene, load_scene
+from torchrl_gn.scenes import ObservationGraph, Scene, load_scene
 from torchrl_gn.training import Budget, OffPolicyTrainer, mean_return
 from torchrl_gn.training.optimizers import make_optimizer
 from torchrl_gn.training.trainer import Trainer
@@ -37,7 +37,7 @@ def trajectories(scene) -> TensorDict:
 def make_model(scene) -> Callable[..., ForwardModel]:
     def make(seed: int = 0, **options) -> ForwardModel:
         torch.manual_seed(seed)
-        return ForwardModel(ParameterNames.of(scene), **(SMALL | {"latent": 4} | options))
+        return ForwardModel.for_scene(scene, **(SMALL | {"latent": 4} | options))
 
     return make
 

@@ -14,9 +14,8 @@ from tensordict import TensorDict
 
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
-from torchrl_gn.training import Budget
+from torchrl_gn.training import Budget, CheckpointError, load_pretrained, package_versions, save_checkpoint
 from torchrl_gn.training import checkpoint as module
-from torchrl_gn.training.checkpoint import CheckpointError, load_pretrained, package_versions, save_checkpoint
 
 
 @pytest.fixture
@@ -59,8 +58,8 @@ def test_everything_comes_back(saved, trained, scene):
     state = torch.zeros(4, 2, 13, dtype=torch.float64)
     state[..., 3] = 1
     action = torch.ones(4, 1)
-    predicted = loaded.model.bind(loaded.scene(), strict=True).step(state, action)
-    assert torch.equal(predicted, trained.model.bind(scene).step(state, action))
+    predicted = loaded.model.bind(loaded.scene(), strict=True).step(state, action)[0]
+    assert torch.equal(predicted, trained.model.bind(scene).step(state, action)[0])
 
 
 def test_weights_stored_in_half_precision_compute_in_single(tmp_path, trained):
@@ -173,7 +172,7 @@ def refused(path, message: str) -> None:
 
 
 def test_missing_files(tmp_path):
-    refused(tmp_path / "no.safetensors", "No checkpoint at")
+    refused(tmp_path / "no.safetensors", "no checkpoint at")
     with pytest.raises(CheckpointError, match=f"No checkpoint at .*{module.CHECKPOINT_FILE}"):
         load_pretrained(tmp_path)
 

@@ -11,8 +11,7 @@ import torch
 
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import onednn_precision
-from torchrl_gn.training import Budget, Trainer, Workers
-from torchrl_gn.training.checkpoint import load_pretrained, save_checkpoint
+from torchrl_gn.training import Budget, Trainer, Workers, load_pretrained, save_checkpoint
 
 
 def weights(trainer) -> dict[str, torch.Tensor]:

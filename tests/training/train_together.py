@@ -11,7 +11,7 @@ import torch
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, Workers, join_workers, make_optimizer
 from torchrl_gn.training.optimizers import Preset
 
@@ -24,7 +24,7 @@ def train(workers: Workers, preset: Preset, *, steps: int = 30) -> dict[str, tor
     trajectories = collect_trajectories(scene, num=20, steps=20)
     torch.manual_seed(workers.rank)  # the first one's weights are everybody's
     small = {"latent": 4, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
-    model = ForwardModel(ParameterNames.of(scene), **small)
+    model = ForwardModel.for_scene(scene, **small)
     loss = ForwardModelLoss(model.bind(scene))
     # ... and so are its statistics.
     loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=500 + workers.rank, seed=workers.rank).sample())

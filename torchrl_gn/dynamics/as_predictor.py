@@ -31,6 +31,8 @@ class ModulePredictor:
     """
 
     fixed_batch = False
+    check_every = 1
+    """Steps between two checks of a guarded rollout: a module may refuse states that are not finite."""
 
     def __init__(self, module: TensorDictModuleBase) -> None:
         self.module = module

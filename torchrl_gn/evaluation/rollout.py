@@ -96,7 +96,8 @@ def guarded_rollout(
         hidden_state: ``[*B]`` hidden state of a recurrent model before the start.
         limit: how far out of the range of training a state may be.
         every: steps between two checks (each waits for a GPU). The batch is then narrowed to what goes on; a compiled
-            model keeps its batch and stops when all have diverged.
+            model keeps its batch and stops when all have diverged. A module that is no predictor is checked after every
+            step.
 
     Returns:
         The states, and how many predictions of each rollout were good.
@@ -109,6 +110,7 @@ def guarded_rollout(
     if not (limit > 0 and every >= 1):
         raise ValueError(f"limit must be positive and every at least 1, got limit={limit} and every={every}.")
     predictor = as_predictor(model)
+    every = getattr(predictor, "check_every", every)
     batch, steps = state.shape[:-2], actions.shape[-2]
     size = batch.numel()
     current, actions = state.reshape(size, *state.shape[-2:]), actions.reshape(size, *actions.shape[-2:])

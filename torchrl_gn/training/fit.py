@@ -95,6 +95,7 @@ def fit(
     if minutes is None and steps is None:
         minutes = 1.0
     budget = Budget(steps=steps, minutes=minutes)
+    scheduled = _make_optimizer(model.model.core, optimizer, lr)
     loss = ForwardModelLoss(model, noise=noise, generator=torch.Generator().manual_seed(seed))
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
     transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()
@@ -108,13 +109,7 @@ def fit(
         assert validation is not None
         return evaluate_errors(model, validation, horizons=(20,), one_step=False).errors["rollout_error_20"].total
 
-    trainer = Trainer(
-        loss,
-        buffer,
-        _make_optimizer(model.model.core, optimizer, lr),
-        budget,
-        validate=None if validation is None else validate,
-    )
+    trainer = Trainer(loss, buffer, scheduled, budget, validate=None if validation is None else validate)
     history, recent = History(), []
     with tqdm(total=100, desc=f"training on {model.scene.name}", unit="%", disable=not progress, leave=False) as bar:
         for now in trainer.run():
