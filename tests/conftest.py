@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.maths import quaternion
 from torchrl_gn.networks import Graph, GraphSize
 from torchrl_gn.policies import ObservationModel
-from torchrl_gn.scenes import ObservationGraph, ParameterNames, Scene
+from torchrl_gn.scenes import ObservationGraph, Scene
 
-from .. import zoo
-from ..sizes import SMALL
+from . import zoo
+from .sizes import SMALL
 
 
 @pytest.fixture(scope="session")
@@ -60,11 +61,11 @@ def fit(random_states, random_actions) -> Callable[..., ForwardModel]:
     def fit(model: ForwardModel, scene: Scene) -> ForwardModel:
         bound = model.bind(scene)
         state = random_states(scene, 100)
-        bound.update_parameter_normalizers()
+        update_parameter_normalizers(bound)
         generator = torch.Generator().manual_seed(1)
         change = 0.02 * torch.randn(100, scene.num_nodes, 12, generator=generator, dtype=torch.float64)
         change = change * torch.as_tensor(scene.movable)
-        bound.update_dynamic_normalizers(state, random_actions(scene, 100), model.layout.apply(state, change))
+        update_dynamic_normalizers(bound, state, random_actions(scene, 100), model.layout.apply(state, change))
         return model
 
     return fit
@@ -76,7 +77,7 @@ def make_model(fit) -> Callable[..., ForwardModel]:
 
     def make(scene: Scene, *, fitted: bool = True, seed: int = 0, **options) -> ForwardModel:
         torch.manual_seed(seed)
-        model = ForwardModel(ParameterNames.of(scene), **(SMALL | options))
+        model = ForwardModel.for_scene(scene, **(SMALL | options))
         return fit(model, scene) if fitted else model
 
     return make
