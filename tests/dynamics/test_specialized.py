@@ -34,7 +34,7 @@ def pull(model, state, action):
 
 
 def compare(model: ForwardModel, scene, state, action, tolerance: float) -> None:
-    plain = pull(model.bind(scene, plain=True), state, action)
+    plain = pull(model.bind(scene, reference=True), state, action)
     model.requires_grad_(False)
     for expected, got in zip(plain, pull(specialize(model.bind(scene)), state, action), strict=True):
         assert got.dtype == expected.dtype and got.shape == expected.shape
@@ -128,7 +128,9 @@ def test_any_batch(scenes, make_model, random_states, random_actions, batch):
     scene = scenes["swimmer6"]
     bound = make_model(scene).double().bind(scene)
     state, action = random_states(scene, *batch), random_actions(scene, *batch)
-    torch.testing.assert_close(specialize(bound).step(state, action), bound.step(state, action), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        specialize(bound).step(state, action)[0], bound.step(state, action)[0], rtol=0, atol=1e-12
+    )
 
 
 def test_a_model_that_has_seen_nothing(scenes, make_model, random_states, random_actions):
@@ -136,7 +138,9 @@ def test_a_model_that_has_seen_nothing(scenes, make_model, random_states, random
     scene = scenes["swimmer6"]
     bound = make_model(scene, fitted=False).bind(scene)
     state, action = random_states(scene, 3), random_actions(scene, 3)
-    torch.testing.assert_close(specialize(bound).step(state, action), bound.step(state, action), rtol=1e-15, atol=1e-15)
+    torch.testing.assert_close(
+        specialize(bound).step(state, action)[0], bound.step(state, action)[0], rtol=1e-15, atol=1e-15
+    )
 
 
 def test_far_from_the_origin_nothing_is_lost(scenes, make_model, random_states, random_actions):
@@ -191,23 +195,23 @@ def test_a_changed_model_is_never_predicted_with_its_old_weights(
     bound = model.bind(scene)
     quick = specialize(bound)
     state, action = random_states(scene, 3), random_actions(scene, 3)
-    before = quick.step(state, action)
+    before = quick.step(state, action)[0]
     change(model)
-    after = quick.step(state, action)
+    after = quick.step(state, action)[0]
     assert (after - before).abs().max() > 1e-7
-    torch.testing.assert_close(after, bound.step(state, action).detach(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(after, bound.step(state, action)[0].detach(), rtol=0, atol=1e-12)
 
 
 def test_an_unchanged_model_is_folded_once(scenes, make_model, random_states, random_actions, folds):
     scene = scenes["swimmer6"]
     quick = specialize(make_model(scene).bind(scene))
     state, action = random_states(scene, 3), random_actions(scene, 3)
-    first = quick.step(state, action)
-    assert torch.equal(quick.step(state, action), first) and len(folds) == 1
+    first = quick.step(state, action)[0]
+    assert torch.equal(quick.step(state, action)[0], first) and len(folds) == 1
     twin = copy.deepcopy(quick)
     change_in_place(twin.model)
-    assert not torch.equal(twin.step(state, action), first)
-    assert torch.equal(quick.step(state, action), first) and len(folds) == 2
+    assert not torch.equal(twin.step(state, action)[0], first)
+    assert torch.equal(quick.step(state, action)[0], first) and len(folds) == 2
 
 
 def test_inference_mode_leaves_nothing_behind(scenes, make_model, random_states, random_actions):
@@ -221,7 +225,7 @@ def test_inference_mode_leaves_nothing_behind(scenes, make_model, random_states,
         parameters = bound.parameters_of(scene).clone()
         quick.step(state, action, parameters)
         parameters["nodes"].mul_(1.5)
-        torch.testing.assert_close(quick.step(state, action, parameters), bound.step(state, action, parameters))
+        torch.testing.assert_close(quick.step(state, action, parameters)[0], bound.step(state, action, parameters)[0])
     for change in (lambda model: None, change_in_place):
         change(model)
         found, expected = (pull(module, state, action) for module in (quick, bound))
@@ -252,7 +256,7 @@ def test_it_stands_in_for_the_bound_model(scenes, make_model, random_states, ran
         played.append(ModelEnv(model, seed=0).rollout(5).detach())
     torch.testing.assert_close(played[0], played[1])
     tensordict = TensorDict({"state": state, "action": actions[:, 0]}, [4])
-    assert torch.equal(ModelEnv(quick).step(tensordict)["next", "state"], quick.step(state, actions[:, 0]))
+    assert torch.equal(ModelEnv(quick).step(tensordict)["next", "state"], quick.step(state, actions[:, 0])[0])
 
 
 def test_a_loss_refuses_to_train_a_snapshot(scenes, make_model):
@@ -336,7 +340,7 @@ def test_compiled_rollouts_and_their_gradients(scenes, make_model, random_states
 
     def pull(model):
         leaves = [value.clone().requires_grad_() for value in (state, actions)]
-        states = model.rollout(*leaves)
+        states = model.rollout(*leaves)[0]
         return [states.detach(), *torch.autograd.grad(states[:, -1].square().sum(), leaves)]
 
     for expected, got in zip(pull(bound), pull(quick), strict=True):
@@ -345,14 +349,14 @@ def test_compiled_rollouts_and_their_gradients(scenes, make_model, random_states
     # Compiling takes a minute: other strides, or a gradient that is wanted, must not need it again.
     strided = state.mT.contiguous().mT
     with torch.compiler.set_stance("fail_on_recompile"):
-        torch.testing.assert_close(quick.step(strided, actions[:, 0]), bound.step(state, actions[:, 0]))
-        quick.step(strided.requires_grad_(), actions[:, 1]).sum().backward()
+        torch.testing.assert_close(quick.step(strided, actions[:, 0])[0], bound.step(state, actions[:, 0])[0])
+        quick.step(strided.requires_grad_(), actions[:, 1])[0].sum().backward()
     # Other weights of the same shapes are used without compiling again, and not by a gradient of the old ones.
     compiled = quick._compiled
     leaf = state.clone().requires_grad_()
-    old = quick.step(leaf, actions[:, 0])
+    old = quick.step(leaf, actions[:, 0])[0]
     change_in_place(model)
-    torch.testing.assert_close(quick.step(state, actions[:, 0]), bound.step(state, actions[:, 0]))
+    torch.testing.assert_close(quick.step(state, actions[:, 0])[0], bound.step(state, actions[:, 0])[0])
     assert quick._compiled is compiled
     with pytest.raises(RuntimeError, match="weights changed between a prediction and its gradient"):
         old.sum().backward()

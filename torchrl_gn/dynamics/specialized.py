@@ -54,8 +54,8 @@ class SpecializedPredictor(Predictor):
         self._executor: Executor | None = None
         self._weights: list[tuple[Any, str, Tensor, int]] = []
         self._given: dict[str, tuple[Tensor, int]] = {}
-        # Refuse now what the executor cannot run, not at the first step.
-        if predictor.parameters_key is None:
+        # Refuse now what the executor cannot run, not at the first step; the eager one runs all.
+        if executor != "eager":
             self.executor()
 
     def __getstate__(self) -> dict:
@@ -108,7 +108,9 @@ class SpecializedPredictor(Predictor):
         )
 
     def program(self, parameters: TensorDictBase | None = None, *, reference: bool = False) -> StepProgram:
-        """Snapshot of the step, without features and components that never vary."""
+        """Snapshot of the step, without features and components that never vary; whole as the ``reference``."""
+        if reference:
+            return super().program(parameters, reference=True)
         model = self.model
         values = PhysicalParameters(*(value.detach().clone() for value in self.parameter_reader.read(parameters)))
         nodes, edges = InputScaling.of(model.node_normalizer), InputScaling.of(model.edge_normalizer)
