@@ -69,11 +69,12 @@ def test_the_next_state_has_the_states_dtype(scenes, make_model, random_states, 
     scene = scenes["swimmer6"]
     bound = make_model(scene).to(network).bind(scene)
     state, action = random_states(scene, 5), random_actions(scene, 5)
-    for action_dtype in (torch.float32, torch.float64):
-        assert bound.step(state.to(dtype), action.to(action_dtype))[0].dtype == dtype
     reference = make_model(scene).double().bind(scene).delta(state, action)
-    error = (bound.delta(state.to(dtype), action).double() - reference).norm() / reference.norm()
-    assert error < (1e-12 if dtype == network == torch.float64 else 1e-5)
+    for predictor in (bound, specialize(bound)):
+        for action_dtype in (torch.float32, torch.float64):
+            assert predictor.step(state.to(dtype), action.to(action_dtype))[0].dtype == dtype
+        error = (predictor.delta(state.to(dtype), action).double() - reference).norm() / reference.norm()
+        assert error < (1e-12 if dtype == network == torch.float64 else 1e-5)
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (3, 4), (0,), (2, 1, 2)])
