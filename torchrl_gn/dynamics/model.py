@@ -97,9 +97,11 @@ class ForwardModel(nn.Module):
         # The network's output has the residual's scale; errors are weighted by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
-        kind: Callable[..., Core] = core_class(core)
-        fixed = {"counts": counts} if core_class(core).fixed_size else {}
-        self.core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
+        kind = core_class(core)
+        fixed = {"counts": counts} if kind.fixed_size else {}
+        self.core = cast(Callable[..., Core], kind)(
+            self.dynamic_size, static, layout.delta_size, **fixed, **core_options
+        )
 
     @classmethod
     def for_scene(

@@ -102,7 +102,7 @@ class SpecializedPredictor(Predictor):
         given = {} if parameters is None else dict(parameters.items())
         return (
             bool(self._weights)
-            and all(owner.get(name) is one and _same(one, *kept) for owner, name, one, *kept in self._weights)
+            and all(owner.get(name) is one and _same(one, kept, seen) for owner, name, one, kept, seen in self._weights)
             and given.keys() == self._given.keys()
             and all(_same(given[name], *kept) for name, kept in self._given.items())
         )
