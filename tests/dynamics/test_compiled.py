@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
-
 import pytest
 import torch
 
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.executors.compiled import CompiledExecutor, check_compiler
+from torchrl_gn.dynamics.executors.compiled import CompiledExecutor
 from torchrl_gn.networks import CORES, Core
 
+from ..compiling import NEW_TORCH, compiles
 from ..sizes import SMALL
 
 MODELS = [SMALL, {"core": "recurrent", "hidden_state": (3, 4, 5), **SMALL}]
-NEW = "isolate_recompiles" in inspect.signature(torch.compile).parameters
-isolated = pytest.mark.skipif(not NEW, reason="torch is too old to compile")
-
-
-def has_compiler() -> bool:
-    try:
-        check_compiler()
-    except FileNotFoundError:
-        return False
-    return True
-
-
-compiles = pytest.mark.skipif(not (NEW and has_compiler()), reason="torch cannot compile here")
 
 
 def change_in_place(model: ForwardModel) -> None:
@@ -113,13 +99,13 @@ def test_compiled_rollouts_and_their_gradients(scenes, make_model, random_states
         old.sum().backward()
 
 
-@pytest.mark.skipif(NEW, reason="this torch is new enough")
+@pytest.mark.skipif(NEW_TORCH, reason="this torch is new enough")
 def test_compiling_with_an_old_torch_is_refused(scenes, make_model):
     with pytest.raises(RuntimeError, match="compiling needs torch 2.13 or newer"):
         specialize(make_model(scenes["swimmer6"]).bind(scenes["swimmer6"]), executor="compiled")
 
 
-@isolated
+@pytest.mark.skipif(not NEW_TORCH, reason="torch is too old to compile")
 @pytest.mark.parametrize("key", [None, "parameters"])
 def test_compiling_without_a_compiler_is_refused(scenes, make_model, key):
     from torch._inductor import config, cpp_builder

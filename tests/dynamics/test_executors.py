@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import itertools
 
 import pytest
@@ -13,11 +12,11 @@ from torch import nn
 
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.dynamics.executors import EXECUTORS
-from torchrl_gn.dynamics.executors.compiled import check_compiler
 from torchrl_gn.networks import CORES, Core, Graph, GraphSize
 from torchrl_gn.scenes import SYSTEMS
 
 from .. import zoo
+from ..compiling import compiles
 
 
 class LinearCore(Core):
@@ -44,14 +43,6 @@ MODELS = {
 BOUNDS = {torch.float64: 1e-10, torch.float32: 1e-5}
 
 
-def has_compiler() -> bool:
-    try:
-        check_compiler()
-    except FileNotFoundError:
-        return False
-    return "isolate_recompiles" in inspect.signature(torch.compile).parameters
-
-
 def cases() -> list:
     """Executor, system, model, batches, and whether each sample has parameters of its own."""
     systems, batches = [*SYSTEMS, "joints"], [(), (1,), (5,)]
@@ -63,9 +54,8 @@ def cases() -> list:
         ("pendulum", "mlp", [(5,)], True),
         ("swimmer6", "gn", [(5,)], True),
     ]
-    needs = pytest.mark.skipif(not has_compiler(), reason="torch cannot compile here")
     for executor in sorted(EXECUTORS.keys() - {"eager"}):
-        found += [pytest.param(executor, *each, marks=[pytest.mark.slow, needs]) for each in few]
+        found += [pytest.param(executor, *each, marks=[pytest.mark.slow, compiles]) for each in few]
     return found
 
 
