@@ -1,4 +1,4 @@
-"""Pins are found from how bodies move, as far as it tells."""
+"""Joint anchors are estimated from how bodies move, as far as it tells."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def moving(request):
 def test_twenty_steps_tell_where_pins_are(moving):
     scene, data = moving
     finder = AnchorEstimator(scene)
-    usual = finder.usual.expand(10, -1, -1).split(3, dim=-1)
+    usual = finder.standard.expand(10, -1, -1).split(3, dim=-1)
     found = finder.solve(finder.sums(data["state"][:, :21]))
     assert gap(scene, data["state"][:, 21:], found) < 1e-5
     # Of jaco's shorter turns the last bits of the states count: up to 1e-4 on one processor, less on another.
@@ -64,7 +64,7 @@ def test_noise_makes_it_careful(noise):
     states = collect_trajectories(sample_variants("swimmer6", 10, rng=0), 10, 200, seed=0)["state"]
     noisy = states + noise * torch.randn(states.shape, generator=generator, dtype=states.dtype)
     gaps = [gap(scene, states[:, 101:], finder.solve(finder.sums(noisy[:, : steps + 1]))) for steps in (20, 100)]
-    usual = gap(scene, states[:, 101:], finder.usual.expand(10, -1, -1).split(3, dim=-1))
+    usual = gap(scene, states[:, 101:], finder.standard.expand(10, -1, -1).split(3, dim=-1))
     assert gaps[1] < gaps[0] < 0.5 * usual and gaps[1] < 30 * noise
 
 
@@ -76,5 +76,5 @@ def test_what_did_not_turn_stays_as_usual():
     assert torch.isfinite(parent_anchor).all() and torch.isfinite(child_anchor).all()
     # The states are the standard scene's own.
     torch.testing.assert_close(
-        torch.cat((parent_anchor, child_anchor), -1), finder.usual.expand(3, -1, -1), rtol=0, atol=1e-3
+        torch.cat((parent_anchor, child_anchor), -1), finder.standard.expand(3, -1, -1), rtol=0, atol=1e-3
     )

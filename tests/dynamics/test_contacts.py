@@ -6,18 +6,23 @@ import pytest
 import torch
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics.features.contacts import Contacts
+from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, JointAxes
+from torchrl_gn.dynamics.features import CanonicalState, StepInputs
+from torchrl_gn.dynamics.normalization import dynamic_graph
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.contact_points import SLOTS, contact_slots
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 from .. import zoo
 
 
 def features(scene, state):
-    offset, radius, mask = (torch.as_tensor(value) for value in contact_slots(scene))
+    mask = torch.as_tensor(contact_slots(scene)[2])
     matrices = quaternion.to_matrix(state[..., 3:7]).unflatten(-1, (3, 3))
-    return Contacts(scene)(state, matrices, offset, radius).unflatten(-1, (SLOTS, 6)), mask
+    bound = Contacts().bind(scene, BODY_STATE, Canonicalizer().bind(scene, BODY_STATE))
+    inputs = StepInputs(CanonicalState(state, matrices, None), torch.empty(0), PhysicalParameters.of(scene))
+    return bound(inputs).unflatten(-1, (SLOTS, 6)), mask
 
 
 @pytest.mark.parametrize("name", ["cheetah", "walker2d"])
@@ -48,14 +53,10 @@ def test_a_tilted_plane_turns_with_the_world(random_states):
     state = random_states(scene, 4)
     seen, mask = features(scene, state)
     turn = quaternion.normalize(torch.tensor([1.0, 0.3, -0.5, 0.2], dtype=torch.float64)).expand(4, 4)
-    turned, _ = features(scene, scene_turn(state, turn))
+    turned, _ = features(scene, BODY_STATE.rotate(state, turn))
     torch.testing.assert_close(turned[..., :3], seen[..., :3])
     velocity = quaternion.rotate(turn[:, None, None], seen[..., 3:])
     torch.testing.assert_close(turned[..., 3:], velocity * mask[..., None])
-
-
-def scene_turn(state, turn):
-    return BODY_STATE.turn(state, turn)
 
 
 def test_of_many_points_the_farthest_are_shown():
@@ -68,8 +69,9 @@ def test_of_many_points_the_farthest_are_shown():
 @pytest.mark.parametrize("contacts", [True, False])
 def test_a_model_sees_them_or_not(scenes, make_model, random_states, random_actions, contacts):
     scene = scenes["cheetah"]
-    model = make_model(scene, contacts=contacts)
+    features = (BodyState(), Controls(), JointAxes(), *([Contacts()] if contacts else []))
+    model = make_model(scene, features=features)
     assert model.dynamic_size.nodes == 18 + contacts * 24
     bound = model.bind(scene)
     state = random_states(scene, 3)
-    assert bound.dynamic_graph(state, random_actions(scene, 3)).nodes.shape[-1] == model.dynamic_size.nodes
+    assert dynamic_graph(bound, state, random_actions(scene, 3)).nodes.shape[-1] == model.dynamic_size.nodes

@@ -5,6 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, JointAxes, Predictor
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.normalization import dynamic_graph
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
 
@@ -38,7 +41,7 @@ def test_place_matters_along_other_axes_and_without_recentring(scenes, make_mode
     along[:, 1:, 0] += 1
     bound = make_model(scene).bind(scene)
     assert (bound.delta(up, action) - bound.delta(state, action)).norm() > 1e-3
-    absolute = make_model(scene, recenter=False).bind(scene)
+    absolute = make_model(scene, canonicalizer=Canonicalizer(recenter=False)).bind(scene)
     assert (absolute.delta(along, action) - absolute.delta(state, action)).norm() > 1e-3
 
 
@@ -46,20 +49,23 @@ def test_place_matters_along_other_axes_and_without_recentring(scenes, make_mode
 def test_positions_along_invariant_axes_can_be_hidden(scenes, make_model, random_states, random_actions, name, hidden):
     """One body moved alone, which no joint would let it, changes what the network sees of other axes only."""
     scene = scenes[name]
-    bound = make_model(scene, positions=False, project=False, recenter=False).bind(scene)
+    features = (BodyState(positions=False), Controls(), JointAxes(), Contacts())
+    absolute = {"project": False, "canonicalizer": Canonicalizer(recenter=False)}
+    bound = make_model(scene, features=features, **absolute).bind(scene)
     state, action = random_states(scene, 10, seed=3), random_actions(scene, 10)
-    seen = bound.dynamic_graph(state, action).nodes
+    seen = dynamic_graph(bound, state, action).nodes
     for axis in range(3):
         moved = state.clone()
         moved[:, 1, axis] += 0.5
-        same = torch.equal(bound.dynamic_graph(moved, action).nodes, seen)
+        same = torch.equal(dynamic_graph(bound, moved, action).nodes, seen)
         assert same or axis not in hidden
         assert not same or axis in hidden or not scene.movable[:, axis].any()
-    default = make_model(scene, project=False, recenter=False).bind(scene)
+    default = make_model(scene, **absolute).bind(scene)
     for axis in hidden:
         moved = state.clone()
         moved[:, 1, axis] += 0.5
-        assert not torch.equal(default.dynamic_graph(moved, action).nodes, default.dynamic_graph(state, action).nodes)
+        shown, before = (dynamic_graph(default, each, action).nodes for each in (moved, state))
+        assert not torch.equal(shown, before)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -81,10 +87,10 @@ def test_predictions_turn_with_the_scene(scenes, make_model, random_states, rand
         turn = quaternion.exp(angle * torch.eye(3, dtype=state.dtype)[yaw_frame.axis]).expand(10, 4)
         pivot = torch.zeros(13, dtype=state.dtype)
         pivot[:3] = torch.as_tensor(yaw_frame.pivot)
-        turned = torch.cat((state[:, :1], (BODY_STATE.turn(state - pivot, turn) + pivot)[:, 1:]), 1)
+        turned = torch.cat((state[:, :1], (BODY_STATE.rotate(state - pivot, turn) + pivot)[:, 1:]), 1)
         error = bound.delta(turned, action) - BODY_STATE.rotate_delta(delta, turn)
         assert error.norm() < (1e-12 if dtype == torch.float64 else 1e-5) * delta.norm()
-    plain = make_model(scene, align=False).bind(scene)
+    plain = make_model(scene, canonicalizer=Canonicalizer(yaw=False)).bind(scene)
     error = plain.delta(turned, action) - BODY_STATE.rotate_delta(plain.delta(state, action), turn)
     assert error.norm() > 1e-3 * delta.norm()
 
@@ -94,35 +100,38 @@ def test_where_the_world_can_be_touched_it_shows_the_heading(make_model, random_
     bound = make_model(scene).bind(scene)
     assert scene.yaw_frame is not None and not scene.yaw_frame.exact
     state = random_states(scene, 5)
-    seen = bound.frame.see(state, bound.values).state
+    seen = bound.canonicalizer(state, bound.scene_parameters).state
     rest = torch.as_tensor(scene.yaw_frame.rest).expand(5, 4)
-    turn = bound.frame.yaw_rotation(state, bound.values).rotation
+    turn = bound.canonicalizer.yaw_rotation(state, bound.scene_parameters).quaternion
     assert turn is not None
     torch.testing.assert_close(seen[:, 0, 3:7], quaternion.product(quaternion.conjugate(turn), state[:, 0, 3:7]))
     unmoved = make_model(zoo.load("arm")).bind(zoo.load("arm"))
-    free = unmoved.frame.see(state, unmoved.values).state
+    free = unmoved.canonicalizer(state, unmoved.scene_parameters).state
     assert torch.equal(free[:, 0], state[:, 0])
     assert torch.equal(free[:, 1:], seen[:, 1:])
     state[:, 1, 3:7] = rest
-    torch.testing.assert_close(bound.frame.see(state, bound.values).state, state, rtol=0, atol=1e-12)
+    torch.testing.assert_close(bound.canonicalizer(state, bound.scene_parameters).state, state, rtol=0, atol=1e-12)
 
 
-def test_joint_axes_turn_with_the_scene(scenes, make_model, random_states, random_actions):
-    scene = scenes["jaco"] if "jaco" in scenes else load_scene("jaco")
-    bound = make_model(scene, joint_axes=True).bind(scene)
+def edge_features(bound: Predictor, state, action):
+    program = bound.program()
+    return eager.features(program, program.canonicalizer(state, program.parameters), action)[1]
+
+
+def test_joint_axes_turn_with_the_scene(make_model, random_states, random_actions):
+    scene = load_scene("jaco")
+    bound = make_model(scene).bind(scene)
     state, action = random_states(scene, 5), random_actions(scene, 5)
-    features = bound.frame.features(bound.frame.see(state, bound.values), action, bound.values)[1]
+    features = edge_features(bound, state, action)
     assert features.shape == (5, scene.num_edges, 7)
     axes, pushes = features[..., 1:4], features[..., 4:]
     torch.testing.assert_close(axes.norm(dim=-1), torch.ones(5, scene.num_edges, dtype=axes.dtype))
     torch.testing.assert_close(pushes, features[..., :1] * axes)
     # With the place and yaw_frame as they are, every body turned by one rotation turns every axis.
-    bound = make_model(scene, align=False).bind(scene)
-    axes = bound.frame.features(bound.frame.see(state, bound.values), action, bound.values)[1][..., 1:4]
+    bound = make_model(scene, canonicalizer=Canonicalizer(yaw=False)).bind(scene)
+    axes = edge_features(bound, state, action)[..., 1:4]
     turn = quaternion.exp(torch.tensor([0.3, -0.5, 0.8], dtype=state.dtype))
     turned = state.clone()
     turned[..., 3:7] = quaternion.product(turn, state[..., 3:7])
     matrix = quaternion.to_matrix(turn).reshape(3, 3)
-    torch.testing.assert_close(
-        bound.frame.features(bound.frame.see(turned, bound.values), action, bound.values)[1][..., 1:4], axes @ matrix.T
-    )
+    torch.testing.assert_close(edge_features(bound, turned, action)[..., 1:4], axes @ matrix.T)

@@ -10,16 +10,16 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.data import log_chain, log_trajectories, simulate_log, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics import BodyState, Controls, ForwardModel, JointAxes, specialize
+from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.evaluation import evaluate_errors, plot_joints
-from torchrl_gn.maths import joint_layout
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.planners import GradientPlanner
-from torchrl_gn.scenes import KinematicTree, ParameterNames, load_scene
+from torchrl_gn.scenes import KinematicTree, load_scene
 from torchrl_gn.training import load_pretrained, save_checkpoint
 
-SMALL = {"latent": 16, "edge_hidden": (16,), "node_hidden": (16,), "global_hidden": (16,)}
+SMALL = {"hidden": (16,)}
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,7 @@ def robot():
 def test_it_trains_is_saved_and_evaluated_like_any_scene(robot, core, tmp_path):
     tree, data = robot
     torch.manual_seed(0)
-    options = {"layout": joint_layout(tree.extras), "joint_axes": False, "contacts": False, "core": core}
-    model = ForwardModel(ParameterNames.of(tree), **options, **SMALL)
+    model = ForwardModel.for_scene(tree, core=core, **SMALL)
     bound = model.bind(tree)
     loss = ForwardModelLoss(bound, teacher_forced_steps=5)
     loss.fit_normalizers(trajectory_buffer(data, batch_size=1000, seed=0).sample())
@@ -44,7 +43,7 @@ def test_it_trains_is_saved_and_evaluated_like_any_scene(robot, core, tmp_path):
         optimizer.zero_grad()
         loss(buffer.sample())["loss_forward_model"].backward()
         optimizer.step()
-    table = evaluate_errors(bound, data, horizons=(10,), warm_up=5, keep=1)
+    table = evaluate_errors(bound, data, horizons=(10,), burn_in=5, keep=1)
     assert list(table["one_step_error"].components) == ["angle", "velocity"]
     assert table["one_step_error"].total < 0.5
     path = plot_joints(data["state"][0, :16], {core: table.rollouts[0]}, tree, tmp_path / "joints.png")
@@ -52,11 +51,11 @@ def test_it_trains_is_saved_and_evaluated_like_any_scene(robot, core, tmp_path):
     save_checkpoint(tmp_path / "robot.safetensors", model, scene=tree)
     again = load_pretrained(tmp_path / "robot.safetensors")
     state, action = data["state"][:, 3], data["action"][:, 3]
-    assert torch.equal(again.model.bind(again.scene()).step(state, action), bound.step(state, action))
-    base = bound.step(state, action)[:, 0]
+    assert torch.equal(again.model.bind(again.scene()).step(state, action)[0], bound.step(state, action)[0])
+    base = bound.step(state, action)[0][:, 0]
     assert torch.equal(base, state[:, 0])  # the base stays
     if core == "gn":
-        torch.testing.assert_close(specialize(bound).step(state, action), bound.step(state, action))
+        torch.testing.assert_close(specialize(bound).step(state, action)[0], bound.step(state, action)[0])
 
 
 def angles_near(targets: torch.Tensor):
@@ -73,8 +72,7 @@ def angles_near(targets: torch.Tensor):
 def test_it_is_an_environment_and_is_planned_with(robot, core):
     tree, data = robot
     torch.manual_seed(0)
-    options = {"layout": joint_layout(tree.extras), "joint_axes": False, "contacts": False, "core": core}
-    bound = ForwardModel(ParameterNames.of(tree), **options, **SMALL).bind(tree)
+    bound = ForwardModel.for_scene(tree, core=core, **SMALL).bind(tree)
     loss = ForwardModelLoss(bound)
     loss.fit_normalizers(trajectory_buffer(data, batch_size=1000, seed=0).sample())
     starts = data["state"].flatten(0, 1)
@@ -83,7 +81,7 @@ def test_it_is_an_environment_and_is_planned_with(robot, core):
     rollout = env.rollout(4, tensordict=env.reset(TensorDict(batch_size=[3])), auto_reset=False)
     assert rollout["state"].shape == (3, 4, 10, 3)
     assert all((starts == state).all(-1).all(-1).any() for state in rollout["state"][:, 0])
-    again = bound.rollout(rollout["state"][:, 0], rollout["action"])
+    again = bound.rollout(rollout["state"][:, 0], rollout["action"])[0]
     torch.testing.assert_close(rollout["next", "state"], again[:, 1:])
     now = env.reset(TensorDict(batch_size=[3]))
     returns = []
@@ -97,8 +95,7 @@ def test_it_is_an_environment_and_is_planned_with(robot, core):
 
 def test_where_it_starts_must_be_said(robot):
     tree, _ = robot
-    options = {"layout": joint_layout(tree.extras), "joint_axes": False, "contacts": False}
-    bound = ForwardModel(ParameterNames.of(tree), **options, **SMALL).bind(tree)
+    bound = ForwardModel.for_scene(tree, **SMALL).bind(tree)
     with pytest.raises(ValueError, match=r"robot 'jaco' starts; give start_states \[M, 10, 3\]"):
         ModelEnv(bound)
     with pytest.raises(ValueError, match=r"must be \[M, 10, 3\], got \[4, 9, 3\]"):
@@ -109,25 +106,29 @@ def test_several_commands_a_joint(robot):
     tree, data = robot
     commands = tuple((2 * joint, 2 * joint + 1) for joint in range(9))
     doubled = KinematicTree("jaco", tree.joint_names, tree.timestep, commands, joint_parents=tree.joint_parents)
-    options = {"layout": joint_layout(), "joint_axes": False, "contacts": False, **SMALL}
-    bound = ForwardModel(ParameterNames.of(doubled), controls=2, **options).bind(doubled)
+    bound = ForwardModel.for_scene(doubled, **SMALL).bind(doubled)
     action = torch.arange(18.0).expand(len(data), 18)
-    _, controls = bound.frame.features(bound.frame.see(data["state"][:, 0], bound.values), action, bound.values)
+    program, state = bound.program(), data["state"][:, 0]
+    _, controls = eager.features(program, program.canonicalizer(state, program.parameters), action)
     assert controls[0].tolist() == [[2 * (e // 2), 2 * (e // 2) + 1] for e in range(18)]
-    with pytest.raises(ValueError, match="controls=2"):
-        ForwardModel(ParameterNames.of(doubled), controls=2)
+    other = ForwardModel.for_scene(tree, **SMALL)
+    with pytest.raises(ValueError, match="reads 1 controls at each joint, scene 'jaco' has 2"):
+        other.bind(doubled)
+    spatial = ForwardModel.for_scene(doubled, features=(BodyState(), Controls(), JointAxes()), **SMALL)
+    with pytest.raises(ValueError, match="JointAxes needs states with orientations and one control"):
+        spatial.bind(doubled)
 
 
 def test_joints_with_fewer_commands_or_none(robot):
     tree, data = robot
     commands = ((0, 1), (), (2,), *[()] * 6)
     some = KinematicTree("jaco", tree.joint_names, tree.timestep, commands, joint_parents=tree.joint_parents)
-    options = {"layout": joint_layout(), "joint_axes": False, "contacts": False, **SMALL}
-    bound = ForwardModel(ParameterNames.of(some), controls=2, **options).bind(some)
+    bound = ForwardModel.for_scene(some, **SMALL).bind(some)
     action = torch.tensor([5.0, 6.0, 7.0]).expand(len(data), 3)
-    _, controls = bound.frame.features(bound.frame.see(data["state"][:, 0], bound.values), action, bound.values)
+    program, state = bound.program(), data["state"][:, 0]
+    _, controls = eager.features(program, program.canonicalizer(state, program.parameters), action)
     assert controls[0].tolist() == [[5, 6]] * 2 + [[0, 0]] * 2 + [[7, 0]] * 2 + [[0, 0]] * 12
-    with pytest.raises(ValueError, match="counted from 0"):
+    with pytest.raises(ValueError, match="must be indices from 0"):
         KinematicTree("jaco", ("a", "b"), 0.01, ((0,), (-1,)))
 
 
@@ -139,17 +140,16 @@ def test_a_double_pendulum_with_one_motor_or_none(core, motors):
     tree, data = log_chain(log, "double", commands=[[0], []] if motors else None), log_trajectories(log, 40)[0]
     assert tree.num_actions == motors and tree.edge_action[:, 0].tolist() == [motors - 1] * 2 + [-1] * 2
     torch.manual_seed(0)
-    options = {"layout": joint_layout(), "joint_axes": False, "contacts": False, "core": core}
-    model = ForwardModel(ParameterNames.of(tree), **options, **SMALL)
+    model = ForwardModel.for_scene(tree, core=core, **SMALL)
     bound = model.bind(tree)
     loss = ForwardModelLoss(bound, teacher_forced_steps=5)
     loss.fit_normalizers(trajectory_buffer(data, batch_size=300, seed=0).sample())
     batch = trajectory_buffer(data, batch_size=16, window=5 if core == "recurrent" else 1, seed=0).sample()
     loss(batch)["loss_forward_model"].backward()
-    assert evaluate_errors(bound, data, horizons=(5,), warm_up=5)["rollout_error_5"].total > 0
+    assert evaluate_errors(bound, data, horizons=(5,), burn_in=5)["rollout_error_5"].total > 0
     # What the motor does is seen, and nothing else.
     state, action = data["state"][:, 3], data["action"][:, 3]
-    assert torch.equal(bound.step(state, action), bound.step(state, action + 1)) == (motors == 0)
+    assert torch.equal(bound.step(state, action)[0], bound.step(state, action + 1)[0]) == (motors == 0)
     env = ModelEnv(bound, start_states=data["state"].flatten(0, 1), seed=0)
     check_env_specs(env)
 
@@ -159,9 +159,8 @@ def test_a_command_that_never_varied_is_held_in_plans(robot):
     low, high = tree.action_low.copy(), tree.action_high.copy()
     low[2] = high[2] = 0.25
     fixed = dataclasses.replace(tree, action_low=low, action_high=high)
-    options = {"layout": joint_layout(), "joint_axes": False, "contacts": False}
     torch.manual_seed(0)
-    bound = ForwardModel(ParameterNames.of(fixed), **options, **SMALL).bind(fixed)
+    bound = ForwardModel.for_scene(fixed, **SMALL).bind(fixed)
     ForwardModelLoss(bound).fit_normalizers(trajectory_buffer(data, batch_size=500, seed=0).sample())
     env = ModelEnv(bound, angles_near(torch.zeros(9)), start_states=data["state"].flatten(0, 1), seed=0)
     planned = GradientPlanner(env, 3, 2, seed=0)(env.reset())["action"]

@@ -15,13 +15,13 @@ from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 from .. import zoo
 
-SIZES = {"latent": 6, "edge_hidden": (8,), "node_hidden": (8, 8), "global_hidden": (8,)}
+SIZES = {"latent": 6, "hidden": (8,), "node_hidden": (8, 8)}
 
 
-def child_anchor(length: float = 0.3, size: float = 0.05, turned: float = 0.0) -> Scene:
+def arm(length: float = 0.3, size: float = 0.05, turned: float = 0.0) -> Scene:
     """A variant of the arm."""
     return zoo.load(
-        "child_anchor",
+        "arm",
         ('pos=".1 .2 1.3" euler="180 0 0"', f'pos=".1 .2 {1 + length}" euler="180 0 {turned}"'),
         ('pos=".3 0 0"', f'pos="{length} 0 0"'),
         ('size=".05 .2"', f'size="{size} .2"'),
@@ -30,7 +30,7 @@ def child_anchor(length: float = 0.3, size: float = 0.05, turned: float = 0.0) -
 
 @pytest.fixture(scope="module")
 def variants():
-    return [child_anchor(), child_anchor(0.5, 0.07, 30), child_anchor(0.2, 0.04, -70)]
+    return [arm(), arm(0.5, 0.07, 30), arm(0.2, 0.04, -70)]
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +42,12 @@ def samples(variants):
 @pytest.fixture
 def model(variants, samples):
     torch.manual_seed(0)
-    model = ForwardModel(ParameterNames.of(variants[0]), **SIZES).double()
+    model = ForwardModel.for_scene(variants[0], **SIZES).double()
     bound = model.bind(variants[0], parameters_key="parameters")
-    statics = torch.stack([bound.parameters_of(scene) for scene in variants])
+    parameters = torch.stack([bound.parameters_of(scene) for scene in variants])
     for index in range(3):
         loss = ForwardModelLoss(bound)
-        one = samples[index].clone().set("parameters", statics[index].expand(2))
+        one = samples[index].clone().set("parameters", parameters[index].expand(2))
         loss.fit_normalizers(trajectory_buffer(one, batch_size=64, seed=0).sample())
     return model
 
@@ -60,17 +60,19 @@ def inputs(samples, bound, variants):
 
 @pytest.mark.parametrize("way", ["plain", "folded", "specialised"])
 def test_every_sample_is_predicted_as_its_own_scene(variants, samples, model, way):
-    bound = model.bind(variants[0], parameters_key="parameters", plain=way == "plain")
+    bound = model.bind(variants[0], parameters_key="parameters", reference=way == "plain")
     assert bound.in_keys == ["state", "action", "parameters"]
     state, action, parameters = inputs(samples, bound, variants)
     model.requires_grad_(False)
     module = specialize(bound) if way == "specialised" else bound
     state.requires_grad_()
     action.requires_grad_()
-    ours = module.step(state, action, parameters)
-    theirs = torch.stack([model.bind(s, plain=True).step(*x) for s, *x in zip(variants, state, action, strict=True)])
+    ours = module.step(state, action, parameters)[0]
+    theirs = torch.stack(
+        [model.bind(s, reference=True).step(*x)[0] for s, *x in zip(variants, state, action, strict=True)]
+    )
     torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-10)
-    assert (ours - bound.step(state, action, parameters[0])).abs().max() > 1e-4
+    assert (ours - bound.step(state, action, parameters[0])[0]).abs().max() > 1e-4
     weight = torch.randn(ours.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     gradients = [torch.autograd.grad((out * weight).sum(), (state, action)) for out in (ours, theirs)]
     for got, expected in zip(*gradients, strict=True):
@@ -83,17 +85,16 @@ def test_every_sample_is_predicted_as_its_own_scene(variants, samples, model, wa
 @pytest.mark.parametrize("core", ["gn", "mlp"])
 def test_rollouts_of_variants(variants, samples, model, special, core):
     if core == "mlp":
-        items = (variants[0].num_nodes, variants[0].num_edges)
-        mlp = ForwardModel(ParameterNames.of(variants[0]), core="mlp", mlp_hidden=(8, 8), items=items).double()
+        mlp = ForwardModel.for_scene(variants[0], core="mlp", hidden=(8, 8)).double()
         mlp.load_state_dict({**mlp.state_dict(), **{k: v for k, v in model.state_dict().items() if "core" not in k}})
         model = mlp
     bound = model.requires_grad_(False).bind(variants[0], parameters_key="parameters")
     module = specialize(bound) if special else bound
     state, _, parameters = inputs(samples, bound, variants)
     actions = samples["action"][:, 0]
-    states = module.rollout(state, actions, parameters)
+    states = module.rollout(state, actions, parameters)[0]
     for index, scene in enumerate(variants):
-        expected = model.bind(scene).rollout(state[index], actions[index])
+        expected = model.bind(scene).rollout(state[index], actions[index])[0]
         torch.testing.assert_close(states[index], expected, rtol=0, atol=1e-10)
 
 
@@ -106,14 +107,14 @@ def test_a_snapshot_is_kept_for_the_same_values_and_never_used_for_others(varian
     quick(sample.select("state", "action", "parameters"))
     assert len(folds) == 1
     parameters["child_anchor"].mul_(1.01)  # in place
-    changed = quick.step(state, action, parameters)
+    changed = quick.step(state, action, parameters)[0]
     assert len(folds) == 2
-    torch.testing.assert_close(changed, bound.step(state, action, parameters))
+    torch.testing.assert_close(changed, bound.step(state, action, parameters)[0])
     parameters["nodes"] = parameters["nodes"] * 1.5  # another tensor
-    torch.testing.assert_close(quick.step(state, action, parameters), bound.step(state, action, parameters))
+    torch.testing.assert_close(quick.step(state, action, parameters)[0], bound.step(state, action, parameters)[0])
     turned = parameters[[1, 2, 0]]
-    torch.testing.assert_close(quick.step(state, action, turned), bound.step(state, action, turned))
-    torch.testing.assert_close(quick.step(state, action), bound.step(state, action))  # back to the scene's own
+    torch.testing.assert_close(quick.step(state, action, turned)[0], bound.step(state, action, turned)[0])
+    torch.testing.assert_close(quick.step(state, action)[0], bound.step(state, action)[0])  # back to the scene's own
 
 
 def test_a_model_of_one_scene_refuses_samples_of_another(variants, samples, model):
@@ -125,22 +126,23 @@ def test_a_model_of_one_scene_refuses_samples_of_another(variants, samples, mode
         )
         assert ("next", "state") in module(sample).keys(True)
         sample["parameters"] = bound.parameters_of(variants[1]).expand(2)
-        with pytest.raises(ValueError, match="other static 'nodes' than scene 'arm'.*parameters_key='parameters'"):
+        with pytest.raises(ValueError, match="other parameters 'nodes' than scene 'arm'.*parameters_key='parameters'"):
             module(sample)
     sample.set(("next", "state"), state)
-    with pytest.raises(ValueError, match="other static 'nodes'"):
+    with pytest.raises(ValueError, match="other parameters 'nodes'"):
         ForwardModelLoss(bound)(sample)
 
 
-@pytest.mark.parametrize("options", [{"parameters": "none"}, {"features": ParameterNames(nodes=("mass",))}])
-def test_a_model_of_fewer_features_compares_all_that_samples_bring(variants, samples, options):
-    model = ForwardModel(**{"features": ParameterNames.of(variants[0]), **options}, **SIZES).double()
+@pytest.mark.parametrize("source", ["none", "scene"])
+def test_a_model_of_fewer_parameters_compares_all_that_samples_bring(variants, samples, source):
+    names = ParameterNames(nodes=("mass",)) if source == "scene" else ParameterNames.of(variants[0])
+    model = ForwardModel(names, parameters=source, **SIZES).double()
     bound = model.bind(variants[0])
     sample = TensorDict({"state": samples["state"][0, :, 0], "action": samples["action"][0, :, 0]}, [2])
     sample["parameters"] = PhysicalParameters.of(variants[0]).tensordict().expand(2)
     assert ("next", "state") in bound(sample).keys(True)
     sample["parameters", "edges"] = sample["parameters", "edges"] + 1.0
-    with pytest.raises(ValueError, match="other static 'edges' than scene 'arm'"):
+    with pytest.raises(ValueError, match="other parameters 'edges' than scene 'arm'"):
         bound(sample)
 
 
@@ -152,7 +154,7 @@ def test_what_is_no_variant_is_refused(variants, model):
         bound.parameters_of(load_scene("swimmer3"))
 
 
-def test_bad_static_values_are_named(variants, samples, model):
+def test_bad_parameters_are_named(variants, samples, model):
     bound = model.bind(variants[0], parameters_key="parameters")
     state, action, parameters = inputs(samples, bound, variants)
     with pytest.raises(KeyError, match="reads each sample's physical parameters at 'parameters'"):
@@ -161,7 +163,7 @@ def test_bad_static_values_are_named(variants, samples, model):
         bound.step(state, action, parameters[:2])
     with pytest.raises(KeyError, match=r"\['mass'\] are not known; use some of \['nodes'"):
         bound.step(state, action, parameters.set("mass", torch.zeros(3)))
-    with pytest.raises(ValueError, match=r"'arm' must be \[3, 3, 3\], got \[3, 3, 2\]"):
+    with pytest.raises(ValueError, match=r"'child_anchor' must be \[3, 3, 3\], got \[3, 3, 2\]"):
         bound.step(state, action, parameters.exclude("mass").set("child_anchor", torch.zeros(3, 3, 2)))
 
 
@@ -193,12 +195,12 @@ def test_a_model_env_of_variants(variants, samples, model, folds):
         env = ModelEnv(module, seed=0)
         played = env.rollout(4, tensordict=env.reset(start.clone(), set_state=True), auto_reset=False)
         made = len(folds)
-        expected = bound.rollout(state, played["action"], parameters)
+        expected = bound.rollout(state, played["action"], parameters)[0]
         torch.testing.assert_close(played["next", "state"], expected[:, 1:])
     assert made == 1  # not at every step
     # Without values of its own a start has the scene's.
     played = env.rollout(3, tensordict=TensorDict(batch_size=[2]))
-    expected = model.bind(variants[0]).rollout(played["state"][:, 0], played["action"])
+    expected = model.bind(variants[0]).rollout(played["state"][:, 0], played["action"])[0]
     torch.testing.assert_close(played["next", "state"], expected[:, 1:])
 
 
@@ -206,8 +208,8 @@ def test_a_model_env_of_variants(variants, samples, model, folds):
 def test_an_inferred_graph_is_read_as_it_is_and_gets_gradients(variants, samples):
     torch.manual_seed(0)
     scene = variants[0]
-    model = ForwardModel(ParameterNames.of(scene), parameters="inferred", inferred=(4, 3, 2), **SIZES).double()
-    bounds = [model.bind(scene, parameters_key="parameters", plain=plain) for plain in (True, False)]
+    model = ForwardModel.for_scene(scene, parameters="inferred", inferred=(4, 3, 2), **SIZES).double()
+    bounds = [model.bind(scene, parameters_key="parameters", reference=plain) for plain in (True, False)]
     ForwardModelLoss(model.bind(scene)).fit_normalizers(trajectory_buffer(samples[0], batch_size=64, seed=0).sample())
     state, action = samples["state"][:, 0, 0], samples["action"][:, 0, 0]
     shapes = {"nodes": (scene.num_nodes, 4), "edges": (scene.num_edges, 3), "globals_": (2,)}
@@ -215,14 +217,14 @@ def test_an_inferred_graph_is_read_as_it_is_and_gets_gradients(variants, samples
     parameters = (
         bounds[0].own_parameters().expand(3).clone().update(leaves)
     )  # joint anchors beside the graph, where bodies are linked
-    outs = [bound.step(state, action, parameters) for bound in bounds]
+    outs = [bound.step(state, action, parameters)[0] for bound in bounds]
     torch.testing.assert_close(*outs, rtol=0, atol=1e-12)
     gradients = [torch.autograd.grad(out.square().sum(), list(leaves.values())) for out in outs]
     for plain, folded in zip(*gradients, strict=True):
         assert plain.norm() > 0
         torch.testing.assert_close(plain, folded)
-    quick = specialize(bounds[1]).step(state, action, parameters)
+    quick = specialize(bounds[1]).step(state, action, parameters)[0]
     torch.testing.assert_close(quick, outs[0], rtol=0, atol=1e-12)
     assert not quick.requires_grad
-    nothing = model.bind(scene).step(state, action)  # without a graph: zeros
+    nothing = model.bind(scene).step(state, action)[0]  # without a graph: zeros
     assert (nothing - outs[0]).abs().max() > 1e-6

@@ -1,4 +1,4 @@
-"""Bodies that joints joint anchor together stay together, and are predicted better for it."""
+"""Projection onto the joint constraints: joined bodies stay together, and are predicted better for it."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ LINKED = [*SYSTEMS, "creature"]
 
 
 def project(bound, state, delta):
-    return bound.projection(state, bound.frame.matrices(state), delta, bound.model.delta_normalizer.std, bound.values)
+    std, matrices = bound.model.delta_normalizer.std, bound.canonicalizer.matrices(state)
+    return bound.projection(state, matrices, delta, std, bound.scene_parameters)
 
 
 def gaps(scene, state):
-    """How far, and how fast, every joint's joint anchor is apart on its two bodies."""
+    """How far, and how fast, every joint's anchor is apart on its two bodies."""
     joint_anchors = scene.joint_anchors
     frame = quaternion.to_matrix(state[..., 3:7]).unflatten(-1, (3, 3))
     places, speeds = [], []
@@ -59,8 +60,8 @@ def test_pinned_bodies_stay_together(make_model, random_actions, name):
     state[..., :3] += 0.01 * moving  # where the network's errors may have led
     bound, loose = (make_model(scene, project=project).bind(scene) for project in (True, False))
     actions = random_actions(scene, 2, 20)
-    assert max(gaps(scene, bound.rollout(state, actions)[:, 1:].detach())) < 1e-10
-    assert max(gaps(scene, loose.rollout(state, actions)[:, 1:].detach())) > 1e-4
+    assert max(gaps(scene, bound.rollout(state, actions)[0][:, 1:].detach())) < 1e-10
+    assert max(gaps(scene, loose.rollout(state, actions)[0][:, 1:].detach())) > 1e-4
 
 
 def test_parallel_hinges_at_one_place_share_their_turn_in_single_precision_too(make_model, random_states):
@@ -80,8 +81,10 @@ def test_a_body_that_turns_about_one_place_needs_no_linking(make_model):
     assert scene.joint_anchors.ancestors.any() and bound.projection is None
     trajectories = collect_trajectories(scene, 2, 20)
     state = trajectories["state"][:, :-1]
-    delta, matrices = bound.delta(state, trajectories["action"]).detach(), bound.frame.matrices(state)
-    assert torch.equal(projection(state, matrices, delta, bound.model.delta_normalizer.std, bound.values), delta)
+    delta, matrices = bound.delta(state, trajectories["action"]).detach(), bound.canonicalizer.matrices(state)
+    assert torch.equal(
+        projection(state, matrices, delta, bound.model.delta_normalizer.std, bound.scene_parameters), delta
+    )
 
 
 def off_axis(scene, state):
@@ -103,7 +106,7 @@ def test_hinges_turn_about_their_axes_alone(make_model, random_actions, name):
     bound = make_model(scene).bind(scene)
     assert isinstance(bound.projection, GeneralizedProjection)
     state = collect_trajectories(scene, 2, 20)["state"][:, -1]
-    states = bound.rollout(state, random_actions(scene, 2, 20)).detach()
+    states = bound.rollout(state, random_actions(scene, 2, 20))[0].detach()
     relative, spin = off_axis(scene, states)
     assert spin.abs().max() < 1e-9
     # From step to step the relative rotation changes about the axis, which its parent carries.
@@ -118,7 +121,7 @@ def test_hinges_turn_about_their_axes_alone(make_model, random_actions, name):
 
 @pytest.mark.parametrize("name", ["jaco", "creature"])
 def test_linking_by_joints_takes_noise_away(make_model, name):
-    """Less is left of a random error than by projection joint anchors alone, and least squares leaves less than it was."""
+    """Generalised coordinates leave less of a random error than maximal ones, which leave less than it was."""
     scene = zoo.load(name)
     bound = make_model(scene).bind(scene)
     states = collect_trajectories(scene, 4, 20)["state"]
@@ -127,9 +130,9 @@ def test_linking_by_joints_takes_noise_away(make_model, name):
     generator = torch.Generator().manual_seed(0)
     noisy = delta + 0.1 * std * torch.randn(delta.shape, generator=generator, dtype=torch.float64) * bound.movable
     seen = std > 1e-9
-    seen_from = states[:, :-1], bound.frame.matrices(states[:, :-1])
+    seen_from = states[:, :-1], bound.canonicalizer.matrices(states[:, :-1])
     left = [
-        ((by(*seen_from, noisy, std, bound.values) - delta)[..., seen] / std[seen]).square().mean()
+        ((by(*seen_from, noisy, std, bound.scene_parameters) - delta)[..., seen] / std[seen]).square().mean()
         for by in (GeneralizedProjection(scene), MaximalProjection(scene), lambda _, __, change, *___: change)
     ]
     assert left[0] < 0.9 * left[1] < 0.8 * left[2]
@@ -145,9 +148,10 @@ def test_in_the_plane_both_ways_are_the_same(make_model, name):
     generator = torch.Generator().manual_seed(0)
     raw = 1e-4 * torch.randn(4, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * bound.movable
     std = torch.ones(12, dtype=torch.float64)
-    matrices = bound.frame.matrices(state)
+    matrices = bound.canonicalizer.matrices(state)
     ours, theirs = (
-        by(state, matrices, raw, std, bound.values) for by in (GeneralizedProjection(scene), MaximalProjection(scene))
+        by(state, matrices, raw, std, bound.scene_parameters)
+        for by in (GeneralizedProjection(scene), MaximalProjection(scene))
     )
     assert (ours - theirs).norm() < 1e-3 * raw.norm()
 
@@ -160,7 +164,9 @@ def test_gradients_of_linking_by_joints(make_model):
     raw = 1e-2 * torch.randn(1, scene.num_nodes, 12, generator=generator, dtype=torch.float64) * bound.movable
     std = torch.ones(12, dtype=torch.float64)
     assert torch.autograd.gradcheck(
-        lambda delta: bound.projection(state, bound.frame.matrices(state), delta * bound.movable, std, bound.values),
+        lambda delta: bound.projection(
+            state, bound.canonicalizer.matrices(state), delta * bound.movable, std, bound.scene_parameters
+        ),
         (raw.requires_grad_(),),
     )
 
@@ -179,8 +185,8 @@ def test_a_linkage_moves_as_its_bodies_mean(scenes, make_model, random_actions):
 
 
 @pytest.mark.parametrize("name", LINKED)
-def test_levers_are_the_derivative_of_places(make_model, name):
-    """How turning moves the bodies of a joint_anchors, against differences."""
+def test_the_jacobian_is_the_derivative_of_positions(make_model, name):
+    """How rotations move joined bodies, against differences."""
     scene = zoo.load(name)
     bound = make_model(scene).bind(scene)
     state = collect_trajectories(scene, 2, 5)["state"][:, -1]
@@ -189,19 +195,20 @@ def test_levers_are_the_derivative_of_places(make_model, name):
     turn = torch.randn(2, scene.num_nodes, 3, generator=generator, dtype=torch.float64) * movable[:, 9:]
     still = torch.zeros_like(turn)
 
-    anchors = bound.projection.anchors(bound.frame.matrices(state), bound.values)
+    projection, matrices = bound.projection, bound.canonicalizer.matrices(state)
+    offsets = projection.offsets(matrices, bound.scene_parameters)
 
     root = torch.as_tensor(scene.joint_anchors.root)
     together = (root[:, None] == root).double()
     mean, root_moves = together / together.sum(1, keepdim=True), movable[root, :3]
 
     def apart(turn):
-        places = bound.projection.pins(state, anchors, turn, still)[1][:, 0].view_as(turn)
+        places = projection.forward_kinematics(state, offsets, turn, still)[1][:, 0].view_as(turn)
         return places - torch.where(root_moves, mean @ places, still)
 
     moved = torch.zeros_like(turn).flatten(1)
-    turned = turn.flatten(1)[:, bound.projection.turning].unsqueeze(-1)
-    moved[:, bound.projection.placed] = (bound.projection.moves(anchors) @ turned).squeeze(-1)
+    turned = turn.flatten(1)[:, projection.rotating].unsqueeze(-1)
+    moved[:, projection.moved_rows] = (projection.jacobian(offsets) @ turned).squeeze(-1)
     moved = moved.view_as(turn)
     torch.testing.assert_close((apart(1e-6 * turn) - apart(-1e-6 * turn)) / 2e-6, moved, rtol=1e-6, atol=1e-8)
 

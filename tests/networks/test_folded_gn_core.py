@@ -8,10 +8,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchrl_gn.networks import GNCore, Graph, GraphSize, Incidence, graph_concat
-from torchrl_gn.networks import folded_gn_core as folded_core
-from torchrl_gn.networks.folded_gn_core import fold_core
+from torchrl_gn.dynamics.normalization import dynamic_graph, static_graph
+from torchrl_gn.networks import GNCore, Graph, GraphSize, Incidence, folded_gn_core, graph_concat
+from torchrl_gn.networks.fold_gn_core import fold_gn_core
 
+NOTHING = GraphSize(0, 0, 0)
 PARTS = ("nodes", "edges", "globals_")
 
 maths = settings(
@@ -35,7 +36,7 @@ def topologies(draw) -> tuple[int, Tensor]:
 def make_core(size: GraphSize, out: int, latent: int, depth: int, seed: int = 0) -> GNCore:
     torch.manual_seed(seed)
     hidden = {"edge_hidden": [7] * depth, "node_hidden": [6] * depth, "global_hidden": [5] * depth}
-    return GNCore(size, out, latent=latent, **hidden).double()
+    return GNCore(size, NOTHING, out, latent=latent, **hidden).double()
 
 
 def outputs_and_gradients(function, core: GNCore, dynamic: Graph, cotangent: Tensor):
@@ -53,7 +54,7 @@ def outputs_and_gradients(function, core: GNCore, dynamic: Graph, cotangent: Ten
 def folded(core: GNCore, dynamic: Graph, static: Graph, predicted: Tensor) -> Tensor:
     size = GraphSize(*(part.shape[-1] for part in (dynamic.nodes, dynamic.edges, dynamic.globals_)))
     incidence = Incidence(static.edge_index, static.nodes.shape[-2], predicted)
-    return fold_core(core, size, incidence, static).predict(dynamic)
+    return fold_gn_core(core, size, incidence, static).predict(dynamic)
 
 
 def compare(core: GNCore, dynamic: Graph, static: Graph, predicted: Tensor, tolerance: float, dtype=torch.float64):
@@ -112,7 +113,7 @@ def test_float32_keeps_its_digits(random_graph, batch):
     edge_index = torch.cat((torch.stack((chain, chain + 1)), torch.stack((chain + 1, chain))), dim=1)
     size, static_size = GraphSize(18, 1, 0), GraphSize(20, 30, 10)
     torch.manual_seed(0)
-    core = GNCore(size + static_size, 12, latent=32, edge_hidden=(32, 32), node_hidden=(32, 32), global_hidden=(32, 32))
+    core = GNCore(size, static_size, 12, hidden=32)
     # Weights that float32 holds exactly, so that only the arithmetic differs.
     core = core.double()
     dynamic = random_graph(size, edge_index, 7, *batch)
@@ -180,8 +181,8 @@ def test_forward_models_compute_their_core(scenes, make_model, random_states, ra
     model = make_model(scene).double()
     bound = model.bind(scene)
     dynamic, static = (
-        bound.dynamic_graph(random_states(scene, 5, seed=3), random_actions(scene, 5, seed=3)),
-        bound.static_graph(),
+        dynamic_graph(bound, random_states(scene, 5, seed=3), random_actions(scene, 5, seed=3)),
+        static_graph(bound, bound.scene_parameters),
     )
     compare(model.core, dynamic, static, bound.incidence.predicted, 1e-10)
 
@@ -191,9 +192,9 @@ def test_large_batches_in_parts_are_the_whole(random_graph, monkeypatch, batch):
     size, edge_index = GraphSize(3, 2, 1), torch.tensor([[0, 1, 2], [1, 2, 0]])
     core = make_core(size + GraphSize(2, 0, 0), 4, 5, depth=2)
     dynamic, static = random_graph(size, edge_index, 3, batch), random_graph(GraphSize(2, 0, 0), edge_index, 3)
-    ready = fold_core(core, size, Incidence(edge_index, 3, torch.tensor([1, 2])), static)
+    ready = fold_gn_core(core, size, Incidence(edge_index, 3, torch.tensor([1, 2])), static)
     whole = ready.predict(dynamic)  # with gradients: in one
-    monkeypatch.setattr(folded_core, "_CACHED", 2 * 3 * 7)  # two samples of three edges with seven activations
+    monkeypatch.setattr(folded_gn_core, "_CACHED", 2 * 3 * 7)  # two samples of three edges with seven activations
     with torch.no_grad():
         assert len(ready._parts((dynamic.nodes.transpose(0, 1),))) == -(-batch // 2)
         torch.testing.assert_close(ready.predict(dynamic), whole.detach(), rtol=1e-12, atol=1e-12)

@@ -41,6 +41,11 @@ def make_block(in_size: GraphSize, out_size: GraphSize) -> GNBlock:
     return GNBlock(in_size, out_size, **HIDDEN).double()
 
 
+def make_core(size: GraphSize) -> GNCore:
+    torch.manual_seed(0)
+    return GNCore(size, GraphSize(0, 0, 0), 4, latent=8, **HIDDEN).double()
+
+
 def relabel(graph: Graph, nodes: Tensor, edges: Tensor) -> Graph:
     """The same graph with its nodes and its edges listed in another order."""
     place = torch.empty_like(nodes)
@@ -103,8 +108,7 @@ def test_without_a_global_update_none_is_built():
 
 
 def test_core_is_two_blocks_and_a_skip(random_graph):
-    torch.manual_seed(0)
-    core = GNCore(GraphSize(3, 2, 1), 4, latent=5, **HIDDEN).double()
+    core = make_core(GraphSize(3, 2, 1))
     graph = random_graph(GraphSize(3, 2, 1), EDGES, NODES)
     between = algorithm_1(core.first, graph)
     assert_same_graph(core(graph), algorithm_1(core.second, graph_concat(graph, between)))
@@ -113,8 +117,7 @@ def test_core_is_two_blocks_and_a_skip(random_graph):
 @pytest.mark.parametrize("kind", ["block", "core"])
 def test_relabelling_nodes_and_edges_relabels_the_output(random_graph, kind):
     size = GraphSize(3, 2, 2)
-    torch.manual_seed(0)
-    function = make_block(size, GraphSize(4, 5, 3)) if kind == "block" else GNCore(size, 4, latent=5, **HIDDEN).double()
+    function = make_block(size, GraphSize(4, 5, 3)) if kind == "block" else make_core(size)
     graph = random_graph(size, EDGES, NODES, 2)
     nodes, edges = torch.randperm(NODES), torch.randperm(EDGES.shape[1])
     assert_same_graph(function(relabel(graph, nodes, edges)), relabel(function(graph), nodes, edges))
@@ -128,7 +131,7 @@ def test_a_node_without_edges_hears_others_only_through_globals(random_graph):
     gradient = torch.autograd.grad(block(graph).nodes[3].sum(), graph.nodes)[0]
     assert gradient[3].abs().sum() > 0
     assert torch.equal(gradient[[0, 1, 2, 4]], torch.zeros(4, 3).double())
-    core = GNCore(size, 4, latent=8, **HIDDEN).double()
+    core = make_core(size)
     gradient = torch.autograd.grad(core(graph).nodes[3].sum(), graph.nodes)[0]
     assert (gradient.abs().sum(-1) > 0).all()
 
@@ -149,8 +152,8 @@ def test_gradients_are_the_finite_differences(random_graph):
 
 
 def test_a_core_without_hidden_layers_is_refused():
-    with pytest.raises(ValueError, match=r"needs a hidden layer, got edge_hidden=\(8,\), node_hidden=\(\)"):
-        GNCore(GraphSize(3, 2, 1), 4, edge_hidden=(8,), node_hidden=(), global_hidden=(8,))
+    with pytest.raises(ValueError, match=r"needs a hidden layer, got edges \(8,\), nodes \(\)"):
+        GNCore(GraphSize(3, 2, 1), GraphSize(0, 0, 0), 4, edge_hidden=(8,), node_hidden=(), global_hidden=(8,))
 
 
 def test_an_unknown_activation_is_named_by_every_network():

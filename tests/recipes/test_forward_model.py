@@ -13,7 +13,6 @@ from safetensors.torch import save_file
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import UnseenParameterWarning
-from torchrl_gn.training import load_pretrained
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained
 

@@ -193,7 +193,11 @@ class ForwardModel(nn.Module):
         return Predictor(self, scene, strict=strict, reference=reference, **options)
 
     def description(self) -> dict:
-        """Plain, JSON-able values from which :meth:`from_description` builds this model again."""
+        """Plain, JSON-able values from which :meth:`from_description` builds this model again.
+
+        Raises:
+            ValueError: if a feature is not in :data:`~torchrl_gn.dynamics.features.FEATURES`.
+        """
         names = {kind: name for name, kind in FEATURES.items()}
         if unknown := [type(feature).__name__ for feature in self.features if type(feature) not in names]:
             raise ValueError(f"Features {unknown} have no name for a checkpoint: add them to FEATURES.")
@@ -213,12 +217,21 @@ class ForwardModel(nn.Module):
 
     @classmethod
     def from_description(cls, description: dict) -> ForwardModel:
-        """Build the model of a :meth:`description`, with fresh weights."""
+        """Build the model of a :meth:`description`, with fresh weights.
+
+        Raises:
+            ValueError: if it names a feature or a core that is not known.
+        """
         rest = dict(description)
         features = []
         for each in rest.pop("features"):
             options = dict(each)
-            features.append(FEATURES[options.pop("feature")](**options))
+            name = options.pop("feature")
+            if name not in FEATURES:
+                raise ValueError(
+                    f"feature={name!r} is not known; use one of {list(FEATURES)}, or add yours to FEATURES."
+                )
+            features.append(FEATURES[name](**options))
         layout = StateLayout(tuple(Component(**component) for component in rest.pop("layout")["components"]))
         return cls(
             ParameterNames.from_names(rest.pop("parameter_names")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -113,8 +114,10 @@ class Predictor(TensorDictModuleBase):
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the network."""
-        # Not parameters(): under TorchRL's losses weights may be plain tensors.
-        return next(each.weight for each in self.model.core.modules() if isinstance(each, nn.Linear)).dtype
+        core = self.model.core
+        # Not of parameters() first: under TorchRL's losses weights may be plain tensors.
+        linear = (each.weight for each in core.modules() if isinstance(each, nn.Linear))
+        return next(itertools.chain(linear, core.parameters())).dtype
 
     @property
     def fixed_batch(self) -> bool:

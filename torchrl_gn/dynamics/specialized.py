@@ -52,10 +52,10 @@ class SpecializedPredictor(Predictor):
         self.strict, self.executor_name = predictor.strict, executor
         self._dtype = dtype
         self._executor: Executor | None = None
-        self._weights: list[tuple[Any, str, Tensor, int]] = []
+        self._weights: list[tuple[Any, str, Tensor, Tensor, int]] = []
         self._given: dict[str, tuple[Tensor, int]] = {}
-        # Refuse now what the executor cannot run, not at the first step.
-        if predictor.parameters_key is None:
+        # Refuse now what the executor cannot run, not at the first step; the eager one runs all.
+        if executor != "eager":
             self.executor()
 
     def __getstate__(self) -> dict:
@@ -87,14 +87,14 @@ class SpecializedPredictor(Predictor):
                     self._executor.update(program)
             owners = [module._parameters for module in self.model.modules()]
             owners += [module._buffers for module in (*self.model.modules(), self, self.parameter_reader)]
+            # Views that share the storage keep it alive: no other tensor can come to lie at its address.
             self._weights = [
-                (owner, name, tensor, _version(tensor))
+                (owner, name, tensor, tensor.detach(), _version(tensor))
                 for owner in owners
                 for name, tensor in owner.items()
                 if tensor is not None
             ]
             given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
-            # Views that share the storage keep it alive: no other tensor can come to lie at its address.
             self._given = {name: (value.detach(), _version(value)) for name, value in given.items()}
         return self._executor
 
@@ -102,13 +102,15 @@ class SpecializedPredictor(Predictor):
         given = {} if parameters is None else dict(parameters.items())
         return (
             bool(self._weights)
-            and all(owner.get(name) is one and _version(one) == seen for owner, name, one, seen in self._weights)
+            and all(owner.get(name) is one and _same(one, kept, seen) for owner, name, one, kept, seen in self._weights)
             and given.keys() == self._given.keys()
             and all(_same(given[name], *kept) for name, kept in self._given.items())
         )
 
     def program(self, parameters: TensorDictBase | None = None, *, reference: bool = False) -> StepProgram:
-        """Snapshot of the step, without features and components that never vary."""
+        """Snapshot of the step, without features and components that never vary; whole as the ``reference``."""
+        if reference:
+            return super().program(parameters, reference=True)
         model = self.model
         values = PhysicalParameters(*(value.detach().clone() for value in self.parameter_reader.read(parameters)))
         nodes, edges = InputScaling.of(model.node_normalizer), InputScaling.of(model.edge_normalizer)
@@ -232,8 +234,8 @@ def _same(now: Tensor, kept: Tensor, version: int) -> bool:
     """Whether a tensor, perhaps another view, shows the numbers that were kept."""
     return (
         version >= 0
-        and _version(now) == version
         and now.data_ptr() == kept.data_ptr()
+        and _version(now) == version
         and (now.shape, now.stride(), now.dtype) == (kept.shape, kept.stride(), kept.dtype)
     )
 

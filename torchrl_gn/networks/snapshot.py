@@ -46,6 +46,9 @@ def copy_into(old, new) -> bool:
         if isinstance(a, Tensor):
             pairs.append((a, b))
             return (a.shape, a.dtype, a.device) == (b.shape, b.dtype, b.device)
+        if isinstance(a, Core):
+            tensors = ((*core.parameters(), *core.buffers()) for core in (a, b))
+            return repr(a) == repr(b) and collect(*tensors)
         if isinstance(a, tuple):
             return len(a) == len(b) and all(map(collect, a, b))
         if is_dataclass(a):

@@ -63,7 +63,7 @@ class CompiledExecutor:
         inputs = [state, action]
         recurrent = self.program.recurrent
         if recurrent is not None:
-            hidden = self._start(state) if hidden is None else hidden
+            hidden = self._start(state, action) if hidden is None else hidden
             inputs += [hidden.nodes, hidden.edges, hidden.globals_]
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
             after, *rest = _Differentiable.apply(self, *inputs)
@@ -71,13 +71,11 @@ class CompiledExecutor:
             after, *rest = detached(self.run, *inputs)
         return after, Graph(rest[0], rest[1], rest[2], self.program.edge_index) if rest else None
 
-    def _start(self, state: Tensor) -> Graph:
-        assert self.program.recurrent is not None
-        size, edges = self.program.recurrent.hidden_size, self.program.edge_index.shape[1]
-        *batch, count, _ = state.shape
-        shapes = ((*batch, count, size.nodes), (*batch, edges, size.edges), (*batch, size.globals_))
-        nodes, edge_features, globals_ = (state.new_zeros(shape, dtype=self.program.dtype) for shape in shapes)
-        return Graph(nodes, edge_features, globals_, self.program.edge_index)
+    def _start(self, state: Tensor, action: Tensor) -> Graph:
+        program = self.program
+        assert program.recurrent is not None
+        canonical = program.canonicalizer(state, program.parameters)
+        return program.recurrent.start(eager.dynamic_graph(program, canonical, action))
 
 
 def _functions(program: StepProgram) -> tuple[Callable, Callable]:

@@ -1,0 +1,106 @@
+"""Every executor is the reference: values of steps and rollouts, and their gradients."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+
+from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
+from torchrl_gn.dynamics.executors import EXECUTORS
+from torchrl_gn.networks import CORES, Core, Graph, GraphSize
+from torchrl_gn.scenes import SYSTEMS
+
+from .. import zoo
+from ..compiling import compiles
+
+
+class LinearCore(Core):
+    """One layer for every node, without fold()."""
+
+    def __init__(self, dynamic: GraphSize, static: GraphSize, out_nodes: int) -> None:
+        super().__init__(dynamic)
+        size = dynamic + static
+        self.layer = nn.Linear(size.nodes + size.globals_, out_nodes)
+
+    def forward(self, graph: Graph) -> Graph:
+        everywhere = graph.globals_.unsqueeze(-2).expand(*graph.nodes.shape[:-1], -1)
+        nodes = self.layer(torch.cat((graph.nodes, everywhere), -1)).tanh()
+        return Graph(nodes, graph.edges, graph.globals_, graph.edge_index)
+
+
+SIZES = {"latent": 16, "hidden": 32}
+MODELS = {
+    "gn": SIZES,
+    "mlp": {"core": "mlp", "hidden": (16, 12)},
+    "recurrent": {"core": "recurrent", "hidden_state": (3, 4, 5), **SIZES},
+    "unfolded": {"core": "unfolded"},
+}
+BOUNDS = {torch.float64: 1e-10, torch.float32: 1e-5}
+
+
+def cases() -> list:
+    """Executor, system, model, batches, and whether each sample has parameters of its own."""
+    systems, batches = [*SYSTEMS, "joints"], [(), (1,), (5,)]
+    found: list = [("eager", *each, batches, False) for each in itertools.product(systems, MODELS)]
+    found += [("eager", *each, [(5,)], True) for each in itertools.product(systems, MODELS)]
+    few = [
+        ("pendulum", "gn", [()], False),
+        ("pendulum", "recurrent", [(1,)], False),
+        ("pendulum", "mlp", [(5,)], True),
+        ("swimmer6", "gn", [(5,)], True),
+    ]
+    for executor in sorted(EXECUTORS.keys() - {"eager"}):
+        found += [pytest.param(executor, *each, marks=[pytest.mark.slow, compiles]) for each in few]
+    return found
+
+
+load = functools.cache(zoo.load)
+
+
+def pull(predictor: Predictor, state, actions, parameters: TensorDictBase | None) -> list[torch.Tensor]:
+    """Changes in a step and in a rollout, and gradients of random functions of both."""
+    leaves = [value.detach().clone().requires_grad_() for value in (state, actions)]
+    after, _ = predictor.step(leaves[0], leaves[1][..., 0, :], parameters)
+    states, _ = predictor.rollout(*leaves, parameters)
+    generator = torch.Generator().manual_seed(7)
+    found = []
+    for out in (after - leaves[0], states[..., 1:, :, :] - states[..., :1, :, :]):
+        weights = torch.randn(out.shape, generator=generator, dtype=out.dtype)
+        gradients = torch.autograd.grad((out * weights).sum(), leaves, retain_graph=True, allow_unused=True)
+        found += [out.detach(), *(torch.zeros(1) if each is None else each for each in gradients)]
+    return found
+
+
+def own_parameters(predictor: Predictor, batch: tuple[int, ...]) -> TensorDictBase:
+    """Physical parameters of every sample, up to 10 % from the scene's."""
+    parameters = predictor.own_parameters().expand(batch).clone()
+    generator = torch.Generator().manual_seed(4)
+    for part in ("nodes", "edges", "globals_", "child_anchor"):
+        shape = parameters[part].shape
+        parameters[part] *= 1 + 0.1 * torch.rand(shape, generator=generator, dtype=torch.float64)
+    return parameters
+
+
+@pytest.mark.parametrize("dtype", BOUNDS, ids=str)
+@pytest.mark.parametrize(("executor", "name", "kind", "batches", "own"), cases())
+def test_every_executor_is_the_reference(
+    fit, random_states, random_actions, monkeypatch, executor, name, kind, batches, own, dtype
+):
+    monkeypatch.setitem(CORES, "unfolded", LinearCore)
+    scene = load(name)
+    torch.manual_seed(0)
+    model = fit(ForwardModel.for_scene(scene, **MODELS[kind]).to(dtype), scene).requires_grad_(False)
+    reference = model.bind(scene, reference=True, parameters_key="parameters" if own else None)
+    predictor = specialize(reference, executor=executor)
+    for batch in batches:
+        state, actions = random_states(scene, *batch, seed=3), random_actions(scene, *batch, 3, seed=3)
+        parameters = own_parameters(reference, batch) if own else None
+        expected, found = (pull(each, state, actions, parameters) for each in (reference, predictor))
+        for wanted, got in zip(expected, found, strict=True):
+            assert got.dtype == wanted.dtype and got.shape == wanted.shape
+            assert (got - wanted).norm() <= BOUNDS[dtype] * wanted.norm()
