@@ -97,6 +97,7 @@ class ForwardModel(nn.Module):
         self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
         kind = cast(Any, core_class(core))
         fixed = {"counts": counts} if kind.fixed_size else {}
+        self.casts = 0  # of the weights, which PyTorch counts as no change of them
         self.core: Core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
 
     @classmethod
@@ -120,6 +121,10 @@ class ForwardModel(nn.Module):
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, first.num_edges
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)
+
+    def _apply(self, fn, recurse: bool = True):
+        self.casts += 1
+        return super()._apply(fn, recurse)
 
     @property
     def parameter_normalizers(self) -> dict[str, Normalizer]:

@@ -52,7 +52,8 @@ class SpecializedPredictor(Predictor):
         self.strict, self.executor_name = predictor.strict, executor
         self._dtype = dtype
         self._executor: Executor | None = None
-        self._weights: list[tuple[Any, str, Tensor, Tensor, int]] = []
+        self._weights: list[tuple[Any, str, Tensor, int, torch.dtype]] = []
+        self._casts = 0
         self._given: dict[str, tuple[Tensor, int]] = {}
         # Refuse now what the executor cannot run, not at the first step; the eager one runs all.
         if executor != "eager":
@@ -87,13 +88,14 @@ class SpecializedPredictor(Predictor):
                     self._executor.update(program)
             owners = [module._parameters for module in self.model.modules()]
             owners += [module._buffers for module in (*self.model.modules(), self, self.parameter_reader)]
-            # Views that share the storage keep it alive: no other tensor can come to lie at its address.
-            self._weights = [
-                (owner, name, tensor, tensor.detach(), _version(tensor))
-                for owner in owners
-                for name, tensor in owner.items()
-                if tensor is not None
+            tensors = [
+                (owner, name, tensor) for owner in owners for name, tensor in owner.items() if tensor is not None
             ]
+            # PyTorch counts no changes of tensors made in inference mode: they are never the same.
+            counted = not any(tensor.is_inference() for _, _, tensor in tensors)
+            self._weights = [(*each, each[2]._version, each[2].dtype) for each in tensors] if counted else []
+            self._casts = self.model.casts
+            # Views that share the storage keep it alive: no other tensor can come to lie at its address.
             given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
             self._given = {name: (value.detach(), _version(value)) for name, value in given.items()}
         return self._executor
@@ -102,7 +104,11 @@ class SpecializedPredictor(Predictor):
         given = {} if parameters is None else dict(parameters.items())
         return (
             bool(self._weights)
-            and all(owner.get(name) is one and _same(one, kept, seen) for owner, name, one, kept, seen in self._weights)
+            and all(
+                owner.get(name) is one and one._version == version and one.dtype is dtype
+                for owner, name, one, version, dtype in self._weights
+            )
+            and self.model.casts == self._casts
             and given.keys() == self._given.keys()
             and all(_same(given[name], *kept) for name, kept in self._given.items())
         )
