@@ -17,33 +17,7 @@ _SIZE = 480  # pixels of a picture's width and height
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; by default with the arguments of this process.
-
-    Returns:
-        Exit code 0. Errors print one message on standard error and exit with code 2.
-    """
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    try:
-        text = _output(options)
-    except (ValueError, OSError, ImportError) as error:
-        parser.exit(2, f"{parser.prog}: {error}\n")
-    print(text)
-    return 0
-
-
-def _output(options: argparse.Namespace) -> str:
-    """Return the output of a command."""
-    if options.command == "show":
-        return _show(options.scene, options.image)
-    if options.command == "doctor":
-        from torchrl_gn.doctor import diagnose
-
-        return diagnose()
-    return f"{_systems()}\n\n{_models()}"
-
-
-def _parser() -> argparse.ArgumentParser:
+    """Run a command and return 0; errors print one message on standard error and exit with code 2."""
     parser = argparse.ArgumentParser("torchrl-gn", description="Graph-network physics models of articulated bodies.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.add_parser("list", help="built-in systems and pretrained models (default)")
@@ -51,11 +25,23 @@ def _parser() -> argparse.ArgumentParser:
     show.add_argument("scene", metavar="NAME_OR_MJCF", help="a built-in system, or the path of an MJCF file")
     show.add_argument("--image", metavar="FILE", help="draw the start state into this file (.png, .jpg, ...)")
     commands.add_parser("doctor", help="this machine: hardware, libraries, speeds, and recommended options")
-    return parser
+    options = parser.parse_args(arguments)
+    try:
+        if options.command == "show":
+            text = _show(options.scene, options.image)
+        elif options.command == "doctor":
+            from torchrl_gn.doctor import diagnose
+
+            text = diagnose()
+        else:
+            text = f"{_systems()}\n\n{_models()}"
+    except (ValueError, OSError, ImportError) as error:
+        parser.exit(2, f"{parser.prog}: {error}\n")
+    print(text)
+    return 0
 
 
 def _systems() -> str:
-    """Return the table of built-in systems."""
     from torchrl_gn.scenes import SYSTEMS, has_variants, load_scene
 
     rows: list[tuple[str, ...]] = [("system", "nodes", "joints", "actions", "control step", "random variants")]
@@ -68,7 +54,6 @@ def _systems() -> str:
 
 
 def _models() -> str:
-    """Return the table of pretrained models and their stated errors."""
     from torchrl_gn.training import load_pretrained, pretrained_names
 
     keys = ("one_step_error", "rollout_error_20", "rollout_error_100")

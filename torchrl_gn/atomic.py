@@ -23,16 +23,11 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     try:
         yield temporary
         # Some writers deny access to others: give the file the user's default mode.
-        temporary.chmod(_mode())
+        os.umask(mask := os.umask(0))
+        temporary.chmod(0o666 & ~mask)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _mode() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return 0o666 & ~mask
 
 
 def write_json(path: str | os.PathLike, values: Any) -> None:

@@ -33,7 +33,8 @@ def diagnose() -> str:
     """Return a report on processor, libraries and speeds, with advice; takes a few seconds."""
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     seconds = _thread_seconds(threads)
-    compiler, gpus = _compiler(), _gpus()
+    compiler = _compiler()
+    gpus = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
     sections = {
         "System": [*_system(threads), ("GPU", ", ".join(gpus) or "none")],
         "Versions": [("python", sys.version.split()[0]), *package_versions().items()],
@@ -76,17 +77,13 @@ def _libraries() -> list[tuple[str, str]]:
 def _products() -> list[tuple[str, str]]:
     speeds = product_speeds()
     onednn = f"{speeds.onednn:.0f}" + (", with rounded factors" if speeds.onednn_error > 1e-5 else "")
-    return [
-        ("float64", f"{speeds.float64:.0f}"),
-        ("float32", f"{speeds.float32:.0f}"),
-        ("float32, oneDNN", onednn if speeds.onednn else "not selectable in this version of torch"),
-        ("bfloat16", f"{speeds.bfloat16:.0f}"),
-        ("float16", f"{speeds.float16:.0f}"),
-    ]
+    rows = [(name, f"{getattr(speeds, name):.0f}") for name in ("float64", "float32", "bfloat16", "float16")]
+    rows.insert(2, ("float32, oneDNN", onednn if speeds.onednn else "not selectable in this version of torch"))
+    return rows
 
 
 def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
-    """Time predictions and a training step on one and on all threads: seconds, best of ``_ROUNDS``."""
+    """Time predictions and a training step on one and on all threads, in seconds."""
     loaded = load_pretrained(_MODEL)
     bound = loaded.model.bind(loaded.scene())
     specialized, loss = specialize(bound), ForwardModelLoss(bound)
@@ -130,31 +127,24 @@ def _compiler() -> str | None:
     return done.stdout.splitlines()[0] if done.returncode == 0 and done.stdout else None
 
 
-def _gpus() -> list[str]:
-    return [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
-
-
 def _advice(seconds: dict[str, tuple[float, float]], threads: int, compiler: bool, gpu: bool) -> list[str]:
     products = product_speeds()
-    lines = ["specialize(model) for prediction, evaluation and planning"]
-    lines.append(
+    slower = products.slowdown(torch.bfloat16)
+    lines = [
+        "specialize(model) for prediction, evaluation and planning",
         "specialize(model, executor='compiled') for few states at a time and for planning"
         if compiler
-        else "install g++ for executor='compiled': 5 to 8 times faster steps of few states"
-    )
-    slower = products.slowdown(torch.bfloat16)
-    lines.append(
+        else "install g++ for executor='compiled': 5 to 8 times faster steps of few states",
         f"dtype=torch.bfloat16 for large batches: products {1 / slower:.1f} times as fast, 3 digits"
         if slower < 0.8
-        else f"no dtype=torch.bfloat16: products take {slower:.1f} times as long as in float32"
-    )
+        else f"no dtype=torch.bfloat16: products take {slower:.1f} times as long as in float32",
+    ]
     if products.onednn_pays:
         gain = products.onednn / products.float32
         lines.append(f"fast_matmul() around large batches: float32 products {gain:.1f} times as fast")
     else:
-        lines.append(
-            "no fast_matmul(): oneDNN " + ("rounds the factors" if products.onednn_error > 1e-5 else "is not faster")
-        )
+        why = "rounds the factors" if products.onednn_error > 1e-5 else "is not faster"
+        lines.append(f"no fast_matmul(): oneDNN {why}")
     one, all_ = seconds["gradient of 200"]
     if threads > 1:
         lines.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -29,21 +30,14 @@ class SlowDtypeWarning(UserWarning):
 
 @dataclass(frozen=True)
 class ProductSpeeds:
-    """Speed of matrix products on one thread, GFLOP/s.
-
-    Attributes:
-        float64, bfloat16, float16: in that dtype.
-        float32: by torch's default library.
-        onednn: in float32, by oneDNN; 0 if this version of torch cannot select it.
-        onednn_error: relative error of oneDNN; above 1e-5 if it rounds the factors.
-    """
+    """Speed of matrix products on one thread, GFLOP/s."""
 
     float64: float
-    float32: float
-    onednn: float
+    float32: float  # by torch's default library
+    onednn: float  # float32 by oneDNN; 0 if this version of torch cannot select it
     bfloat16: float
     float16: float
-    onednn_error: float
+    onednn_error: float  # relative; above 1e-5 if oneDNN rounds the factors
 
     @property
     def onednn_pays(self) -> bool:
@@ -62,23 +56,15 @@ class ProductSpeeds:
 
 @functools.cache
 def product_speeds() -> ProductSpeeds:
-    """Measure products of 1,400 x 128 by 128 x 128 (0.1 s), or read the result of an earlier process.
-
-    Cached in ``$XDG_CACHE_HOME/torchrl_gn`` (``~/.cache/torchrl_gn``) if writable, by processor, instruction sets and
-    torch version.
-    """
+    """Measure products of 1,400 x 128 by 128 x 128 (0.1 s), or read an earlier result from ``~/.cache/torchrl_gn``."""
     key = "\n".join([processor_name(), instruction_sets(), torch.__version__, *restrictions()])
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
     file = folder / f"products-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
-    try:
+    with contextlib.suppress(OSError, ValueError, TypeError):  # missing, damaged, or of another version
         return ProductSpeeds(**json.loads(file.read_text()))
-    except (OSError, ValueError, TypeError):  # missing, damaged, or of another version of this package
-        pass
     speeds = _measure()
-    try:
+    with contextlib.suppress(OSError):
         write_json(file, asdict(speeds))
-    except OSError:
-        pass
     return speeds
 
 
@@ -91,18 +77,9 @@ def processor_name() -> str:
 def instruction_sets() -> str:
     """Return the processor's vector and matrix instruction sets, such as ``"AVX2, FMA"``."""
     flags = set((_cpuinfo().get("flags") or _cpuinfo().get("Features") or "").split())
-    known = {
-        "avx2": "AVX2",
-        "fma": "FMA",
-        "avx512f": "AVX-512",
-        "avx512_bf16": "AVX-512 BF16",
-        "avx512_fp16": "AVX-512 FP16",
-        "amx_tile": "AMX",
-        "amx_bf16": "AMX BF16",
-        "asimd": "NEON",
-        "sve": "SVE",
-        "bf16": "BF16",
-    }
+    known = {"avx2": "AVX2", "fma": "FMA", "avx512f": "AVX-512", "avx512_bf16": "AVX-512 BF16"}
+    known |= {"avx512_fp16": "AVX-512 FP16", "amx_tile": "AMX", "amx_bf16": "AMX BF16"}
+    known |= {"asimd": "NEON", "sve": "SVE", "bf16": "BF16"}
     return ", ".join(name for flag, name in known.items() if flag in flags) or "not known"
 
 

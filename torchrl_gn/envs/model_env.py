@@ -10,55 +10,48 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
-from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, reward_of, set_specs, step_reward
+from torchrl_gn.envs.specs import (
+    RewardFunction,
+    finite_reward,
+    outcome,
+    read,
+    reward_of,
+    set_specs,
+    spec_of,
+    step_reward,
+)
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
 
 class ModelEnv(ModelBasedEnvBase):
-    """Steps predicted by a learned model, with the specs of :class:`~torchrl_gn.envs.SceneEnv`.
+    """Steps predicted by a learned model, with the specs of :class:`~torchrl_gn.envs.SceneEnv` but no ``physics``.
 
-    Stateless and batched over any leading batch, as ``SceneEnv``, but without its ``physics`` entry: TensorDicts of the
-    true environment can be stepped here, so a planner on the model acts in the true environment. A step is
-    differentiable in ``state``, ``action`` and the model's weights; nothing is detached (freeze the weights to plan).
+    Stateless, batched over any leading batch, and differentiable in ``state``, ``action`` and the weights of the
+    submodule ``world_model``; nothing is detached. A prediction that is not finite keeps the last good state, sets
+    ``done`` and ``terminated`` and gives ``unstable_reward``. Rollouts do not check ``done``, which would wait for a
+    GPU; ``TransformedEnv`` around the environment does.
 
-    A prediction that is not finite does not raise: the step keeps the last good state, sets ``done`` and ``terminated``
-    and gives ``unstable_reward``. Gradients through such a step may be NaN. To avoid waiting for a GPU, rollouts do not
-    check ``done``: they run their full length without resets (:meth:`any_done` is False). ``TransformedEnv`` around the
-    environment checks and resets.
-
-    The model is the submodule ``world_model``: it follows ``to()``, and its weights are among the environment's
-    parameters. A loss that must not train them keeps the environment out of its submodules.
-
-    ``reset()`` draws true start states; ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state``. A
-    model with physical parameters per sample (``parameters_key``) reads them from the TensorDict; by default they are
-    its scene's, or zeros for an inferred graph. TorchRL does not carry them across auto-resets. The hidden state of a
-    recurrent model is the entry ``hidden_state``; without one it starts at its initial value.
+    ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state``, ``reset()`` from drawn ones. Physical
+    parameters (``parameters_key``) come from the TensorDict, else from the scene (zeros if inferred); TorchRL does not
+    carry them across auto-resets. A recurrent model's entry ``hidden_state`` begins at its initial value.
 
     Args:
-        model: module with ``in_keys`` holding ``"state"`` and ``"action"``, ``out_keys`` holding
-            ``("next", "state")`` and an attribute ``scene``, as
-            :class:`~torchrl_gn.dynamics.Predictor`.
+        model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
-        start_states: ``[M, S]`` full MuJoCo states to start from, or a function
-            ``(n, generator) -> [n, S]``. Default: the system's reset distribution. For a robot known by its joints
-            alone (:class:`~torchrl_gn.scenes.KinematicTree`): its states ``[M, N, C]``, for example of a log.
-        unstable_reward: reward of a step whose prediction is not finite.
-        seed: seed of the start states. Default: drawn from torch's global generator.
-        device: where everything lives. Default: the model's device.
+        start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own. A
+            :class:`~torchrl_gn.scenes.KinematicTree` needs states ``[M, N, C]``, for example of a log.
+        seed: default: drawn from torch's global generator.
 
     Raises:
         TypeError: the model lacks these keys or the scene.
-        ValueError: start states, ``state`` or ``action`` have a wrong shape; a robot of joints has no start states; the
-            reward is of another scene; ``unstable_reward``, or when resetting ``state`` or physical parameters, are not
-            finite.
+        ValueError: an entry, the start states or the reward do not fit the scene, or are not finite.
         KeyError: when stepping, no ``state`` or ``action``.
     """
 
@@ -94,17 +87,10 @@ class ModelEnv(ModelBasedEnvBase):
         self._simulator: Simulator | None = None
         set_specs(self, self.scene, physics=False)
         if self._parameters_key is not None:
-            self.state_spec[self._parameters_key] = self._spec_of(cast(Any, model).own_parameters())
+            self.state_spec[self._parameters_key] = spec_of(cast(Any, model).own_parameters(), self.device)
         if "hidden_state" in inputs:
             for spec in (self.observation_spec, self.state_spec):
-                spec["hidden_state"] = self._spec_of(cast(Any, model).initial_hidden_state())
-
-    def _spec_of(self, entries: TensorDictBase) -> Composite:
-        specs = {
-            str(key): Unbounded(shape=value.shape, dtype=value.dtype, device=self.device)
-            for key, value in entries.items()
-        }
-        return Composite(specs, device=self.device)
+                spec["hidden_state"] = spec_of(cast(Any, model).initial_hidden_state(), self.device)
 
     @property
     def predictor(self) -> Predictor | ModulePredictor:
@@ -133,8 +119,7 @@ class ModelEnv(ModelBasedEnvBase):
             if self._simulator is not None:
                 state = self._simulator.observe(state)
         reset = TensorDict({"state": state}, batch_size=shape)
-        key = self._parameters_key
-        if key is not None:
+        if (key := self._parameters_key) is not None:
             parameters = tensordict.get(key, None)
             if parameters is None:
                 parameters = cast(TensorDictBase, self.world_model.own_parameters()).expand(shape)
@@ -155,34 +140,19 @@ class ModelEnv(ModelBasedEnvBase):
         predicted = self.world_model(tensordict.exclude("next"))["next"]
         prediction = predicted["state"]
         stable = prediction.isfinite().flatten(-2).all(-1, keepdim=True)
-        next_state = torch.where(stable.unsqueeze(-1), prediction, state)
-        reward = step_reward(self.reward, state, action, next_state, tensordict.get("task", None))
-        entries = {
-            "state": next_state,
-            "reward": torch.where(stable, reward, self.unstable_reward),
-            "done": ~stable,
-            "terminated": ~stable,
-        }
+        entries: dict[str, Any] = outcome(self, tensordict, state, action, prediction, stable)
         if "hidden_state" in predicted.keys():
             entries["hidden_state"] = predicted["hidden_state"]
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def imagine(self, tensordict: TensorDictBase, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """States and rewards of action sequences, in one call of the model and one of the reward.
+        """States ``[*B, H + 1, N, 13]`` and rewards ``[*B, H, 1]`` of action sequences, in one call of the model.
 
-        Same results as step by step, but much faster, for planners. Predictions that are not finite, and their
-        rewards, are returned as they are. Differentiable as :meth:`step` is.
+        Equals stepping, but is faster; predictions that are not finite are returned as they are. Differentiable.
 
         Args:
             tensordict: ``[*B]``, as for a step, without its ``action``.
-            actions: ``[*B, H, A]``.
-
-        Returns:
-            States ``[*B, H + 1, N, 13]``, beginning with the TensorDict's, and rewards ``[*B, H, 1]``.
-
-        Raises:
-            ValueError: ``actions`` or ``state`` have a wrong shape, or H is 0.
-            KeyError: no ``state``.
+            actions: ``[*B, H, A]``, H at least 1.
         """
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
         if actions.shape != shape or shape[-2] < 1:

@@ -10,62 +10,41 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.envs.specs import RewardFunction, finite_reward, read, reward_of, set_specs, step_reward
+from torchrl_gn.envs.specs import RewardFunction, finite_reward, outcome, read, reward_of, set_specs
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
 
 class SceneEnv(EnvBase):
-    """MuJoCo simulation of a scene, stateless and batched over any leading batch.
-
-    A step is a function of the TensorDict's ``physics`` and ``action`` alone: the same environment steps one state or
-    many, TorchRL's planners branch from any TensorDict, and recorded steps replay bit for bit. A batch is simulated by
-    MuJoCo's threads in one call. Not differentiable (:class:`~torchrl_gn.envs.ModelEnv` is).
+    """MuJoCo simulation of a scene, stateless and batched over any leading batch; not differentiable.
 
     Entries:
-        - ``state`` ``[*B, N, 13]`` float64: position 3, w-first quaternion 4, linear velocity 3,
-          angular velocity 3 of each node; SI, world frame.
-        - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which cannot be recovered
-          from ``state``.
+        - ``state`` ``[*B, N, 13]`` float64: position 3, w-first quaternion 4, linear velocity 3, angular velocity 3;
+          SI, world frame.
+        - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), all that a step starts from.
         - ``action`` ``[*B, A]``: float32 in the spec, float64 accepted. MuJoCo clamps limited controls.
         - ``variant`` ``[*B, 1]`` int64, with several scenes only: index of the sample's scene.
-        - ``reward`` ``[*B, 1]`` float32; zero without ``reward``.
-        - ``done``, ``terminated`` ``[*B, 1]``: true where the simulation became unstable. Add TorchRL's
-          ``StepCounter`` for a time limit.
-
-    An unstable simulation does not raise, so that one bad candidate cannot end a planner's search: the step keeps the
-    last good state, sets ``terminated`` and gives ``unstable_reward``.
+        - ``done``, ``terminated`` ``[*B, 1]``: the simulation became unstable. The step keeps the last good state and
+          gives ``unstable_reward``. TorchRL's ``StepCounter`` limits the time.
 
     ``reset()`` draws start states for the TensorDict's batch; ``reset(tensordict, set_state=True)`` starts from its
-    ``physics``, or with several scenes from its ``variant`` alone. (``set_state=False`` ignores the entry; TorchRL 0.14
-    warns if ``set_state`` is not given.)
-
-    Collectors need a fixed number of environments: :func:`~torchrl_gn.envs.batched`.
+    ``physics``, or with several scenes from its ``variant`` alone. For collectors see :func:`~torchrl_gn.envs.batched`.
 
     Args:
         scene: the scene, or variants of one (:func:`~torchrl_gn.scenes.sample_variants`). A batch cycles through them,
             or follows the TensorDict's ``variant``; ``env.scene`` is the first.
-        reward: function ``(state, action, next_state, task) -> [*B, 1]``, for example from
-            :func:`~torchrl_gn.rewards.make_reward`; ``task`` is the TensorDict's entry or None.
-        start_states: ``[M, S]`` full MuJoCo states to start from, or a function
-            ``(n, generator) -> [n, S]``. Default: the system's reset distribution.
-        num_threads: threads of the simulation. Default: all cores.
-        unstable_reward: reward of an unstable step.
-        seed: seed of the start states. Default: drawn from torch's global generator.
-        device: where TensorDicts movable; the simulation runs on the CPU.
+        reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
+        start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own.
+        seed: default: drawn from torch's global generator.
+        device: of the TensorDicts; the simulation runs on the CPU.
 
     Raises:
-        ValueError: start states have a wrong shape, the reward is of another scene, or ``unstable_reward`` is not
-            finite; when stepping or resetting, ``action`` or ``physics`` is not finite or has a wrong shape.
-        KeyError: when stepping, no ``physics`` or ``action``.
+        ValueError: an entry, the start states or the reward do not fit the scene, or are not finite.
 
     Example:
-        >>> from torchrl_gn.rewards import make_reward
         >>> from torchrl_gn.scenes import load_scene
-        >>> scene = load_scene("pendulum")
-        >>> env = SceneEnv(scene, make_reward("balance", scene), seed=0)
-        >>> start = env.reset(TensorDict(batch_size=[5]))
+        >>> start = (env := SceneEnv(load_scene("pendulum"), seed=0)).reset(TensorDict(batch_size=[5]))
         >>> env.rollout(20, tensordict=start, auto_reset=False)["next", "reward"].shape
         torch.Size([5, 20, 1])
     """
@@ -144,16 +123,8 @@ class SceneEnv(EnvBase):
         # Entry by entry: TensorDict.to costs as much as a small simulation.
         stable = simulated["stable"].to(self.device).unsqueeze(-1)
         state, next_state = simulated["state"].to(self.device).unbind(-3)
-        next_state = torch.where(stable.unsqueeze(-1), next_state, state)
-        next_physics = torch.where(stable, simulated["physics"][..., 1, :].to(self.device), physics.detach())
-        reward = step_reward(self.reward, state, action, next_state, tensordict.get("task", None))
-        entries = {
-            "state": next_state,
-            "physics": next_physics,
-            "reward": torch.where(stable, reward, self.unstable_reward),
-            "done": ~stable,
-            "terminated": ~stable,
-        }
+        entries = outcome(self, tensordict, state, action, next_state, stable)
+        entries["physics"] = torch.where(stable, simulated["physics"][..., 1, :].to(self.device), physics.detach())
         if variant is not None:
             entries["variant"] = variant.to(self.device, copy=True)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)

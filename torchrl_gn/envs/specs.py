@@ -21,17 +21,7 @@ RewardFunction = Callable[..., Tensor]
 
 
 def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -> None:
-    """Set an environment's specs for a scene.
-
-    Observations are float64, as simulated. Actions and rewards are float32, the dtype of TorchRL's policies, value
-    networks and planners; environments also accept float64 actions.
-
-    Args:
-        env: environment to set up; its device is set already.
-        scene: the scene.
-        physics: whether the full MuJoCo state is an entry.
-        variants: number of variants of the scene; if several, ``variant`` is an entry.
-    """
+    """Set an environment's specs for a scene: float64 observations, float32 actions and rewards, as in TorchRL."""
     device = env.device
 
     def unbounded(*shape: int) -> Unbounded:
@@ -44,8 +34,8 @@ def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -
         observation["variant"] = Bounded(0, variants - 1, shape=torch.Size((1,)), dtype=torch.int64, device=device)
     env.observation_spec = Composite(observation, device=device)
     # A step reads these besides the action.
-    carried = {"physics" if physics else "state", "variant"} & observation.keys()
-    env.state_spec = Composite({key: observation[key].clone() for key in carried}, device=device)
+    inputs = {"physics" if physics else "state", "variant"} & observation.keys()
+    env.state_spec = Composite({key: observation[key].clone() for key in inputs}, device=device)
     actions: dict[str, Any] = {"shape": torch.Size((scene.num_actions,)), "dtype": torch.float32, "device": device}
     low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (scene.action_low, scene.action_high))
     # The bounds of a robot known by its logs may be unknown.
@@ -54,37 +44,24 @@ def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -
     env.reward_spec = Unbounded(shape=torch.Size((1,)), dtype=torch.float32, device=device)
 
 
+def spec_of(entries: TensorDictBase, device: torch.device | None) -> Composite:
+    """Spec of any values of the shape and dtype of these."""
+    specs = {str(key): Unbounded(shape=e.shape, dtype=e.dtype, device=device) for key, e in entries.items()}
+    return Composite(specs, device=device)
+
+
 def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvBase) -> Tensor:
-    """Read and check an entry of a step's input.
-
-    Args:
-        tensordict: the step's input, batch ``[*B]``.
-        key: name of the entry.
-        shape: its shape without the batch.
-        env: the environment, named in errors.
-
-    Returns:
-        ``[*B, *shape]``.
-
-    Raises:
-        KeyError: the entry is missing.
-        ValueError: the entry has another shape.
-    """
+    """Return an entry ``[*B, *shape]`` of an input ``[*B]``; KeyError if missing, ValueError for another shape."""
     value = tensordict.get(key, None)
     if value is None:
         raise KeyError(f"{env} needs an entry {key!r} in its input; reset() writes the state, a policy the action")
-    if value.shape != (*tensordict.shape, *shape):
-        expected = [*tensordict.shape, *shape]
-        raise ValueError(f"{env}: {key!r} must be {expected}, got {list(value.shape)}")
+    if value.shape != (expected := (*tensordict.shape, *shape)):
+        raise ValueError(f"{env}: {key!r} must be {list(expected)}, got {list(value.shape)}")
     return value
 
 
 def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
-    """Reward function on the environment's device; a copy if it is on another device.
-
-    Raises:
-        ValueError: the reward reads the bodies of another scene.
-    """
+    """Return the reward on the environment's device, copied if need be; raise ValueError if it is of another scene."""
     if not isinstance(reward, nn.Module):
         return reward
     for each in reward.modules():
@@ -96,11 +73,7 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
 
 
 def finite_reward(value: float) -> float:
-    """Check the reward of an unstable step.
-
-    Raises:
-        ValueError: ``value`` is not finite, which would spoil returns and averages.
-    """
+    """Return the reward of an unstable step; raise ValueError if it is not finite, which would spoil averages."""
     if not math.isfinite(value):
         raise ValueError(f"unstable_reward must be finite, got {value}; give a large negative number")
     return float(value)
@@ -109,11 +82,7 @@ def finite_reward(value: float) -> float:
 def step_reward(
     reward: RewardFunction | None, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None
 ) -> Tensor:
-    """Reward ``[*B, 1]`` of a step in float32, zero without a reward function.
-
-    Raises:
-        ValueError: the reward function returned another shape.
-    """
+    """Return a step's reward ``[*B, 1]`` in float32, zero without a function; raise ValueError for another shape."""
     shape = (*next_state.shape[:-2], 1)
     if reward is None:
         return next_state.new_zeros(shape, dtype=torch.float32)
@@ -121,3 +90,13 @@ def step_reward(
     if value.shape != shape:
         raise ValueError(f"the reward must be {list(shape)}, {reward} returned {list(value.shape)}")
     return value.to(torch.float32)
+
+
+def outcome(
+    env: Any, tensordict: TensorDictBase, state: Tensor, action: Tensor, next_state: Tensor, stable: Tensor
+) -> dict[str, Tensor]:
+    """Entries that a step writes; where it is not ``stable`` ``[*B, 1]``, the last state and ``unstable_reward``."""
+    next_state = torch.where(stable.unsqueeze(-1), next_state, state)
+    reward = step_reward(env.reward, state, action, next_state, tensordict.get("task", None))
+    reward = torch.where(stable, reward, env.unstable_reward)
+    return {"state": next_state, "reward": reward, "done": ~stable, "terminated": ~stable}

@@ -1,4 +1,4 @@
-"""Start states of episodes."""
+"""Start states of episodes, and of batches of environments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import cast
 
 import numpy as np
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import BatchSizeTransform, EnvBase, TransformedEnv
 
 from torchrl_gn.data.controls import numpy_generator
 from torchrl_gn.data.simulate import Simulator
@@ -19,16 +21,10 @@ StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndar
 
 
 class StartSampler:
-    """Draw start states of a scene, reproducibly.
+    """Draw start states of a scene (the first of its variants) or of a robot known by its joints, reproducibly.
 
-    Args:
-        scene: the scene, or the first of its variants; or a robot known by its joints alone.
-        start_states: ``[M, S]`` full MuJoCo states, drawn uniformly, or a function ``(n, generator) -> [n, S]``.
-            Default: the system's reset distribution. A robot of joints needs node states, ``[M, N, C]``.
-        seed: seed of the draws. Default: drawn from torch's global generator.
-
-    Raises:
-        ValueError: the start states are not ``[M, S]`` finite numbers, or a robot of joints has none.
+    ``start_states`` are ``[M, S]`` full MuJoCo states, drawn uniformly, or a function ``(n, generator) -> [n, S]``;
+    by default those of the system. A robot of joints needs node states ``[M, N, C]``. Others raise ValueError.
     """
 
     def __init__(
@@ -62,17 +58,12 @@ class StartSampler:
         *,
         simulator: Simulator | None,
     ) -> Tensor:
-        """Start states for a batch.
+        """Return start states ``[*B, S]`` (robot of joints: ``[*B, N, C]``), float64, on the CPU, for a batch shape.
 
         Args:
-            shape: the batch ``*B``.
-            reset: ``[*B]`` or ``[*B, 1]`` bool, samples to reset (default all). The others get a copy of one of
-                these, which TorchRL overwrites.
+            reset: ``[*B]`` or ``[*B, 1]`` bool, samples to draw for (default all); the others get a copy of one.
             variant: ``[*B, 1]`` index of each sample's variant, if there are several.
-            simulator: simulator of the scene or its variants; None for a robot of joints.
-
-        Returns:
-            ``[*B, S]`` float64 full MuJoCo states, or ``[*B, N, C]``, on the CPU.
+            simulator: of the scene or its variants; None for a robot of joints.
         """
         size = shape.numel()
         mask = np.ones(size, dtype=bool) if reset is None else reset.reshape(size).cpu().numpy()
@@ -107,3 +98,30 @@ class StartSampler:
             bad = int(np.flatnonzero(~finite)[0])
             raise ValueError(f"start state {bad} of {self.scene.name!r} is not finite")
         return states
+
+
+class _Starts:
+    """Reset every sample of a batch to its own start state: ``BatchSizeTransform`` alone repeats one."""
+
+    def __init__(self, env: EnvBase, batch_size: torch.Size) -> None:
+        self.env, self.batch_size = env, batch_size
+
+    def __call__(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if tensordict_reset.shape == self.batch_size:
+            return tensordict_reset
+        return self.env.reset(TensorDict(batch_size=self.batch_size))
+
+
+def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
+    """Fix the number of environments ``batch_size`` of a stateless one, each with its own start state.
+
+    Example:
+        >>> from torchrl_gn.envs import SceneEnv
+        >>> from torchrl_gn.scenes import load_scene
+        >>> batched(SceneEnv(load_scene("pendulum"), seed=0), 4).rollout(5)["state"].shape
+        torch.Size([4, 5, 2, 13])
+    """
+    size = torch.Size(batch_size)
+    if not size or min(size) < 1:
+        raise ValueError(f"batch_size must be numbers of at least 1, got {list(size)}")
+    return TransformedEnv(env, BatchSizeTransform(batch_size=size, reset_func=_Starts(env, size)))

@@ -33,23 +33,16 @@ def suite_env(
     keys: Sequence[str] | None = None,
     seed: int = 0,
 ) -> EnvBase:
-    """A suite task with its observation in one entry ``observation`` ``[num_envs, O]`` float32.
-
-    Physics, observation, reward and termination are the suite's, through TorchRL's ``DMControlWrapper``; environments
-    are stepped in turn in this process.
+    """Make a task of the suite, whose observation is one entry ``observation`` ``[num_envs, O]`` float32.
 
     Args:
-        domain: domain of the suite, for example ``"swimmer"``.
-        task: task of the domain, for example ``"swimmer6"``; swimmers may have any number of links from 3.
-        num_envs: number of environments.
-        timestep: control step, seconds, a multiple of the physics step; default: the suite's.
+        domain: for example ``"swimmer"``.
+        task: for example ``"swimmer6"``; swimmers may have any number of links from 3.
+        num_envs: number of environments, stepped in turn in this process.
+        timestep: control step, seconds, a multiple of the physics step. Default: the suite's.
         steps: control steps of an episode; None: the suite's time limit.
-        keys: the suite's entries to concatenate, in order; default: all, in the suite's order.
-        seed: seed of start states and targets; each environment derives its own.
-
-    Raises:
-        ValueError: there is no such task, the control step does not fit, or a number is not positive.
-        ImportError: dm_control is not installed.
+        keys: the suite's entries to concatenate, in order. Default: all.
+        seed: of start states and targets; each environment derives its own.
 
     Example:
         >>> suite_env("swimmer", "swimmer6", num_envs=2, timestep=0.02).reset()["observation"].shape
@@ -71,11 +64,9 @@ def suite_env(
 
 
 def observation_env(graph: ObservationGraph, domain: str, task: str, **options) -> EnvBase:
-    """The task that an observation graph describes, with the options of :func:`suite_env`.
+    """Make the task that an observation graph describes, with the options of :func:`suite_env`.
 
-    Raises:
-        ValueError: the task's observation or action differs from the graph's, or actions are not bounded by -1 and 1
-            (as those of quadruped and lqr).
+    Raises ValueError if its observation or actions differ from the graph's, or actions are not within -1 and 1.
     """
     loaded = _load(domain, task, 0)
     low, high = loaded.action_spec().minimum, loaded.action_spec().maximum
@@ -93,7 +84,7 @@ def observation_env(graph: ObservationGraph, domain: str, task: str, **options) 
 
 @cache
 def _suite() -> tuple[Any, Any, Any]:
-    """The suite, its swimmers and its environments, imported on demand without looking for a display."""
+    """Import the suite, its swimmers and its environments without looking for a display."""
     before = os.environ.get("MUJOCO_GL")
     os.environ.setdefault("MUJOCO_GL", "off")
     try:

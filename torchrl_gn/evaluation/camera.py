@@ -15,19 +15,12 @@ _AZIMUTH, _ELEVATION = np.radians(-55.0), np.radians(18.0)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A parallel projection.
+    """A parallel projection."""
 
-    Attributes:
-        right: ``[3]`` unit vector that points right in the picture.
-        up: ``[3]`` unit vector that points up.
-        toward: ``[3]`` unit vector towards the viewer.
-        planar: whether everything moves in the plane of the picture.
-    """
-
-    right: np.ndarray
-    up: np.ndarray
-    toward: np.ndarray
-    planar: bool
+    right: np.ndarray  # [3] unit vector that points right in the picture
+    up: np.ndarray  # [3] up
+    toward: np.ndarray  # [3] towards the viewer
+    planar: bool  # whether everything moves in the plane of the picture
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """World points ``[..., 3]`` to picture coordinates ``[..., 2]``, metres."""
@@ -35,10 +28,7 @@ class View:
 
 
 def choose_view(scene: Scene) -> View:
-    """View straight at the plane of motion; oblique from above if the motion is spatial.
-
-    A scene is planar if no node moves along some axis or rotates about the other two.
-    """
+    """View straight at the plane of motion, if no node leaves it; oblique from above if the motion is spatial."""
     movable = np.asarray(scene.movable.any(axis=0))
     x, y, z = np.eye(3)
     # From above for z; from the front, with z up, for the others.
@@ -53,11 +43,9 @@ def choose_view(scene: Scene) -> View:
 
 
 def follow(scene: Scene, states: np.ndarray) -> np.ndarray:
-    """Point ``[T, 3]`` that the camera follows: mean of the moving nodes, along translation-invariant axes only.
+    """Point ``[T, 3]`` that the camera follows for states ``[T, N, 13]``.
 
-    Args:
-        scene: the scene.
-        states: ``[T, N, 13]`` true states.
+    Mean of the moving nodes, along translation-invariant axes only.
     """
     center = states[:, scene.predicted, :3].mean(axis=1)
     return np.where(scene.translation_invariant, center, 0.0)

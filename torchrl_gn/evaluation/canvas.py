@@ -23,11 +23,7 @@ PAPER = "#fbfbfc"
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """Empty figure of a size in inches.
-
-    Raises:
-        ImportError: if matplotlib is not installed.
-    """
+    """Empty figure of a size in inches; ImportError if matplotlib is not installed."""
     # Here, not at the top: training imports this package and needs no matplotlib.
     try:
         from matplotlib.figure import Figure
@@ -47,10 +43,8 @@ def clean(axes: Axes) -> None:
     axes.grid(color=GRID, linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8, color=MUTED)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(MUTED)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(MUTED)
 
 
 def save(figure: Figure, path: str | os.PathLike) -> Path:

@@ -23,30 +23,19 @@ _SMOOTH = 2  # antialiasing: panels are drawn this much larger, then reduced
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Outlines of one state sequence, in metres of the picture plane.
+    """Outlines of one state sequence, in metres of the picture plane."""
 
-    Attributes:
-        outlines: for each shape ``[T, K, 2]``.
-        order: ``[T, shapes]`` drawing order, far shapes first.
-        shadows: for each shape ``[T, K, 2]`` on the floor; empty without a visible floor.
-        joints: ``[T, J, 2]`` joint anchors.
-        valid: ``[T]`` whether the state is finite.
-    """
-
-    outlines: list[np.ndarray]
-    order: np.ndarray
-    shadows: list[np.ndarray]
-    joints: np.ndarray
-    valid: np.ndarray
+    outlines: list[np.ndarray]  # [T, K, 2] of each shape
+    order: np.ndarray  # [T, shapes] drawing order, far shapes first
+    shadows: list[np.ndarray]  # [T, K, 2] on the floor, of each shape; empty without a visible floor
+    joints: np.ndarray  # [T, J, 2] joint anchors
+    valid: np.ndarray  # [T] whether the state is finite
 
 
 class SceneDrawing:
     """Draws panels of one scene with one camera, framed for a true state sequence.
 
-    Args:
-        scene: the scene.
-        truth: ``[T, N, 13]`` true states. They alone set the camera, so that a drifting prediction is seen to drift.
-        size: width and height of a panel, pixels.
+    ``truth`` ``[T, N, 13]`` alone sets the camera, so that a prediction's drift shows. ``size`` is in pixels.
     """
 
     def __init__(self, scene: Scene, truth: np.ndarray, size: int) -> None:
@@ -57,11 +46,11 @@ class SceneDrawing:
         self._floor = self._find_floor(truth)
         self._follow = self.view.project(follow(scene, truth))
         self.truth = self.motion(truth)
-        parts = [o for o, moves in zip(self.truth.outlines, self._moving, strict=True) if moves]
-        if not parts:  # no visible moving geoms: frame the nodes
-            parts = [self.view.project(truth[:, :, :3])]
-        seen = np.concatenate(parts, axis=1) - self._follow[:, None]
-        low, high = seen.min(axis=(0, 1)), seen.max(axis=(0, 1))
+        moving = [o for o, moves in zip(self.truth.outlines, self._moving, strict=True) if moves]
+        if not moving:  # no visible moving geoms: frame the nodes
+            moving = [self.view.project(truth[:, :, :3])]
+        points = np.concatenate(moving, axis=1) - self._follow[:, None]
+        low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
         self._middle = (low + high) / 2
         self.extent = float(max((high - low).max(), 1e-6) * 1.16)
         if self.view.planar and self.view.up[2] and self._floor is not None:
@@ -72,10 +61,10 @@ class SceneDrawing:
         if self.geometry.floor is not None or self.view.planar:
             return self.geometry.floor
         positions, rotations = self.geometry.poses(truth[:1])
-        fixed = [shape for shape, still in zip(self.geometry.shapes, self.geometry.fixed, strict=True) if still]
         lowest = [
             (positions[0, shape.geom, 2] + shape.points @ rotations[0, shape.geom, 2]).min() - shape.radius
-            for shape in fixed
+            for shape, fixed in zip(self.geometry.shapes, self.geometry.fixed, strict=True)
+            if fixed
         ]
         return float(min(lowest)) if lowest else None
 
@@ -107,11 +96,14 @@ class SceneDrawing:
                     self._polygon(draw, step, shadow[step], _mix(MUTED, PAPER, 0.62), None)
         self._shapes(draw, step, self.truth, None)
         if ghost:
-            pale = _mix(TRUTH, PAPER, 0.72)
-            self._shapes(draw, step, self.truth, pale, edge=_mix(TRUTH, PAPER, 0.5))
+            self._shapes(draw, step, self.truth, _mix(TRUTH, PAPER, 0.72), edge=_mix(TRUTH, PAPER, 0.5))
         if motion.valid[step]:
             self._shapes(draw, step, motion, color)
-            self._joint_dots(draw, step, motion)
+            radius = self.size * _SMOOTH / 180
+            # Bodies hide most joints of a spatial scene.
+            for x, y in self._pixels(step, motion.joints[step]).tolist() if self.view.planar else ():
+                if abs(x) + abs(y) < 20 * self.size * _SMOOTH:
+                    draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="white", outline=INK)
         else:
             middle = self.size * _SMOOTH / 2
             font = ImageFont.load_default(18 * _SMOOTH)
@@ -147,30 +139,18 @@ class SceneDrawing:
                 fill, rim = _mix(color, "#ffffff", 0.12 + 0.2 * (node % 2)), _mix(color, "#000000", 0.35)
             self._polygon(draw, step, motion.outlines[index][step], fill, rim, width=round(1.2 * _SMOOTH))
 
-    def _joint_dots(self, draw: ImageDraw.ImageDraw, step: int, motion: Motion) -> None:
-        if not self.view.planar:
-            return  # bodies hide most joints of a spatial scene
-        radius = self.size * _SMOOTH / 180
-        for x, y in self._pixels(step, motion.joints[step]).tolist():
-            if abs(x) + abs(y) < 20 * self.size * _SMOOTH:
-                draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="white", outline=INK)
-
     def _ground(self, draw: ImageDraw.ImageDraw, step: int) -> None:
         spacing = _nice(self.extent / 4)
         center = self._follow[step] + self._middle
         low, high = center - self.extent / 2, center + self.extent / 2
-        side, line = self.size * _SMOOTH, _SMOOTH
-        grid = GRID
-        if self.view.planar and self.view.up[2] == 0:  # from above: a grid that stays where it is
-            for axis in range(2):
+        side, line, grid = self.size * _SMOOTH, _SMOOTH, GRID
+        if self.view.planar:  # a grid that stays where it is; from the side its vertical lines, and the floor
+            above = self.view.up[2] == 0
+            for axis in range(2 if above else 1):
                 for value in _ticks(low[axis], high[axis], spacing):
                     at = self._pixels(step, np.full(2, value))[axis]
                     draw.line((at, 0, at, side) if axis == 0 else (0, at, side, at), fill=grid, width=line)
-        elif self.view.planar:  # from the side: the floor, with marks that stay where they are
-            for value in _ticks(low[0], high[0], spacing):
-                at = self._pixels(step, np.full(2, value))[0]
-                draw.line((at, 0, at, side), fill=grid, width=line)
-            if self._floor is not None:
+            if self._floor is not None and not above:
                 at = self._pixels(step, np.array([0.0, self._floor]))[1]
                 if at < side:
                     draw.rectangle((0, at, side, side), fill=_mix(MUTED, PAPER, 0.75))

@@ -14,14 +14,10 @@ if TYPE_CHECKING:
 
 
 def kinetic_energy(state: Tensor, scene: Scene) -> Tensor:
-    """Kinetic energy of all moving bodies, without joint armature.
+    """Kinetic energy ``[...]``, joules, of all moving bodies, without joint armature.
 
     Args:
         state: ``[..., N, 13]``.
-        scene: whose state it is.
-
-    Returns:
-        ``[...]`` joules.
     """
     columns = {
         name: torch.as_tensor(column)

@@ -11,28 +11,15 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PredictionError:
-    """One error (one-step, or rollout over a horizon) and what it is made of.
-
-    Attributes:
-        name: for example ``"rollout_error_100"``.
-        components: squared error of each component relative to the persistence baseline,
-            1 for a model that predicts no change; infinite if a prediction diverged.
-        squared: mean squared error of each component, left-out ones included: m^2,
-            rad^2, (m/s)^2, (rad/s)^2.
-        baselines: the same of predicting the initial state unchanged.
-        left_out: components without a relative error because the truth never moves there.
-        sequences: number of sequences that the means are taken over.
-        diverged: number of them in which the model predicted something that is not a state, or is absurdly
-            far out of the range of its training.
-    """
+    """One error (one-step, or rollout over a horizon) and its components."""
 
     name: str
-    components: dict[str, float]
-    squared: dict[str, float]
-    baselines: dict[str, float]
-    left_out: tuple[str, ...]
+    components: dict[str, float]  # relative to the persistence baseline; infinite if a prediction diverged
+    squared: dict[str, float]  # mean squared errors: m^2, rad^2, (m/s)^2, (rad/s)^2
+    baselines: dict[str, float]  # those of predicting the initial state unchanged
+    left_out: tuple[str, ...]  # components that never move in the truth
     sequences: int
-    diverged: int
+    diverged: int  # sequences whose prediction is no state or far out of the range of the training
 
     @property
     def total(self) -> float:
@@ -42,16 +29,10 @@ class PredictionError:
 
 @dataclass(frozen=True, eq=False)
 class ErrorTable:
-    """Prediction errors of one model on one test set (paper, "Prediction performance evaluation").
-
-    Attributes:
-        errors: by name, ``"one_step_error"`` first, then ``"rollout_error_<horizon>"``.
-        rollouts: ``[keep, H + 1, N, 13]`` predicted states of the first ``keep`` sequences
-            over the longest horizon, NaN from where one diverged.
-    """
+    """Prediction errors of one model on one test set (paper, "Prediction performance evaluation")."""
 
     errors: dict[str, PredictionError]
-    rollouts: Tensor
+    rollouts: Tensor  # [keep, H + 1, N, 13] first predicted sequences, NaN from where one diverged
 
     def __getitem__(self, name: str) -> PredictionError:
         return self.errors[name]
@@ -59,9 +40,8 @@ class ErrorTable:
     def to_metrics(self) -> dict[str, float]:
         """Flat names and plain numbers, ready for a logger or a JSON file.
 
-        For every error ``E``: ``E`` (total), ``E/<component>``, ``E/baseline/<component>`` (mean
-        square of the persistence baseline), ``E/diverged`` (sequences), and
-        ``E/left_out/<component>`` = 1 in place of ``E/<component>`` for a component that is left out.
+        For every error ``E``: ``E`` (total), ``E/<component>`` or, if left out, ``E/left_out/<component>`` = 1,
+        ``E/baseline/<component>`` (mean square of the persistence baseline), and ``E/diverged`` (sequences).
         """
         metrics: dict[str, float] = {}
         for name, error in self.errors.items():
@@ -74,9 +54,7 @@ class ErrorTable:
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table's cells as text: a row of titles, the total, every component, the baseline."""
-        titles = (name.replace("_error", "").replace("_", " ") for name in self.errors)
-        rows = [("relative squared error", *titles)]
-        rows.append(("total", *(_number(error.total) for error in self.errors.values())))
+        rows = [_titles(self), ("total", *(_number(error.total) for error in self.errors.values()))]
         for component in next(iter(self.errors.values())).baselines:
             values = (
                 "left out" if component in error.left_out else _number(error.components[component])
@@ -87,8 +65,10 @@ class ErrorTable:
         return rows
 
     def to_table(self) -> str:
-        """Errors relative to the persistence baseline as lines of text, one column an error."""
+        """Errors relative to the persistence baseline as lines of text, one column per error."""
         return "\n".join([*_aligned(self.rows()), *self._divergences()])
+
+    __str__ = to_table
 
     def _divergences(self) -> list[str]:
         return [
@@ -97,23 +77,19 @@ class ErrorTable:
             if error.diverged
         ]
 
-    def __str__(self) -> str:
-        return self.to_table()
-
 
 def summary(tables: Mapping[str, ErrorTable]) -> str:
-    """Total errors of several tables as lines of text, one row a table.
-
-    Args:
-        tables: by label, with the same errors.
-    """
+    """Total errors of several tables (by label, with the same errors) as lines of text, one row per table."""
     first = next(iter(tables.values()))
-    titles = (name.replace("_error", "").replace("_", " ") for name in first.errors)
-    rows = [("relative squared error", *titles)]
+    rows = [_titles(first)]
     rows += [(label, *(_number(table[name].total) for name in first.errors)) for label, table in tables.items()]
     rows.append(("persistence baseline", *(_number(1.0) for _ in first.errors)))
     notes = [f"{label}, {line}" for label, table in tables.items() for line in table._divergences()]
     return "\n".join([*_aligned(rows), *notes])
+
+
+def _titles(table: ErrorTable) -> tuple[str, ...]:
+    return "relative squared error", *(name.replace("_error", "").replace("_", " ") for name in table.errors)
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:

@@ -1,11 +1,4 @@
-"""One-step and rollout errors relative to the persistence baseline.
-
-Paper, "Prediction performance evaluation": squared errors of position,
-orientation, linear and angular velocity, each divided by that of predicting no
-change, then averaged together. Here each component is a ratio of means over
-predicted nodes, steps and sequences; the orientation error is the squared angle
-of the rotation between prediction and truth.
-"""
+"""One-step and rollout errors relative to the persistence baseline (paper, "Prediction performance evaluation")."""
 
 from __future__ import annotations
 
@@ -37,17 +30,12 @@ HORIZONS = (20, 100)
 
 
 def squared_errors(prediction: Tensor, truth: Tensor, layout: StateLayout = BODY_STATE) -> Tensor:
-    """Squared error of every component of a state, in float64.
+    """Squared error ``[..., C]`` of every component of a state, in float64: m^2, rad^2, (m/s)^2, (rad/s)^2.
 
     Args:
-        prediction: ``[..., 13]`` states; quaternions need not have unit norm, and
-            ``q`` equals ``-q``.
-        truth: ``[..., 13]`` states.
-        layout: what the channels mean; the default is the state of a body.
-
-    Returns:
-        ``[..., C]`` squared distances (m^2, (m/s)^2, (rad/s)^2) and squared angles (rad^2),
-        in the order of ``layout.components``.
+        prediction: ``[..., 13]``; quaternions need not have unit norm, and ``q`` equals ``-q``.
+        truth: ``[..., 13]``.
+        layout: meaning of the channels. Default: the state of a body.
     """
     prediction, truth = prediction.double(), truth.double()
     errors = []
@@ -76,40 +64,26 @@ def evaluate_errors(
     scene: Scene | None = None,
     device: torch.device | str | None = None,
 ) -> ErrorTable:
-    """Errors of a model on test trajectories.
+    """Evaluate a model on test trajectories, in batches, in evaluation mode, without gradients.
 
-    ``one_step_error`` is over every step of every sequence, against each step's own
-    input state unchanged; ``rollout_error_<H>`` over steps 1 to ``H`` of rollouts from
-    state 0, against state 0 unchanged. Runs in batches, in evaluation mode, without
-    gradients; sums are float64 and memory does not grow with the number of sequences.
-
-    A component that never moves in the truth (Pendulum's position) is left out and
-    named. A sequence diverges where the model predicts something that is not a state
-    (NaN, infinity, a zero quaternion, or errors too large to square), and in a rollout also where the
-    state is absurdly far out of the range of the training (:func:`~torchrl_gn.evaluation.guarded_rollout`).
-    From there on its error counts as infinite, and so does the mean over sequences: no number would be the
-    model's, and leaving the sequence out would flatter it. It is counted, and no more time is spent on it.
+    ``one_step_error`` is over every step, relative to its input state unchanged; ``rollout_error_<H>`` over steps 1 to
+    ``H`` of rollouts from state 0, relative to state 0 unchanged. Each component is a ratio of means over predicted
+    nodes, steps and sequences; the total is their mean. A component that never moves in the truth is left out. If a
+    prediction diverges (:func:`~torchrl_gn.evaluation.guarded_rollout`), its error is infinite, and so is the mean.
 
     Args:
         model: reads state and action at its first two ``in_keys``, writes the next state at its first ``out_keys``.
         trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]``, ``"action"`` ``[M, T, A]`` and, if
             the model reads them, physical parameters ``[M]`` at its ``parameters_key``; may be memory-mapped.
         horizons: lengths of the rollouts to measure, at most ``T``.
-        one_step: whether to measure the one-step error, which takes a prediction of every step.
         burn_in: steps at the start of every trajectory that are not evaluated; a recurrent model's hidden state runs
             through them.
-        batch_size: number of states that the model gets in one call.
         keep: number of predicted rollouts to return in the table.
-        scene: which nodes count and which components are movable; default ``model.scene``.
-        device: where to run; default where the model is.
-
-    Returns:
-        Table with ``"one_step_error"``, if asked for, and one ``"rollout_error_<H>"`` for each horizon.
+        scene: which nodes count and which components are movable. Default: ``model.scene``.
 
     Raises:
-        KeyError: if the model reads physical parameters that the trajectories lack.
-        ValueError: if shapes do not fit, trajectories are too short, empty, of another scene than the model's or
-            contain values that are not finite, or nothing moves in them.
+        ValueError: shapes do not fit, trajectories are too short, empty, of another scene or not finite, or nothing
+            moves in them.
     """
     if scene is None:
         scene = cast("Scene", model.scene)
@@ -122,11 +96,9 @@ def evaluate_errors(
         raise ValueError(f"burn_in={burn_in} must not be negative.")
     _check(states, actions, [burn_in + horizon for horizon in horizons], batch_size, scene, layout)
     steps, horizon = actions.shape[1] - burn_in, max(horizons, default=0)
-    if device is None:
-        device = next(itertools.chain(model.parameters(), model.buffers()), states).device
+    device = device or next(itertools.chain(model.parameters(), model.buffers()), states).device
     predicted = torch.as_tensor(scene.predicted, device=device)
-    single = _Sums(1, layout, predicted)
-    rollouts = _Sums(horizon, layout, predicted)
+    single, rollouts = _Sums(1, layout, predicted), _Sums(horizon, layout, predicted)
     predictor = as_predictor(model)
     parameters = predictor.parameters_in(trajectories)
     if parameters is not None:
@@ -148,14 +120,12 @@ def evaluate_errors(
             guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own, hidden_state=hidden_state)
             kept.append(_add_rollouts(guarded, state, rollouts, wanted))
 
-    fixed = _fixed_components(scene, layout)
-    errors = {}
-    if one_step:
-        errors["one_step_error"] = single.error("one_step_error", 1, len(states), steps, fixed)
-    for length in horizons:
-        name = f"rollout_error_{length}"
-        errors[name] = rollouts.error(name, length, len(states), length, fixed)
-    return ErrorTable(errors, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])))
+    movable = scene.movable[scene.predicted]
+    fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
+    errors = [single.error("one_step_error", 1, len(states), steps, fixed)] if one_step else []
+    errors += [rollouts.error(f"rollout_error_{h}", h, len(states), h, fixed) for h in horizons]
+    table = {error.name: error for error in errors}
+    return ErrorTable(table, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])))
 
 
 class _Sums:
@@ -225,12 +195,11 @@ def _batches(
         state = torch.as_tensor(states[rows]).to(device)
         action = torch.as_tensor(actions[rows]).to(state.device)
         own = None if parameters is None else parameters[rows].to(state.device)
-        checks = {
-            "states that are not finite": state.isfinite(),
-            "states with a zero quaternion": ~_without_angle(state, layout),
-            "actions that are not finite": action.isfinite(),
-        }
-        for what, good in checks.items():
+        for what, good in (
+            ("states that are not finite", state.isfinite()),
+            ("states with a zero quaternion", ~_without_angle(state, layout)),
+            ("actions that are not finite", action.isfinite()),
+        ):
             if not bool(good.all()):
                 bad = start + int((~good.flatten(1).all(1)).nonzero()[0])
                 raise ValueError(f"Trajectory {bad} contains {what}.")
@@ -239,13 +208,8 @@ def _batches(
 
 def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:
     """``[..., N]``: nodes of ``[..., N, 13]`` that have a zero quaternion (or ``cos = sin = 0``)."""
-    turning = [layout.slices[component.name] for component in layout.components if component.kind != "add"]
-    return torch.stack([(state[..., where] == 0).all(-1) for where in turning]).any(0)
-
-
-def _fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
-    movable = scene.movable[scene.predicted]
-    return {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
+    angular = [layout.slices[component.name] for component in layout.components if component.kind != "add"]
+    return torch.stack([(state[..., where] == 0).all(-1) for where in angular]).any(0)
 
 
 def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Scene, layout: StateLayout) -> None:

@@ -1,7 +1,4 @@
-"""Figures of numbers: errors, training, run time.
-
-Each writes one file, in the format of the path's suffix, and returns the written path.
-"""
+"""Figures of numbers: errors, training, run time. Each writes one file, whose suffix sets the format."""
 
 from __future__ import annotations
 
@@ -26,17 +23,11 @@ _CURVES = (6.4, 3.8)  # inches of a figure of curves
 
 
 def plot_loglog(
-    panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]],
-    path: str | os.PathLike,
-    *,
-    ylabel: str,
+    panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]], path: str | os.PathLike, *, ylabel: str
 ) -> Path:
     """Lines on logarithmic axes, panels side by side.
 
-    Args:
-        panels: ``(x, y)`` by label, by the name of the panel's horizontal axis.
-        path: file to write.
-        ylabel: name of the vertical axis.
+    ``panels`` holds ``(x, y)`` by label, by the name of the panel's horizontal axis.
     """
     figure = new_figure((4.2 * len(panels) + 0.6, 3.8))
     for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
@@ -46,8 +37,7 @@ def plot_loglog(
         if all(float(value).is_integer() for value in counts) and len(counts) < 10:
             axes.set_xticks(counts, [f"{value:,.0f}" for value in counts])  # labels of powers of ten may overlap
             axes.set_xticks([], minor=True)
-        axes.set_xlabel(xlabel)
-        axes.set_ylabel(ylabel)
+        axes.set(xlabel=xlabel, ylabel=ylabel)
         axes.grid(alpha=0.25, which="both")
         axes.legend(frameon=False)
     return save(figure, path)
@@ -60,9 +50,7 @@ def plot_rewards(
 
     Args:
         rewards: ``[B, T]`` by label; NaN after the end of an episode.
-        path: file to write.
         timestep: seconds of a control step.
-        ylabel: name of the vertical axis.
     """
     figure = new_figure(_CURVES)
     axes = figure.subplots()
@@ -82,10 +70,8 @@ def plot_planning_curves(
 ) -> Path:
     """Rewards over planning time, on a logarithmic axis, with error bars.
 
-    Args:
-        curves: milliseconds of planning per control step, mean rewards and half-lengths of their error bars,
-            ``[N]`` each, by label.
-        path: file to write.
+    ``curves`` holds milliseconds of planning per control step, mean rewards and half-lengths of their error bars,
+    ``[N]`` each, by label.
     """
     figure = new_figure(_CURVES)
     axes = figure.subplots()
@@ -102,12 +88,7 @@ def plot_learning_curves(
 ) -> Path:
     """Returns over environment steps: median of the seeds, band of their quartiles (paper, "Learning curves").
 
-    Args:
-        curves: environment steps ``[T]`` and returns ``[S, T]`` of ``S`` seeds by label.
-        path: file to write.
-
-    Raises:
-        ValueError: if a seed does not have one return per entry of the steps.
+    ``curves`` holds environment steps ``[T]`` and returns ``[S, T]`` of ``S`` seeds by label.
     """
     figure = new_figure(_CURVES)
     axes = figure.subplots()
@@ -130,13 +111,8 @@ def plot_training_curve(
 ) -> Path:
     """Losses or validation errors over training time, on a logarithmic scale.
 
-    Args:
-        curves: ``(seconds, values)`` by label; values that are not positive and finite are skipped.
-        path: file to write.
-        ylabel: name of the vertical axis.
-
-    Raises:
-        ValueError: if a curve's times and values differ in number, or nothing can be drawn.
+    ``curves`` holds ``(seconds, values)`` by label; values that are not positive and finite are skipped. Raises
+    ValueError if nothing can be drawn.
     """
     kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for label, (seconds, values) in curves.items():
@@ -154,32 +130,23 @@ def plot_training_curve(
     figure = new_figure((7.0, 4.2))
     axes = figure.subplots()
     for number, (label, (x, y)) in enumerate(kept.items()):
-        marker = "o" if len(x) <= 60 else None
-        color = series_color(number)
-        axes.plot(x / scale, y, color=color, label=label, linewidth=1.6, marker=marker, markersize=3)
+        look = {"color": series_color(number), "marker": "o" if len(x) <= 60 else None}
+        axes.plot(x / scale, y, label=label, linewidth=1.6, markersize=3, **look)
     axes.set_yscale("log")
     _label(axes, f"training time [{unit}]", ylabel)
     return save(figure, path)
 
 
 def plot_errors(
-    tables: Mapping[str, ErrorTable],
-    path: str | os.PathLike,
-    *,
-    errors: Sequence[str] | None = None,
+    tables: Mapping[str, ErrorTable], path: str | os.PathLike, *, errors: Sequence[str] | None = None
 ) -> Path:
     """Bars of errors relative to the persistence baseline (paper, figure "One-step and rollout errors").
 
-    One panel per error, one bar per table, small marks for its components and a dashed line for the
-    persistence baseline. A diverged error is drawn to the top and labelled.
+    One panel per error, one bar per table, small marks for its components. A diverged error is drawn to the top.
 
     Args:
         tables: by label, for example the system's name.
-        path: file to write.
-        errors: names of the errors to show; default all of the first table.
-
-    Raises:
-        ValueError: if there is no table, or a table lacks a named error.
+        errors: names of the errors to show. Default: all of the first table.
     """
     if not tables:
         raise ValueError("plot_errors needs at least one table.")
@@ -225,16 +192,10 @@ def plot_bars(
     """Groups of bars on a logarithmic axis (paper, figure "One-step and rollout errors for different models").
 
     Each panel has a group per system, each group a bar per model, and a dashed line at 1, the persistence
-    baseline. Panels stand side by side while they fit, else one below the other. Heights that are not
-    finite are drawn to the top, hatched.
+    baseline. Heights that are not finite are drawn to the top, hatched.
 
     Args:
         panels: ``(height, half-range)`` by system, by model, by the panel's title; a missing system leaves a gap.
-        path: file to write.
-        ylabel: name of the vertical axis.
-
-    Raises:
-        ValueError: if there is nothing to draw.
     """
     models = list(dict.fromkeys(model for panel in panels.values() for model in panel))
     groups = list(dict.fromkeys(group for panel in panels.values() for bars in panel.values() for group in bars))
@@ -273,8 +234,7 @@ def _band(axes: Axes, x, low: np.ndarray, middle: np.ndarray, high: np.ndarray, 
 
 
 def _label(axes: Axes, xlabel: str, ylabel: str) -> None:
-    axes.set_xlabel(xlabel)
-    axes.set_ylabel(ylabel)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.legend(frameon=False, fontsize=9)
     clean(axes)
 
@@ -289,8 +249,6 @@ def _frame_bars(axes: Axes, title: str, groups: Collection[str], limits: tuple[f
     """Axes of bars with a dashed line at 1; more than ``horizontal`` group names are slanted."""
     axes.axhline(1.0, color=INK, linestyle="--", linewidth=1)
     axes.set_xticks(range(len(groups)), list(groups), rotation=30 if len(groups) > horizontal else 0, fontsize=9)
-    axes.set_xlim(-0.6, len(groups) - 0.4)
     axes.set_title(title, fontsize=10)
-    axes.set_yscale("log")
-    axes.set_ylim(*limits)
+    axes.set(xlim=(-0.6, len(groups) - 0.4), yscale="log", ylim=limits)
     clean(axes)

@@ -20,38 +20,15 @@ _Geom = mujoco.mjtGeom
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One visible geom: the convex hull of points, thickened by a radius.
+    """One visible geom: the convex hull of points, thickened by a radius."""
 
-    A sphere is one point, a capsule two; boxes, cylinders, ellipsoids and convex hulls of meshes have radius 0.
-
-    Attributes:
-        geom: MuJoCo id.
-        points: ``[P, 3]`` in the geom's frame, metres.
-        radius: metres.
-    """
-
-    geom: int
-    points: np.ndarray
-    radius: float
+    geom: int  # MuJoCo id
+    points: np.ndarray  # [P, 3] in the geom's frame, metres
+    radius: float  # metres
 
 
 class SceneGeometry:
-    """Shapes of a scene, fixed to its nodes.
-
-    Welded bodies are placed by fixed offsets in their node's frame, so predicted states are drawn as they are, even
-    with joints apart.
-
-    Args:
-        scene: the scene.
-
-    Attributes:
-        geom_node: ``[G]`` node that carries each geom.
-        shapes: the visible geoms, without planes and height fields.
-        joints: ``(node, [3] anchor in the node's frame)`` of hinges and balls of bodies that do not slide too (as
-            Cheetah's torso does).
-        floor: height of a horizontal floor plane, metres, or None.
-        fixed: which shapes belong to the world.
-    """
+    """Shapes of a scene, fixed to its nodes (welded bodies by fixed offsets), also where joints come apart."""
 
     def __init__(self, scene: Scene) -> None:
         model = scene.model
@@ -59,6 +36,7 @@ class SceneGeometry:
         mujoco.mj_kinematics(model, data)
         node_of_root = {int(body): node for node, body in enumerate(scene.body)}
         self._body_node = np.array([node_of_root[int(root)] for root in model.body_weldid])
+        # [G] node that carries each geom
         self.geom_node = self._body_node[model.geom_bodyid]
         # The offsets are the same in any configuration.
         roots = scene.body[self.geom_node]
@@ -68,6 +46,7 @@ class SceneGeometry:
         self.shapes = [
             shape for geom in range(model.ngeom) if _is_visible(model, geom) if (shape := _shape(model, geom))
         ]
+        # Whether each shape belongs to the world.
         self.fixed = [self.geom_node[shape.geom] == 0 for shape in self.shapes]
         self.joints = self._joints(model)
         planes = [g for g in range(model.ngeom) if model.geom_type[g] == _Geom.mjGEOM_PLANE]
@@ -75,8 +54,9 @@ class SceneGeometry:
         self.floor = float(levels[0]) if levels else None
 
     def _joints(self, model: mujoco.MjModel) -> list[tuple[int, np.ndarray]]:
-        turning = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
-        sliding = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if int(model.jnt_type[j]) not in turning}
+        """Node and ``[3]`` anchor in its frame of hinges and balls of bodies that do not slide too."""
+        rotating = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
+        sliding = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if int(model.jnt_type[j]) not in rotating}
         return [
             (int(self._body_node[body]), model.jnt_pos[joint].copy())
             for joint, body in enumerate(model.jnt_bodyid)
@@ -84,14 +64,7 @@ class SceneGeometry:
         ]
 
     def poses(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World poses of all geoms.
-
-        Args:
-            states: ``[T, N, 13]`` states of the nodes.
-
-        Returns:
-            positions ``[T, G, 3]`` and rotation matrices ``[T, G, 3, 3]``.
-        """
+        """Positions ``[T, G, 3]`` and rotations ``[T, G, 3, 3]`` of all geoms for node states ``[T, N, 13]``."""
         position, rotation = node_frames(states)
         position, rotation = position[:, self.geom_node], rotation[:, self.geom_node]
         return position + np.einsum("tgij,gj->tgi", rotation, self._pos), rotation @ self._mat

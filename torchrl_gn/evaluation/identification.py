@@ -33,17 +33,11 @@ def identification_errors(
 
     Args:
         model: forward model that reads what the inference model writes.
-        inference: inference model.
         observed: ``[M]`` with ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``: one trajectory of
             every system.
         trajectories: ``[M]`` test trajectories of the same systems in the same order.
-        steps: how many transitions to identify from; default: all.
+        steps: number of transitions to identify from. Default: all.
         wrong: give every system what was inferred of another (paper, figure "System identification performance").
-        horizons: steps of the rollout errors.
-        one_step: whether to measure the one-step error.
-
-    Raises:
-        ValueError: if there are not as many observed as test trajectories, or (``wrong``) only one.
     """
     if len(observed) != len(trajectories):
         raise ValueError(f"There are {len(observed)} observed and {len(trajectories)} test trajectories; give pairs.")
@@ -61,22 +55,14 @@ def identification_errors(
 
 
 def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
-    """How much of each target a linear map of the features tells, on samples that it was not fitted to.
+    """Coefficients of determination ``[P]`` of linear maps from features to targets, on samples not fitted to.
 
-    Ridge regression on standardised features and targets, for each target with the penalty whose leave-one-out
-    error is lowest: there may be more features than samples.
+    Ridge regression on standardised features, for each target with the penalty of lowest leave-one-out error.
 
     Args:
         features: ``[M, F]``.
         targets: ``[M, P]``.
-        train: number of samples to fit to; the rest are tested on.
-
-    Returns:
-        ``[P]`` coefficients of determination: 1 where the targets can be read off, 0 where no better than their
-        mean, below where worse.
-
-    Raises:
-        ValueError: if fewer than two samples are left to fit to or to test on.
+        train: number of samples to fit to; the rest are tested on. At least two each.
     """
     if train < 2 or len(features) - train < 2:
         raise ValueError(f"train={train} of {len(features)} samples leaves too few to fit to or to test on.")
@@ -88,15 +74,15 @@ def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
     center = targets[:train].mean(0)
     wanted = targets[:train] - center
     u, s, v = torch.linalg.svd(fitted, full_matrices=False)
-    told = u.T @ wanted
+    projected = u.T @ wanted
     best, record = torch.zeros_like(targets[train:]), torch.full_like(center, torch.inf)
     for penalty in _PENALTIES:
         gain = s / (s.square() + penalty * train)
         # The mean is fitted too: one over the number of samples of each one's influence on itself.
         influence = (u.square() * (s * gain)).sum(1, keepdim=True) + 1 / train
-        missed = wanted - u @ ((s * gain)[:, None] * told)
+        missed = wanted - u @ ((s * gain)[:, None] * projected)
         error = (missed / (1 - influence).clamp(min=1e-9)).square().sum(0)
-        predicted = tested @ (v.T @ (gain[:, None] * told))
+        predicted = tested @ (v.T @ (gain[:, None] * projected))
         best, record = torch.where(error < record, predicted, best), torch.minimum(error, record)
     left = targets[train:] - center - best
     return 1 - left.square().sum(0) / (targets[train:] - targets[train:].mean(0)).square().sum(0)

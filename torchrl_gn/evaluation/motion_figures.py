@@ -32,27 +32,15 @@ _PANELS = (
 
 
 def plot_body_trajectory(
-    truth: Tensor,
-    prediction: Tensor,
-    scene: Scene,
-    path: str | os.PathLike,
-    *,
-    node: int | str | None = None,
+    truth: Tensor, prediction: Tensor, scene: Scene, path: str | os.PathLike, *, node: int | str | None = None
 ) -> Path:
     """Predicted against true state of one body (paper, figure "Evaluation rollout in a Swimmer6").
-
-    Four panels: position, quaternion, linear and angular velocity. Quaternion signs are chosen so that the true
-    one is continuous and the predicted one close to it.
 
     Args:
         truth: ``[T + 1, N, 13]`` true states.
         prediction: ``[T + 1, N, 13]`` predicted states; values that are not finite leave gaps.
-        scene: whose states they are.
         path: file to write; its suffix (``.png``, ``.pdf``, ``.svg``) sets the format.
-        node: index or name of the body; default the middle moving one (link 3 of Swimmer6, as in the paper).
-
-    Raises:
-        ValueError: if the shapes differ or do not fit the scene, or it has no such node.
+        node: index or name of the body. Default: the middle moving one (link 3 of Swimmer6, as in the paper).
     """
     expected = (scene.num_nodes, BODY_STATE.size)
     if truth.ndim != 3 or truth.shape != prediction.shape or truth.shape[1:] != expected:
@@ -100,9 +88,7 @@ def plot_motions(
         panels: true states ``[S, T + 1, N, 13]`` and predicted states ``[S, H + 1, N, 13]`` of their last ``H + 1``
             steps, by title.
         scene: the scene of the states, or one of its variants.
-        path: file to write.
-        labels: names of the ``S`` systems.
-        node: index or name of the body; default the middle moving one.
+        node: index or name of the body. Default: the middle moving one.
     """
     index, where = _node_index(scene, node), BODY_STATE.slices["orientation"]
     figure = new_figure((4.6 * len(panels) + 0.4, 3.6))
@@ -117,7 +103,7 @@ def plot_motions(
             main, true = int(relative[:, 1:].square().sum(0).argmax()), np.zeros(0)
             for states, offset, look in ((truth, 0, _TRUE), (prediction, first, {**_PREDICTED, "label": label})):
                 rotated = _rotated(states[system, :, index, where], start, main)
-                if offset:  # count whole turns as the truth does where the prediction begins
+                if offset:  # count whole revolutions as the truth does where the prediction begins
                     rotated = rotated + 2 * np.pi * round((true[offset] - rotated[0]) / (2 * np.pi))
                 else:
                     true = rotated
@@ -132,7 +118,7 @@ def plot_motions(
 
 
 def _rotated(orientation: Tensor, start: Tensor, axis: int) -> np.ndarray:
-    """Angle ``[T]`` rotated about an axis of the body's frame since the start, whole turns counted."""
+    """Angle ``[T]`` rotated about an axis of the body's frame since the start, whole revolutions counted."""
     relative = quaternion.product(quaternion.conjugate(start), orientation)
     return np.unwrap(2 * torch.atan2(relative[:, 1 + axis], relative[:, 0]).detach().cpu().numpy())
 
@@ -150,17 +136,20 @@ def plot_joints(
     Args:
         truth: ``[T + 1, N, 3 + extras]`` states of a robot of joints.
         predictions: states of the last ``H + 1`` steps by the model's name.
-        scene: the robot.
-        path: file to write.
-        joints: joints to show; default: the first four.
+        joints: joints to show. Default: the first four.
     """
     joints = list(range(min(4, scene.num_joints))) if joints is None else list(joints)
+
+    def angles(states: Tensor) -> np.ndarray:
+        return np.unwrap(torch.atan2(states[:, 1], states[:, 0]).detach().cpu().numpy())
+
     figure = new_figure((2.9 * len(joints) + 0.8, 4.8))
     grid = figure.subplots(2, len(joints), squeeze=False, sharex=True)
     colors = (PREDICTION, *AXES)
     for column, joint in enumerate(joints):
-        for row, read in enumerate((_angles, _velocities)):
-            axes = grid[row, column]
+        for axes, read in zip(
+            grid[:, column], (angles, lambda states: states[:, 2].detach().cpu().numpy()), strict=True
+        ):
             true = read(truth[:, joint + 1])
             axes.plot(np.arange(len(true)) * scene.timestep, true, **_MEASURED)
             for number, (name, states) in enumerate(predictions.items()):
@@ -177,14 +166,6 @@ def plot_joints(
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return save(figure, path)
-
-
-def _angles(states: Tensor) -> np.ndarray:
-    return np.unwrap(torch.atan2(states[:, 1], states[:, 0]).detach().cpu().numpy())
-
-
-def _velocities(states: Tensor) -> np.ndarray:
-    return states[:, 2].detach().cpu().numpy()
 
 
 def _node_index(scene: Scene, node: int | str | None) -> int:

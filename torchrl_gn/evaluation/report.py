@@ -29,19 +29,15 @@ def report(
     horizons: tuple[int, ...] = HORIZONS,
     scene: Scene | None = None,
 ) -> tuple[ErrorTable, list[Path]]:
-    """Evaluate a model on test trajectories and draw the first of them.
+    """Evaluate a model, bound to the scene of the trajectories, and draw the first of them.
 
     Args:
-        model: the model, bound to the scene of the trajectories.
-        trajectories: ``[M]`` test trajectories, ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``, and
-            physical parameters at the model's ``parameters_key`` if it has one.
-        folder: where the files go.
-        horizons: steps of the rollout errors.
+        trajectories: ``[M]`` with ``state`` ``[M, T + 1, N, 13]``, ``action`` ``[M, T, A]`` and physical parameters at
+            the model's ``parameters_key`` if it has one.
         scene: scene of the first trajectory, if that is a variant of the model's.
 
     Returns:
-        The error table, and the written files: ``prediction.png`` (the paper's figure of one body),
-        ``errors.png`` (bars) and ``rollout.gif`` (truth beside prediction).
+        The error table, and the written files: ``prediction.png`` (one body), ``errors.png`` and ``rollout.gif``.
     """
     folder, scene = Path(folder), scene or model.scene
     table = evaluate_errors(model, trajectories, horizons=horizons, keep=1)
@@ -68,20 +64,8 @@ def fresh_errors(
 ) -> ErrorTable:
     """Evaluate a model on new random trajectories of a scene, the same ones for the same seed.
 
-    A model that identifies is evaluated on random variants of the scene: each is identified from one
-    trajectory and predicted on another.
-
-    Args:
-        model: the model.
-        scene: the scene.
-        sequences: number of trajectories, or of variants.
-        length: control steps of each trajectory.
-        seed: seed of the trajectories and variants.
-        context_length: steps to identify from.
-
-    Raises:
-        ValueError: if trajectories are shorter than the longest rollouts, 100 steps, or the model identifies and
-            the scene is no system of the paper with variants.
+    A model that identifies is evaluated on random variants of the scene: each is identified from one trajectory
+    (``context_length`` steps) and predicted on another. ``length`` in control steps must be at least 100.
     """
     if length < max(HORIZONS):
         raise ValueError(f"length={length} is too short: errors are measured over rollouts of {max(HORIZONS)} steps.")

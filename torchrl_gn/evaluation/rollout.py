@@ -13,57 +13,29 @@ from torchrl_gn.dynamics import as_predictor
 from torchrl_gn.finite import require_finite
 
 
-def predict(
-    model: TensorDictModuleBase, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None
-) -> Tensor:
-    """Predict one step, whatever the model's keys.
-
-    Args:
-        model: reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
-        state: ``[*B, N, 13]``.
-        action: ``[*B, A]``.
-        parameters: physical parameters ``[*B]`` of each sample, for a :class:`~torchrl_gn.dynamics.Predictor`.
-
-    Returns:
-        ``[*B, N, 13]`` next states.
-    """
-    return as_predictor(model).step(state, action, parameters)[0]  # pyright: ignore[reportArgumentType]
-
-
 def rollout(
     model: TensorDictModuleBase, state: Tensor, actions: Tensor, parameters: TensorDictBase | None = None
 ) -> Tensor:
-    """States that a model predicts from a start state under a sequence of actions.
+    """States ``[*B, T + 1, N, 13]`` that a model predicts from a start state, which comes first.
 
-    Differentiable in the state, the actions and the model's weights, through every step. Inputs are checked,
-    predictions are not: see :func:`guarded_rollout`.
+    Differentiable in the state, the actions and the model's weights. Inputs are checked, predictions are not: see
+    :func:`guarded_rollout`.
 
     Args:
-        model: as of :func:`predict`.
+        model: reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
         state: ``[*B, N, 13]`` start states.
         actions: ``[*B, T, A]`` controls; ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``.
-        parameters: physical parameters of each rollout ``[*B]``, or without batch; by default the scene's.
-
-    Returns:
-        ``[*B, T + 1, N, 13]``; the first is the start state.
-
-    Raises:
-        ValueError: if the batch shapes of ``state`` and ``actions`` differ, or a number is not finite.
+        parameters: physical parameters of each rollout ``[*B]``, or without batch. Default: the scene's.
     """
     _check(state, actions, parameters)
     return as_predictor(model).rollout(state, actions, parameters)[0]  # pyright: ignore[reportArgumentType]
 
 
 class GuardedRollout(NamedTuple):
-    """Rollouts of which some may have diverged.
+    """Rollouts of which some may have diverged."""
 
-    Attributes:
-        states: ``[*B, T + 1, N, 13]``; a diverged one keeps its last good state.
-        good_steps: ``[*B]`` integers, number of good predictions; ``T`` if none was bad.
-    """
-
-    states: Tensor
-    good_steps: Tensor
+    states: Tensor  # [*B, T + 1, N, 13]; a diverged one keeps its last good state
+    good_steps: Tensor  # [*B] number of good predictions; T if none was bad
 
     @property
     def diverged(self) -> Tensor:
@@ -85,26 +57,15 @@ def guarded_rollout(
     """A :func:`rollout` that stops what diverges. Not differentiable.
 
     A prediction is bad if it is not finite or, of a :class:`~torchrl_gn.dynamics.Predictor`, outside ``limit`` times
-    the range of its training (:meth:`~torchrl_gn.dynamics.Predictor.in_range`). The other states are those of
-    :func:`rollout`, to rounding where the batch was narrowed.
+    the range of its training (:meth:`~torchrl_gn.dynamics.Predictor.in_range`).
 
     Args:
-        model: as of :func:`predict`.
+        model: like ``parameters`` as of :func:`rollout`.
         state: ``[*B, N, 13]`` start states; they are not judged.
         actions: ``[*B, T, A]``.
-        parameters: as of :func:`rollout`.
         hidden_state: ``[*B]`` hidden state of a recurrent model before the start.
-        limit: how far out of the range of training a state may be.
         every: steps between two checks (each waits for a GPU). The batch is then narrowed to what goes on; a compiled
-            model keeps its batch and stops when all have diverged. A module that is no predictor is checked after every
-            step.
-
-    Returns:
-        The states, and how many predictions of each rollout were good.
-
-    Raises:
-        ValueError: if the batch shapes of ``state`` and ``actions`` differ, a number is not finite, or ``limit`` or
-            ``every`` is not positive.
+            model keeps its batch and stops when all have diverged. Other modules are checked after every step.
     """
     _check(state, actions, parameters)
     if not (limit > 0 and every >= 1):

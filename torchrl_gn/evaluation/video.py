@@ -34,29 +34,20 @@ def rollout_video(
     size: int = 360,
     labels: tuple[str, str] = ("truth", "prediction"),
 ) -> Path:
-    """Write a rollout as a video, the truth on the left and the prediction on the right.
+    """Write a rollout as a video: the truth on the left; on the right the prediction, with the truth pale behind.
 
-    The truth is repeated, pale, behind the prediction. The camera looks at the plane of motion (or from the side and
-    above) and follows the truth along translation-invariant axes, never the prediction. Bodies are drawn where the
-    states put them, even with joints apart.
+    The camera looks at the plane of motion (or from the side and above) and follows the truth along
+    translation-invariant axes. Bodies are drawn where the states put them, even with joints apart.
 
     Args:
-        scene: whose states they are.
         truth: ``[T + 1, N, 13]`` true states.
-        prediction: ``[T + 1, N, 13]`` predicted states, or None to show the truth alone; frames of non-finite
-            states say so.
+        prediction: ``[T + 1, N, 13]`` predicted states, or None; frames of non-finite states say so.
         path: file to write: ``.gif``, or ``.mp4`` (needs imageio-ffmpeg).
-        speed: 1 is real time. States are skipped to keep frames at least 20 ms long (at 2.5 ms a step every eighth
-            state is shown).
-        size: width and height of a panel, pixels.
-        labels: captions of the two panels.
-
-    Returns:
-        The written path.
+        speed: 1 is real time. States are skipped to keep frames at least 20 ms long.
 
     Raises:
-        ValueError: if shapes do not fit the scene, the truth is not finite, or an option is out of range.
-        ImportError: if Pillow is not installed, or imageio-ffmpeg for an ``.mp4``.
+        ValueError: shapes do not fit the scene, the truth is not finite, or an option is out of range.
+        ImportError: Pillow is not installed, or imageio-ffmpeg for an ``.mp4``.
     """
     path = Path(path)
     if path.suffix not in (".gif", ".mp4"):
@@ -85,18 +76,11 @@ def rollout_frames(
     size: int = 360,
     labels: tuple[str, str] = ("truth", "prediction"),
 ) -> Iterator[Image.Image]:
-    """Pictures of :func:`rollout_video`, one by one, with the same errors.
+    """RGB pictures of :func:`rollout_video` with even widths and heights, one for ``every`` states.
 
     Args:
-        scene: whose states they are.
         truth: ``[T + 1, N, 13]``.
         prediction: ``[T + 1, N, 13]`` or None.
-        every: number of states per picture.
-        size: width and height of a panel, pixels.
-        labels: captions of the two panels.
-
-    Returns:
-        Iterator of RGB pictures with even widths and heights.
     """
     sequences = [_to_numpy(scene, "Truth", truth)]
     if prediction is not None:
@@ -107,17 +91,13 @@ def rollout_frames(
         raise ValueError("The true states contain values that are not finite.")
     if every < 1 or size < 32 or size % 2:
         raise ValueError(f"every must be at least 1 and size an even number from 32, got {every} and {size}.")
-    _require_pillow()
-    sequences = [states[::every] for states in sequences]
-    panels = _drawn_panels(scene, sequences, size)
-    return (_compose(scene.name, step * every * scene.timestep, row, size, labels) for step, row in enumerate(panels))
-
-
-def _require_pillow() -> None:
     try:
         import PIL  # noqa: F401
     except ImportError:
         raise ImportError('Pictures and videos need Pillow: pip install "torchrl_gn[figures]".') from None
+    sequences = [states[::every] for states in sequences]
+    panels = _drawn_panels(scene, sequences, size)
+    return (_compose(scene.name, step * every * scene.timestep, row, size, labels) for step, row in enumerate(panels))
 
 
 def _drawn_panels(scene: Scene, sequences: list[np.ndarray], size: int) -> Iterator[list[Image.Image]]:
@@ -125,12 +105,9 @@ def _drawn_panels(scene: Scene, sequences: list[np.ndarray], size: int) -> Itera
 
     drawing = SceneDrawing(scene, sequences[0], size)
     motions = [drawing.truth, *map(drawing.motion, sequences[1:])]
-    colors = (TRUTH, PREDICTION)
     for step in range(len(sequences[0])):
-        yield [
-            drawing.panel(step, motion, color, ghost=number > 0)
-            for number, (motion, color) in enumerate(zip(motions, colors, strict=False))
-        ]
+        row = zip(motions, (TRUTH, PREDICTION), (False, True), strict=False)
+        yield [drawing.panel(step, motion, color, ghost=ghost) for motion, color, ghost in row]
 
 
 def _compose(name: str, time: float, row: list[Image.Image], size: int, labels: tuple[str, str]) -> Image.Image:

@@ -17,8 +17,7 @@ from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
-from torchrl_gn.objectives.batch_entries import read_entries
-from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.objectives.checks import read_entries, require_fitted
 
 FIT_NORMALIZERS = (
     "Call fit_normalizers(transitions) of the loss with thousands of clean transitions [B], once before training;"
@@ -29,34 +28,26 @@ FIT_NORMALIZERS = (
 class ForwardModelLoss(LossModule):
     r"""Squared error of predicted state changes (paper, SM "Training algorithms" and "Loss").
 
-    The target is the change from the *noisy* input state to the clean next state, so the model learns to correct
-    displaced bodies. Over windows the model is fed its own predictions, except for the first ``teacher_forced_steps``
-    (paper, SM "Recurrent one-step predictions": all), and a recurrent model's hidden state is carried along.
-
-    Each component's error is divided by the variance of its change in this scene and averaged over movable channels,
-    nodes and samples; the loss is the mean over components.
-
-    Orientation error: :math:`1 - (q_e \cdot q_p)^2` (the paper prints :math:`1 - \cos^2(q_e \cdot q_p)`, which is not
-    zero for equal rotations), computed as the squared vector part of :math:`\bar q_e q_p` of the *change* quaternions:
-    the dot product has no digits left for the small rotations of one step.
+    The target is the change from the *noisy* input state to the clean next state. Over windows the model is fed its own
+    predictions after ``teacher_forced_steps`` (paper, SM "Recurrent one-step predictions": all), with its hidden state.
+    Each component's error is divided by the variance of its change in this scene; the loss is the mean over components.
+    Orientations: :math:`1 - (q_e \cdot q_p)^2` of the *change* quaternions (as printed, it is not zero if equal).
 
     Differentiated: the model's weights, through the whole window.
 
     Args:
         model: forward model bound to the scene of the samples.
-        noise: standard deviation of the input noise, in standard deviations of each state channel (radians for
-            orientations). Fixed channels get none.
+        noise: standard deviation of the input noise, in standard deviations of each movable state channel (radians for
+            orientations).
         generator: source of the noise. Default: torch's global generator, with which a run cannot resume bit for bit.
         teacher_forced_steps: steps at the start of a window that are fed the true state, with noise.
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` consecutive steps, ``action`` ``[B, (H,) A]``,
-    ``("next", "state")`` like ``state``, and the physical parameters ``[B, (H)]`` if the model reads them, the same
-    over a window.
+    ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if it reads them.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
 
-    Call :meth:`fit_normalizers` once before training. To continue from a trained model with noise or on another scene,
-    call :meth:`fit_scales` instead.
+    Call :meth:`fit_normalizers` once before training; for a trained model on another scene :meth:`fit_scales`.
     """
 
     @dataclass
@@ -86,13 +77,11 @@ class ForwardModelLoss(LossModule):
             raise ValueError(f"noise={noise} must not be negative, NaN or infinite.")
         if isinstance(model, SpecializedPredictor):
             raise TypeError("A specialised model passes no gradient to the weights; train the bound model.")
-        self.model = model
-        self.noise = noise
-        self.generator = generator
         if teacher_forced_steps < 1:
             raise ValueError(
                 f"teacher_forced_steps={teacher_forced_steps} must be at least 1: the first state is a true one."
             )
+        self.model, self.noise, self.generator = model, noise, generator
         self.teacher_forced_steps = teacher_forced_steps
         scale = torch.zeros(model.layout.delta_size, dtype=torch.float64, device=model.movable.device)
         self.register_buffer("noise_scale", scale)
@@ -132,7 +121,7 @@ class ForwardModelLoss(LossModule):
         self._fit_scales(state, next_state)
 
     def _fit_scales(self, state: Tensor, next_state: Tensor) -> Tensor:
-        """Fit the scales; returns the states with noise."""
+        """Fit the scales; return the states with noise."""
         model, layout = self.model, self.model.layout
         clean = Normalizer(layout.size, floor=1e-9)
         clean.update(model.canonicalizer.recentered(state)[..., model.incidence.predicted, :].cpu())
@@ -163,12 +152,11 @@ class ForwardModelLoss(LossModule):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Loss of a batch of transitions or windows.
+        """Return the losses of a batch of transitions or windows.
 
         Raises:
-            KeyError: if an entry is missing.
-            ValueError: if a shape is wrong, or a value is NaN or Inf.
-            RuntimeError: if the model's normalisers have seen no data, or the noise has no scale.
+            ValueError: a shape is wrong, or a value is NaN or Inf.
+            RuntimeError: the model's normalisers have seen no data, or the noise has no scale.
         """
         require_fitted(self, self.trained, remedy=FIT_NORMALIZERS, also=self._require_noise_scale)
         state, action, next_state = self._read(tensordict)
@@ -185,14 +173,13 @@ class ForwardModelLoss(LossModule):
             delta, hidden = eager.delta(program, current, action[:, step], hidden)
             errors = errors + self._component_errors(delta, target)
             if step + 1 < steps:
-                forced = step + 1 < self.teacher_forced_steps
-                current = self._perturb(state[:, step + 1]) if forced else layout.apply(current, delta)
+                teacher_forced = step + 1 < self.teacher_forced_steps
+                current = self._perturb(state[:, step + 1]) if teacher_forced else layout.apply(current, delta)
         errors = errors / steps
-        movable = self._movable_components()
+        scale = self._scale(self.noise_scale)
+        movable = torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
         loss = errors.sum() / movable.sum().clamp(min=1)
-        out: dict[str, Tensor] = {
-            f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)
-        }
+        out = {f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)}
         return TensorDict({"loss_forward_model": loss, **out}, [])
 
     def _require_noise_scale(self) -> None:
@@ -212,8 +199,8 @@ class ForwardModelLoss(LossModule):
 
     def _read_parameters(self, tensordict: TensorDictBase, *, windows: bool = False) -> TensorDictBase | None:
         parameters = self.model.parameters_in(tensordict)
-        if parameters is not None:
-            parameters = parameters[:, 0] if windows else parameters
+        if parameters is not None and windows:
+            parameters = parameters[:, 0]
         # Inferred parameters come from a network in training: if it diverges, the loss shows it.
         if parameters is not None and self.trained.parameter_source != "inferred":
             require_finite(parameters, f"{self.model.parameters_key!r} of the batch")
@@ -233,11 +220,6 @@ class ForwardModelLoss(LossModule):
         """Weights ``[N, 12]``: inverse standard deviations of movable channels, 0 for fixed ones."""
         weight = torch.where(self.error_weight < 0, self.trained.delta_normalizer.inverse_std, self.error_weight)
         return (weight * self.model.movable).to(like.dtype)
-
-    def _movable_components(self) -> Tensor:
-        layout = self.model.layout
-        scale = self._scale(self.noise_scale)
-        return torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
 
     def _component_errors(self, delta: Tensor, target: Tensor) -> Tensor:
         layout, scale = self.model.layout, self._scale(delta)

@@ -8,8 +8,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import Predictor
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
-from torchrl_gn.objectives.batch_entries import read_entries
-from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.objectives.checks import read_entries, require_fitted
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 from torchrl_gn.scenes import Scene
 
@@ -17,24 +16,20 @@ from torchrl_gn.scenes import Scene
 class IdentificationLoss(LossModule):
     """Prediction error on query windows, given an estimate from a context window of the same trajectory.
 
-    Paper, SM "End-to-end training algorithm for System ID". The inference model estimates the static graph from the
-    context; the forward model predicts the queries with it. One loss trains both.
+    Paper, SM "End-to-end training algorithm for System ID". One loss trains both models.
 
     Args:
-        model: the two models.
         scene: the standard scene of the samples.
         context_length: steps to identify a system from.
         shortest: lower bound of the context length in training, which draws it per batch and keeps the last steps.
             Default: ``context_length``, always (paper).
         num_queries: windows to predict with each estimate.
-        noise: of the input state, see :class:`ForwardModelLoss`.
         generator: source of the noise and of the context lengths. Default: torch's global generator.
 
     Input: ``state``, ``action`` and ``("next", "state")`` ``[B, context_length + num_queries * H, ...]``, as
-    ``trajectory_buffer(..., window=context_length, query_windows=(num_queries, H))`` draws them. Queries of ``H`` steps
-    are unrolled. The true physical parameters are not read.
+    ``trajectory_buffer(..., window=context_length, query_windows=(num_queries, H))`` draws them.
 
-    Output: as :class:`ForwardModelLoss`.
+    Output and ``noise``: as :class:`ForwardModelLoss`.
     """
 
     prediction: ForwardModelLoss
@@ -103,7 +98,11 @@ class IdentificationLoss(LossModule):
                 f" query_windows=({self.num_queries}, H))."
             )
         state, action, next_state = read_entries(self, tensordict, self.in_keys)
-        context = slice(self._context_start(), self.context_length)
+        start, most, generator = 0, self.context_length - self.shortest, self.prediction.generator
+        if most and self.training:
+            device = None if generator is None else generator.device
+            start = int(torch.randint(most + 1, (), generator=generator, device=device))
+        context = slice(start, self.context_length)
         parameters = self.inference.infer(state[:, context], action[:, context], next_state[:, context]).parameters
         # Each query is a sample: [B * num_queries, H, ...].
         state, action, next_state = (
@@ -111,21 +110,9 @@ class IdentificationLoss(LossModule):
             for entry in (state, action, next_state)
         )
         batch = len(state), window
-        parameters = parameters.apply(lambda value: value.repeat_interleave(self.num_queries, 0), batch_size=batch[:1])
-        parameters = parameters.apply(
-            lambda value: value.unsqueeze(1).expand(*batch, *value.shape[1:]), batch_size=batch
-        )
+        parameters = parameters.repeat_interleave(self.num_queries, 0).unsqueeze(1).expand(*batch)
         entries = {"state": state, "action": action, "next": {"state": next_state}, "parameters": parameters}
         return self.prediction(TensorDict(entries, batch_size=batch))
-
-    def _context_start(self) -> int:
-        """First step of this batch's context; 0 outside training."""
-        most = self.context_length - self.shortest
-        if not most or not self.training:
-            return 0
-        generator = self.prediction.generator
-        device = None if generator is None else generator.device
-        return int(torch.randint(most + 1, (), generator=generator, device=device))
 
     def training_state(self) -> dict:
         return self.prediction.training_state()

@@ -10,8 +10,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives import LossModule
 
-from torchrl_gn.objectives.batch_entries import read_entries
-from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.objectives.checks import read_entries, require_fitted
 from torchrl_gn.policies import LearnedReward, ObservationModel
 
 UPDATE_NORMALIZERS = (
@@ -21,16 +20,10 @@ UPDATE_NORMALIZERS = (
 
 
 class ObservationModelLoss(LossModule):
-    """Squared error of predicted observation changes, and of predicted rewards.
+    """Squared error of predicted observation changes, and of rewards (paper, "Model-based reinforcement learning").
 
-    Errors are in standard deviations of each dimension's change; constant dimensions are left out. Train jointly with
-    a policy, from the same replay buffer (paper, "Model-based reinforcement learning").
-
-    Differentiated: the weights of the model and of the reward.
-
-    Args:
-        model: the forward model.
-        reward: learned reward. Default: the reward is known.
+    Errors are in standard deviations of each dimension's change; constant dimensions are left out. Differentiated: the
+    weights of the model and of the reward, if that is learned.
 
     Input: ``observation`` ``[*B, O]``, ``action`` ``[*B, A]``, ``("next", "observation")`` and, with a learned reward,
     ``("next", "reward")`` ``[*B, 1]``.
@@ -67,12 +60,11 @@ class ObservationModelLoss(LossModule):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of a batch of transitions.
+        """Return the losses of a batch of transitions.
 
         Raises:
-            KeyError: if an entry is missing.
-            ValueError: if a value is NaN or Inf, or the rewards' shape differs from the predicted one.
-            RuntimeError: if the model's normalisers have seen no data.
+            ValueError: a value is NaN or Inf, or the rewards have a wrong shape.
+            RuntimeError: the model's normalisers have seen no data.
         """
         require_fitted(self, self.model, remedy=UPDATE_NORMALIZERS)
         observation, action, next_observation, *rewards = read_entries(self, tensordict, self.in_keys)

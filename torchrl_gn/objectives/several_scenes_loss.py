@@ -11,26 +11,18 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.objectives.checks import require_fitted
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 
 
 class SeveralScenesLoss(LossModule):
     """Mean of the losses of several scenes that share a model (paper, "Learning a forward model for multiple systems").
 
-    Every scene has a sub-batch of its own topology, without padding, and the same weight.
-
-    Args:
-        losses: loss of each scene, all of one model.
-
     Input: TensorDict ``[S, B, ...]`` or a list of ``S`` sub-batches, in the order of ``losses``, as a
     ``ReplayBufferEnsemble(..., sample_from_all=True)`` draws them.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, means over the scenes, and the detached loss
     of each scene as ``scene_<name>``.
-
-    Raises:
-        ValueError: if there is no loss, models differ, or two scenes share a name.
     """
 
     losses: nn.ModuleList

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss
 
 from torchrl_gn.networks.frozen_weights import frozen, with_weights
-from torchrl_gn.objectives.fitted import require_fitted
+from torchrl_gn.objectives.checks import require_fitted
 from torchrl_gn.objectives.observation_model_loss import UPDATE_NORMALIZERS
 
 ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -30,34 +30,19 @@ class SVGLoss(DDPGLoss):
         \mathbb{E}\Big[\sum_{k=0}^{N-1} \gamma^k r(x_{t+k}, a_{t+k}, x_{t+k+1}) + \gamma^N Q(x_{t+N}, a_{t+N})\Big],
         \quad a_{t+k} \sim \pi(\cdot | x_{t+k}), \quad x_{t+k+1} = g(x_{t+k}, a_{t+k})
 
-    with reparameterised actions: its gradient runs through the model :math:`g`, the reward and the value. ``steps=0``
-    is the model-free SVG(0), and DDPG with a deterministic policy. Imagined steps do not end an episode.
-    (Paper: :math:`a_t` as the last action is a misprint.)
+    with reparameterised actions. ``steps=0`` is the model-free SVG(0), and DDPG with a deterministic policy. Imagined
+    steps do not end an episode. (Paper: :math:`a_t` as the last action is a misprint.) The value's loss is DDPG's with
+    actions drawn from the target policy. Input, output and ``make_value_estimator`` (gamma) are DDPG's.
 
-    The value's loss is DDPG's with actions drawn from the target policy. Keys, target networks, priorities and
-    ``make_value_estimator``, which sets gamma, are as in :class:`~torchrl.objectives.DDPGLoss`.
-
-    Differentiated: the policy's weights in ``loss_actor``, the value's in ``loss_value``. Model and reward are not
-    submodules: they get no gradient, and ``parameters()`` and ``to()`` leave them out.
+    Differentiated: the policy's weights in ``loss_actor``, through model, reward and value; the value's in
+    ``loss_value``. Model and reward are no submodules: no gradient, and ``parameters()`` and ``to()`` leave them out.
 
     Args:
-        actor_network: policy, for example a ``ProbabilisticActor``.
         value_network: writes ``state_action_value``.
         model: TensorDict module from observation and action to ``("next", observation)``, for example an
             :class:`~torchrl_gn.policies.ObservationModel`. Other inputs of policy and value (a goal) stay constant.
-        reward: reward of an imagined step, known or learned.
         steps: ``N``, steps through the model.
         **options: of :class:`~torchrl.objectives.DDPGLoss`.
-
-    Raises:
-        ValueError: if ``steps`` is negative, model or reward is missing for ``steps > 0``, or the model predicts no
-            input of policy or value.
-
-    Input: as DDPG's: the policy's inputs, ``action``, and under ``"next"`` the same inputs, ``reward``, ``done`` and
-    ``terminated``.
-
-    Output: ``loss_actor`` and ``loss_value``, and for monitoring ``pred_value``, ``target_value``, the maximum of each,
-    and ``td_error``.
     """
 
     deterministic_sampling_mode: Any = ExplorationType.RANDOM  # actions are drawn
@@ -114,17 +99,15 @@ class SVGLoss(DDPGLoss):
         return self
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Loss of the value, and what to monitor; needs fitted normalisers, as :meth:`loss_actor`."""
+        """Return the loss of the value, and what to monitor."""
         self._require_fitted()
         with set_exploration_type(self.deterministic_sampling_mode):  # as in forward, for direct calls
             return super().loss_value(tensordict)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Loss of the policy, and nothing to monitor.
+        """Return the loss of the policy, and nothing to monitor.
 
-        Raises:
-            ValueError: if the reward of an imagined step is not ``[*B, 1]``.
-            RuntimeError: if normalisers of policy, value or model have seen no data.
+        Raises RuntimeError if normalisers of policy, value or model have seen no data.
         """
         self._require_fitted()
         weights = self._maybe_get_priority_weight(tensordict)
@@ -143,14 +126,8 @@ class SVGLoss(DDPGLoss):
             now = self.value_network(now)
         value = value + discount * now.get(self.tensor_keys.state_action_value)
         loss = self._reduce_loss(-value.squeeze(-1), tensordict=tensordict, weights=weights)
-        self._clear_weakrefs(
-            tensordict,
-            loss,
-            "value_network_params",
-            "target_value_network_params",
-            "target_actor_network_params",
-            "actor_network_params",
-        )
+        weak = [f"{target}{name}_network_params" for target in ("", "target_") for name in ("actor", "value")]
+        self._clear_weakrefs(tensordict, loss, *weak)
         return loss, {}
 
     def _require_fitted(self) -> None:
@@ -158,7 +135,6 @@ class SVGLoss(DDPGLoss):
         require_fitted(self, self.actor_network, self.value_network, *model, remedy=UPDATE_NORMALIZERS)
 
     def _act(self, now: TensorDictBase) -> TensorDictBase:
-        """Add the policy's action."""
         with with_weights(self.actor_network, self.actor_network_params):
             return self.actor_network(now)
 

@@ -21,20 +21,16 @@ def solve_box_qp(
 
     .. math:: \min_x \tfrac12 x^\top H x + g^\top x \quad \text{with} \quad l \le x \le u
 
-    Dimensions at a bound that their gradient points beyond are clamped; the others take a projected Newton step with
-    line search.
-
     Args:
         hessian: ``[M, n, n]`` symmetric positive definite.
         gradient: ``[M, n]``.
         lower: ``[M, n]``, or broadcastable.
         upper: likewise, not below ``lower``.
         start: warm start ``[M, n]``, clipped to the bounds. Default: 0.
-        iterations: maximum number of Newton steps.
         tolerance: bound on the free gradient, relative to ``|g|``.
 
     Returns:
-        Solutions ``[M, n]`` and the free dimensions ``[M, n]`` bool.
+        Solutions ``[M, n]`` and the free dimensions ``[M, n]`` bool, those not held at a bound.
     """
     x = np.clip(np.zeros_like(gradient) if start is None else start, lower, upper)
     identity = np.eye(gradient.shape[-1])

@@ -37,9 +37,8 @@ def backward_pass(
     """Policies that minimise a quadratic model, for ``M`` dampings at once.
 
     Args:
-        model: the control problem.
-        control_damping: ``[M]`` added to the diagonal of the controls' Hessian.
-        state_damping: ``[M]`` added to the diagonal of the next value's Hessian: keeps the states near the trajectory.
+        control_damping: ``[M]``, added to the diagonal of the controls' Hessian.
+        state_damping: ``[M]``, added to the diagonal of the next value's Hessian.
 
     Returns:
         Control changes ``[H, M, A]`` and feedback gains ``[H, M, A, X]``, zero for controls at bounds.

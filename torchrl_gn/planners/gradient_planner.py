@@ -27,41 +27,30 @@ OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
 class GradientPlanner(RecedingHorizonPlanner):
     """Plan by gradient ascent on the rewards that a learned model predicts.
 
-    Paper, SM "MPC planner with learned models". Every control step rolls out the next ``horizon`` steps
-    (:meth:`~torchrl_gn.envs.ModelEnv.imagine`), differentiates the sum of rewards by the actions, and updates them
-    ``iterations`` times. The first action of the best sequence seen is executed; the rest, shifted by one step with the
-    last action repeated, warm-starts the next plan.
-
-    The planner keeps no state: the plan is the TensorDict's entry ``plan``. Without it the planner improves the best
-    of smooth random sequences. Where episodes auto-reset, append :meth:`make_tensordict_primer` to the environment;
-    ``Collector(..., auto_register_policy_transforms=True)`` does so.
-
-    Sequences with predictions or rewards that are not finite are discarded. If none is left, the planner keeps the
-    last plan, or the zero action without one, and warns.
+    Paper, SM "MPC planner with learned models". Every control step rolls out ``horizon`` steps and updates the
+    actions by the gradient of their summed reward, ``iterations`` times. The first action of the best sequence seen
+    is executed; the rest, shifted, warm-starts the next plan: the TensorDict's entry ``plan``. Where episodes
+    auto-reset, append :meth:`make_tensordict_primer` to the environment. Sequences that are not finite are discarded;
+    if all are, the last plan is kept, with a warning.
 
     Opens autograd itself, also under ``no_grad``; ``inference_mode`` is refused. Actions are detached.
 
     Args:
         env: the learned model with the reward. A specialised model plans several times faster.
-        horizon: control steps ``H`` to look ahead.
         iterations: updates at each control step (paper: 3 to 51).
         warm_up: updates of a first plan. Default: ``iterations * horizon`` (paper), at most 200.
         candidates: sequences ``K`` to improve in parallel.
         samples: random sequences to choose the first candidates from; at least ``candidates``.
         noise: amplitude, as a fraction of the actions' range, of the perturbations of the best candidate that replace
-            the worse half of the candidates at every later control step.
+            the worse half at every later control step.
         optimizer: makes the optimiser of the actions, in units of half their range. Default: Adam, learning rate 0.1.
-        shrink: factor on the step size after a control step without improvement; an improvement doubles it, up to the
-            optimiser's own. 1: constant.
+        shrink: factor on the step size after a step without improvement; an improvement doubles it, up to 1.
         action_cost: cost per step and mean squared action, in units of half the range.
-        seed: of the random sequences. Default: drawn from torch's global generator.
+        seed: default: drawn from torch's global generator.
 
     Raises:
-        TypeError: if ``env`` is no ``ModelEnv``.
-        ValueError: if an option is out of range, or reward or actions are missing; when planning, if the rewards do
-            not depend on the actions.
-        KeyError: when planning, if the environment drops a recurrent model's hidden state.
-        RuntimeError: when planning in inference mode.
+        ValueError: an option is out of range, reward or actions are missing, or the rewards ignore the actions.
+        KeyError: when planning, the environment drops a recurrent model's hidden state.
     """
 
     def __init__(
@@ -94,8 +83,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         if not 0 < shrink <= 1:
             raise ValueError(f"shrink must be above 0 and at most 1, got {shrink}")
         super().__init__(env)
-        self.shrink = shrink
-        self.horizon, self.iterations = horizon, iterations
+        self.horizon, self.iterations, self.shrink = horizon, iterations, shrink
         self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
         self.candidates, self.samples, self.noise, self.action_cost = candidates, samples, noise, action_cost
         self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)
@@ -115,18 +103,17 @@ class GradientPlanner(RecedingHorizonPlanner):
 
     @property
     def plan_shape(self) -> tuple[int, int, int]:
-        """Shape of a sample's plan: candidates, horizon, actions."""
+        """Shape of a sample's plan ``(K, H, A)``."""
         return self.candidates, self.horizon, self.imagined.scene.num_actions
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Transform for the real environment that resets the plan, and a recurrent model's hidden state."""
-        hidden_state = (
-            cast(TensorDictBase, self.imagined.world_model.initial_hidden_state()) if self._recurrent else None
-        )
+        model = self.imagined.world_model
+        hidden_state = cast(TensorDictBase, model.initial_hidden_state()) if self._recurrent else None
         return plan_primer(self.plan_shape, torch.float32, self.imagined.device, hidden_state, step_size=(1,))
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
-        """Next action ``[*B, A]``, on the states' device; the remaining plan and the hidden state to write."""
+        """Return the next action ``[*B, A]``, and the remaining plan and the hidden state to write."""
         if torch.is_inference_mode_enabled():
             raise RuntimeError(
                 "GradientPlanner needs gradients: use torch.no_grad() instead of torch.inference_mode()."
@@ -142,7 +129,9 @@ class GradientPlanner(RecedingHorizonPlanner):
                 "The model is recurrent, and the environment drops its entry 'hidden_state' between steps: append the"
                 " planner's make_tensordict_primer() to the real environment."
             )
-        best, step_size = plan.clone(), self._step_size(flat).to(device)
+        size = cast(Tensor, flat.get((KEY, "step_size"), torch.ones(len(flat), 1)))
+        step_size = size.where(size > 0, 1.0).to(device)  # a primer writes 0
+        best = plan.clone()
         with frozen(self.imagined):
             for resumed in (False, True):
                 rows = (planned == resumed).nonzero().flatten()
@@ -155,20 +144,14 @@ class GradientPlanner(RecedingHorizonPlanner):
                     step_size[rows] *= torch.where(improved, 2.0, self.shrink)
         actions, step_size = self._actions(best), step_size.clamp(_MIN_STEP_SIZE, 1.0)
         plan, step_size = actions.reshape(*batch, *self.plan_shape), step_size.reshape(*batch, 1)
-        remaining = shift_plan(batch, plan.to(states_at), step_size=step_size.to(states_at))
-        written: dict[NestedKey, TensorDictBase] = {KEY: remaining}
+        written: dict[NestedKey, TensorDictBase]
+        written = {KEY: shift_plan(batch, plan.to(states_at), step_size=step_size.to(states_at))}
         if self._recurrent:
-            written["next", "hidden_state"] = (
-                self._next_hidden_state(entries, actions[:, 0, 0]).reshape(batch).to(states_at)
-            )
+            with torch.no_grad():
+                executed = entries.copy().set("action", self.env.action_spec.project(actions[:, 0, 0]))
+                hidden_state = self.imagined.world_model(executed)["next", "hidden_state"]
+            written["next", "hidden_state"] = hidden_state.reshape(batch).to(states_at)
         return actions[:, 0, 0].reshape(*batch, -1).to(states_at), written
-
-    def _step_size(self, flat: TensorDictBase) -> Tensor:
-        """Step sizes ``[B, 1]``, as fractions of the optimiser's; 1 without a plan."""
-        size = cast("Tensor | None", flat.get((KEY, "step_size"), None))
-        if size is None:
-            return torch.ones(len(flat), 1)
-        return size.where(size > 0, 1.0)  # a primer writes 0
 
     def _scaled(self, actions: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in units of half their range, -1 to 1; 0 where they are fixed."""
@@ -182,12 +165,6 @@ class GradientPlanner(RecedingHorizonPlanner):
     def _recurrent(self) -> bool:
         return "hidden_state" in self.imagined.world_model.in_keys
 
-    @torch.no_grad()
-    def _next_hidden_state(self, entries: TensorDictBase, action: Tensor) -> TensorDictBase:
-        """The recurrent model's hidden state after this state and action."""
-        action = self.env.action_spec.project(action)
-        return self.imagined.world_model(entries.copy().set("action", action))["next", "hidden_state"]
-
     def _entries(self, flat: TensorDictBase) -> TensorDictBase:
         """Entries that a rollout reads, detached."""
         self.imagined.predictor.parameters_in(flat)  # refuses other variants, which the entries below no longer show
@@ -198,17 +175,14 @@ class GradientPlanner(RecedingHorizonPlanner):
         return cast(TensorDictBase, usable).to(self.imagined.device)
 
     def _imagine(self, starts: TensorDictBase, plan: Tensor) -> Tensor:
-        """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` from states ``[B K]``.
-
-        Minus infinity where any state is not finite: the reward may read other bodies only.
-        """
+        """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` from states ``[B K]``; minus infinity if diverged."""
         states, rewards = self.imagined.imagine(starts, self._actions(plan).flatten(0, 1))
         finite = states.isfinite().flatten(1).all(1)
         total = torch.where(finite, rewards.sum((-2, -1)), -torch.inf).reshape(plan.shape[:2])
         return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
 
     def _initial_plan(self, entries: TensorDictBase) -> Tensor:
-        """The best random sequences ``[B, K, H, A]``, zero actions among them, which come first if none is finite."""
+        """Return the best random sequences ``[B, K, H, A]``, zero actions among them."""
         rows = len(entries)
         drawn = self._splines(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
@@ -223,9 +197,8 @@ class GradientPlanner(RecedingHorizonPlanner):
         return drawn.gather(1, best[..., None, None].expand(-1, -1, *drawn.shape[2:]))
 
     def _splines(self, rows: int, count: int) -> Tensor:
-        drawn = spline_controls(self.imagined.scene, rows * count, self.horizon, self._rng)
-        controls = torch.from_numpy(drawn).float().to(self.half_range.device)
-        return self._scaled(controls).reshape(rows, count, self.horizon, -1)
+        drawn = torch.from_numpy(spline_controls(self.imagined.scene, rows * count, self.horizon, self._rng))
+        return self._scaled(drawn.float().to(self.half_range.device)).reshape(rows, count, self.horizon, -1)
 
     def _resample(self, plan: Tensor) -> Tensor:
         """Replace the worse half of the candidates ``[B, K, H, A]`` by perturbations of the first, the best."""
@@ -240,11 +213,9 @@ class GradientPlanner(RecedingHorizonPlanner):
     ) -> tuple[Tensor, Tensor]:
         """Ascend the returns of candidates ``[B, K, H, A]`` by steps of ``step_size`` ``[B, 1]`` times the optimiser's.
 
-        Returns:
-            Best sequences seen, best candidate first, unchanged with a warning where no return is finite; and
-            ``[B, 1]`` whether any beats all given ones.
+        Returns the best sequences seen, best candidate first, and ``[B, 1]`` whether any beats all given ones.
         """
-        # The same tensors in every iteration, so that the model folds their parameters once.
+        # The same tensors in every iteration: the model folds their parameters once.
         starts = _repeated(entries, self.candidates)
         best, best_return = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
         initial_return = best_return

@@ -25,50 +25,34 @@ _INITIAL_SAMPLES = 16  # random sequences; a first plan starts from the best
 
 
 class ILQGPlanner(RecedingHorizonPlanner):
-    """Plan on the true MuJoCo physics by control-limited iLQG.
+    """Plan on the true MuJoCo physics by control-limited iLQG (Tassa, Mansard and Todorov 2014).
 
-    Every control step improves the planned actions by a few iterations (Tassa, Mansard and Todorov 2014; see
-    :class:`~torchrl_gn.planners.ilqg_solver.ILQGSolver`) to maximise the sum of ``env.reward`` minus a control cost.
-    The first action is executed; the rest warm-starts the next plan.
+    Every control step improves the planned actions by a few iterations, to maximise the sum of ``env.reward`` minus a
+    control cost. The first action is executed; the rest warm-starts the next plan. Where episodes auto-reset, append
+    :meth:`make_tensordict_primer` to the environment. Rows of a batch are planned one by one, in float64, without
+    gradients. A state without any stable sequence keeps its last plan, or zero actions, with a warning.
 
-    The planner keeps no state: the plan is the TensorDict's entry ``plan``, without which a new plan begins. Where
-    episodes auto-reset (a collector), append :meth:`make_tensordict_primer` to the environment. Rows of a batch are
-    planned one by one, in float64. Autograd differentiates the reward, also under ``torch.no_grad`` and
-    ``torch.inference_mode``; no gradient flows through the planner.
-
-    Entries:
-        - reads ``physics`` ``[*B, S]`` float64, and ``task`` and ``plan`` if present.
-        - writes ``action`` ``[*B, A]`` and ``plan``: remaining ``actions`` ``[*B, H, A]`` float64 with the last one
-          repeated, and ``planned`` ``[*B, 1]`` bool.
-
-    A state without any stable sequence keeps its last plan, or zero actions, with a warning the first time.
+    Reads ``physics`` ``[*B, S]`` float64, and ``task`` and ``plan`` if present; writes ``action`` ``[*B, A]`` and
+    ``plan``: remaining ``actions`` ``[*B, H, A]`` float64 and ``planned`` ``[*B, 1]`` bool.
 
     Args:
         env: the true physics, with a differentiable reward ``(state, action, next_state, task) -> [*B, 1]``.
         horizon: control steps ``H`` to plan ahead.
-        iterations: of iLQG at every control step.
-        warm_up: iterations of a first plan, from the best of some smooth random sequences. Default: ten times
-            ``iterations``.
+        warm_up: iterations of a first plan, from the best of some random sequences. Default: ten times ``iterations``.
         control_cost: quadratic cost per control and step, of a control at its bound; keep it below a step's reward.
         central: central differences of the physics: 1.5 times the time, equal plans where measured.
-        seed: seed of the random sequences. Default: drawn from torch's global generator.
-        num_threads: threads of the simulation. Default: the environment's.
+        seed: default: drawn from torch's global generator.
 
     Raises:
-        TypeError: if ``env`` is no :class:`~torchrl_gn.envs.SceneEnv`.
-        ValueError: if reward, actions or bounds are missing, or an option is out of range; when planning, if physics or
-            plan do not fit, or autograd cannot differentiate the reward.
-        KeyError: when planning, if ``physics`` is missing.
+        TypeError: ``env`` is no :class:`~torchrl_gn.envs.SceneEnv`.
+        ValueError: reward, actions or bounds are missing, an option is out of range, or an entry does not fit.
 
     Example:
-        >>> from torchrl.envs import TransformedEnv
         >>> from torchrl_gn.rewards import make_reward
         >>> from torchrl_gn.scenes import load_scene
         >>> scene = load_scene("pendulum")
-        >>> env = SceneEnv(scene, make_reward("balance", scene), seed=0)
-        >>> planner = ILQGPlanner(env, horizon=10, iterations=1, seed=0)
-        >>> acted = TransformedEnv(env, planner.make_tensordict_primer())
-        >>> acted.rollout(3, planner)["action"].shape
+        >>> planner = ILQGPlanner(SceneEnv(scene, make_reward("balance", scene), seed=0), horizon=10, iterations=1)
+        >>> planner.env.rollout(3, planner)["action"].shape
         torch.Size([3, 1])
     """
 
@@ -156,21 +140,17 @@ class ILQGPlanner(RecedingHorizonPlanner):
             start = solver.simulate(physics, solver.controls(sequences()))
             if math.isfinite(start.cost):
                 return solver.actions(solver.improve(start, iterations).controls)
-        self._warn()
+        if not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"ILQGPlanner found no sequence of {self.horizon} actions for {env.scene.name!r} that can be simulated"
+                " with a finite reward: the simulation becomes unstable whatever is done, or the reward is not finite."
+                " Such states keep their last plan, or rest if they have none. Try a smaller physics step in the model."
+                " (Warned once.)",
+                RuntimeWarning,
+                stacklevel=2,
+            )
         return solver.actions(solver.controls(rest[0])) if plan is None else plan
-
-    def _warn(self) -> None:
-        if self._warned:
-            return
-        self._warned = True
-        warnings.warn(
-            f"ILQGPlanner found no sequence of {self.horizon} actions for {self._scene_env.scene.name!r} that can be"
-            " simulated with a finite reward: the simulation becomes unstable whatever is done, or the reward is not"
-            " finite. Such states keep their last plan, or rest if they have none. Try a smaller physics step in the"
-            " model. (Warned once.)",
-            RuntimeWarning,
-            stacklevel=2,
-        )
 
     @property
     def _scene_env(self) -> SceneEnv:

@@ -36,16 +36,10 @@ class Trajectory:
 class ILQGSolver:
     """Improve trajectories by iLQG.
 
-    Every iteration linearises the dynamics, expands the reward to second order (Gauss-Newton), solves the
-    control-limited backward pass for several dampings, simulates each feedback policy at several step sizes, and
-    accepts the best trajectory if it improves. Dampings are relative to the root mean square of the cost's gradient by
-    the controls. (Tassa et al. adapt one damping between iterations and search step sizes only.)
-
-    Args:
-        simulator: simulation of one scene, with bounded actions.
-        reward: the reward.
-        control_cost: quadratic cost of a control, at its bound.
-        central: differentiate the dynamics by central differences.
+    Every iteration linearises the dynamics, expands the reward (Gauss-Newton), solves the control-limited backward pass
+    for several dampings, simulates each policy at several step sizes, and accepts the best trajectory if it improves.
+    (Tassa et al. adapt one damping between iterations.) Dampings are relative to the cost gradient's root mean square.
+    ``control_cost`` is that of a control at its bound.
     """
 
     def __init__(self, simulator: Simulator, reward: RewardExpansion, *, control_cost: float, central: bool):
@@ -148,9 +142,7 @@ class ILQGSolver:
             paths[:, t + 1], states[:, t] = self.simulator.step(paths[:, t], self.actions(controls[:, t]))
         # One more step observes the last state, and whether it is stable.
         beyond, states[:, steps] = self.simulator.step(paths[:, steps], self.actions(controls[:, -1]))
-        stable = np.array(
-            [np.isfinite(path).all() and np.isfinite(last).all() for path, last in zip(paths, beyond, strict=True)]
-        )
+        stable = np.asarray(np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(beyond).all(axis=1))
         return controls, paths, states, stable
 
     def _best(

@@ -11,10 +11,7 @@ from torchrl_gn.data.simulate import Simulator
 
 
 class Tangent:
-    """Tangent space of MuJoCo states, ``X = 2 nv + na``: positions, velocities and activations.
-
-    Quaternions change by rotation vectors (``mj_integratePos``).
-    """
+    """Tangent space of MuJoCo states, ``X = 2 nv + na``; quaternions change by rotation vectors."""
 
     def __init__(self, model: mujoco.MjModel):
         self.model = model
@@ -60,27 +57,15 @@ class Linearization:
 
 
 def linearize(
-    simulator: Simulator,
-    physics: np.ndarray,
-    actions: np.ndarray,
-    *,
-    epsilon: float = 1e-6,
-    central: bool = False,
+    simulator: Simulator, physics: np.ndarray, actions: np.ndarray, *, epsilon: float = 1e-6, central: bool = False
 ) -> Linearization:
-    """Linearise a trajectory by finite differences; all perturbed steps are simulated as one batch.
-
-    Differences whole control steps, with any integrator and contacts. At bounds controls are perturbed inwards.
+    """Linearise a trajectory by finite differences of whole control steps, inwards at the controls' bounds.
 
     Args:
-        simulator: the simulation of one scene.
         physics: states ``[T + 1, S]``, float64.
         actions: ``[T, A]``, within the bounds.
-        epsilon: size of the perturbations, in metres, radians, their rates, and half the range of a control.
-        central: central differences, error ``O(epsilon ** 2)``, instead of forward ones at half the cost, error
-            ``O(epsilon)``.
-
-    Returns:
-        The Jacobians, float64.
+        epsilon: size of the perturbations, in SI units, and of controls in halves of their range.
+        central: central differences, error ``O(epsilon ** 2)``, at twice the cost of forward ones, ``O(epsilon)``.
     """
     scene, tangent = simulator.scene, Tangent(simulator.scene.model)
     times, num = len(physics), tangent.size + scene.num_actions
@@ -93,12 +78,8 @@ def linearize(
     widths[:, tangent.size :] = width
 
     starts, applied = [tangent.add(physics[:, None], change)], [_one_perturbed(controls, tangent.size, above)]
-    if central:
-        starts.append(tangent.add(physics[:, None], -change))
-        applied.append(_one_perturbed(controls, tangent.size, below))
-    else:
-        starts.append(physics[:, None])
-        applied.append(controls[:, None])
+    starts.append(tangent.add(physics[:, None], -change) if central else physics[:, None])
+    applied.append(_one_perturbed(controls, tangent.size, below) if central else controls[:, None])
     after, state = simulator.step(
         np.concatenate([s.reshape(-1, scene.physics_size) for s in starts]),
         np.concatenate([c.reshape(-1, scene.num_actions) for c in applied]),
@@ -116,10 +97,7 @@ def linearize(
 def _perturb_controls(
     low: np.ndarray, high: np.ndarray, controls: np.ndarray, epsilon: float, central: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Controls ``[T, A]`` perturbed up and down, inwards at bounds, and their difference.
-
-    The difference is 1 where the bounds are equal, so that the derivative by a fixed control is 0.
-    """
+    """Controls ``[T, A]`` perturbed up and down, inwards at bounds, and their difference, 1 between equal bounds."""
     step = 0.5 * epsilon * (high - low)
     above = np.minimum(controls + step, high)
     below = np.maximum(controls - step, low)

@@ -17,6 +17,7 @@ from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
+from torchrl_gn.envs.specs import spec_of
 
 # Environments carry entries unknown to them from step to step; a primer also resets its own when an episode begins.
 KEY = "plan"
@@ -47,10 +48,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
 
 def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int) -> None:
-    """Raise ValueError unless ``env`` has a reward and bounded actions, ``counts`` are at least 1, ``warm_up`` 0.
-
-    Equal bounds fix an action.
-    """
+    """Raise ValueError unless ``env`` has a reward and bounded actions, ``counts`` are at least 1, ``warm_up`` 0."""
     for name, value in counts.items():
         check_count(name, value, 1)
     if warm_up is not None:
@@ -79,14 +77,7 @@ def check_count(name: str, value: int, least: int) -> None:
 
 
 def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Planned actions of a TensorDict ``[*B]``, for sequences of ``shape`` ``(..., H, A)``.
-
-    Returns:
-        Actions ``[*B, *shape]``, zeros without a plan, and ``[*B, 1]`` bool, whether they were planned.
-
-    Raises:
-        ValueError: if the plan has another shape, that of another planner or horizon.
-    """
+    """Return planned actions ``[*B, *shape]``, zeros without a plan, and ``[*B, 1]`` whether planned."""
     batch = tensordict.shape
     plan = cast("TensorDictBase | None", tensordict.get(KEY, None))
     if plan is None:
@@ -117,21 +108,13 @@ def plan_primer(
 ) -> TensorDictPrimer:
     """Transform that resets the plan when an episode begins; append it to the real environment.
 
-    Args:
-        shape: of a sample's sequences, ``(..., H, A)``.
-        dtype: of the actions.
-        device: of the environment.
-        hidden_state: a recurrent model's initial hidden state, zeros, to reset too.
-        **more: shapes of a sample's other entries of the plan.
+    ``shape`` is that of a sample's sequences, ``(..., H, A)``; ``more`` has the shapes of other entries of the plan.
+    A recurrent model's initial ``hidden_state``, zeros, is reset too.
     """
-    entries = {key: Unbounded(shape=torch.Size(of), dtype=dtype, device=device) for key, of in more.items()}
-    entries["actions"] = Unbounded(shape=torch.Size(shape), dtype=dtype, device=device)
+    shapes = {**more, "actions": shape}
+    entries = {key: Unbounded(shape=torch.Size(of), dtype=dtype, device=device) for key, of in shapes.items()}
     entries["planned"] = Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=device)
     specs = {KEY: Composite(entries)}
     if hidden_state is not None:
-        of = {
-            str(key): Unbounded(shape=value.shape, dtype=value.dtype, device=device)
-            for key, value in hidden_state.items()
-        }
-        specs["hidden_state"] = Composite(of)
+        specs["hidden_state"] = spec_of(hidden_state, device)
     return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)

@@ -19,19 +19,14 @@ class ReturnToGo(TensorDictModuleBase):
 
     .. math:: a_{kt} = \frac{R_{kt} - \max_j R_{jt}}{\mathrm{std}_j\, R_{jt}} \qquad R_{kt} = \sum_{s \ge t} r_{ks}
 
-    The standard deviation makes one temperature fit rewards of any size, and leaves out outliers (unstable rollouts);
-    the maximum prevents overflow.
-
-    Reads ``("next", "reward")`` ``[*B, K, H, 1]`` of ``K`` candidates; writes ``advantage`` of the same shape, 0 for
-    the best. Differentiable, except for the choice of outliers.
+    The standard deviation, without outliers, makes one temperature fit any reward. Reads ``("next", "reward")``
+    ``[*B, K, H, 1]`` of ``K`` candidates; writes ``advantage`` of the same shape, 0 for the best. Differentiable.
 
     Example:
         >>> from torchrl.modules import MPPIPlanner
         >>> from torchrl_gn.envs import SceneEnv
-        >>> from torchrl_gn.rewards import make_reward
         >>> from torchrl_gn.scenes import load_scene
-        >>> scene = load_scene("pendulum")
-        >>> env = SceneEnv(scene, make_reward("balance", scene), seed=0)
+        >>> env = SceneEnv(load_scene("pendulum"), seed=0)
         >>> sizes = dict(planning_horizon=5, optim_steps=2, num_candidates=8, top_k=4)
         >>> env.rollout(3, MPPIPlanner(env, ReturnToGo(), temperature=5.0, **sizes))["action"].shape
         torch.Size([3, 1])

@@ -13,14 +13,9 @@ Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]  # state [*B, N, 13], action 
 
 
 class RewardExpansion:
-    """A tensor reward as a function of arrays, with derivatives.
+    """A tensor reward ``(state, action, next_state, task) -> [*B, 1]`` as a function of arrays, with derivatives.
 
-    Opens autograd itself, also under ``torch.no_grad`` and ``torch.inference_mode``; results are detached.
-
-    Args:
-        reward: function ``(state, action, next_state, task) -> [*B, 1]``, independent for each row.
-        task: the reward's task, without batch: a tensor, a TensorDict or None.
-        device: where the reward computes.
+    Opens autograd itself. ``task`` has no batch: a tensor, a TensorDict or None.
     """
 
     def __init__(self, reward: Callable[..., Tensor], task: Any, device: torch.device | str | None):
@@ -38,18 +33,17 @@ class RewardExpansion:
     def derivatives(self, inputs: Inputs, jacobians: Inputs) -> tuple[np.ndarray, np.ndarray]:
         """Gradient ``[T, Z]`` and Gauss-Newton Hessian ``[T, Z, Z]`` by ``Z`` variables of the inputs.
 
-        Args:
-            inputs: of ``T`` steps.
-            jacobians: of each flattened input: ``[T, N * 13, Z]``, ``[T, A, Z]``, ``[T, N * 13, Z]``.
-
-        Raises:
-            ValueError: if autograd cannot differentiate the reward, or its shape is wrong.
+        ``inputs`` are those of ``T`` steps, with Jacobians ``[T, N * 13, Z]``, ``[T, A, Z]`` and ``[T, N * 13, Z]``.
+        ValueError if autograd cannot differentiate the reward, or its shape is wrong.
         """
         num = jacobians[0].shape[-1]
         with torch.inference_mode(False), torch.enable_grad():
             columns = [torch.from_numpy(np.ascontiguousarray(j)).to(self.device) for j in jacobians]
             gradients, _ = self._gradients(self._tensors(inputs))
-            terms = [_transposed(j, g.flatten(1)) for j, g in zip(columns, gradients, strict=True)]
+            terms = [
+                (j.transpose(1, 2) @ g.flatten(1).unsqueeze(-1)).squeeze(-1)
+                for j, g in zip(columns, gradients, strict=True)
+            ]
             gradient = (terms[0] + terms[1] + terms[2]).detach().cpu().numpy()
             hessian = torch.zeros(len(inputs[1]), num, num, dtype=torch.float64)
             if any(g.requires_grad for g in gradients):
@@ -86,7 +80,3 @@ class RewardExpansion:
 
     def _tensors(self, inputs: Inputs) -> tuple[Tensor, ...]:
         return tuple(torch.from_numpy(np.array(x, dtype=np.float64, order="C")).to(self.device) for x in inputs)
-
-
-def _transposed(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix.transpose(1, 2) @ vector.unsqueeze(-1)).squeeze(-1)

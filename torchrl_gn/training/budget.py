@@ -11,17 +11,11 @@ _CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
 @dataclass(frozen=True)
 class Budget:
-    """Limits on optimiser steps and training minutes; training ends at the first one reached.
-
-    Attributes:
-        steps: positive number of optimiser steps; None: no limit.
-        minutes: positive minutes of training, summed over resumed runs; None: no limit.
-        clock: ``"wall"`` time, or ``"processor"`` time, which sums over threads.
-    """
+    """Limits on optimiser steps and training minutes; training ends at the first one reached. One must be given."""
 
     steps: int | None = None
-    minutes: float | None = None
-    clock: str = "wall"
+    minutes: float | None = None  # summed over resumed runs
+    clock: str = "wall"  # or "processor", which sums over threads
 
     def __post_init__(self) -> None:
         if self.clock not in _CLOCKS:

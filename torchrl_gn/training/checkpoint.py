@@ -29,26 +29,13 @@ CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
 FORMAT = 4
 """Version of the checkpoint format that this package writes and reads."""
 
-_PACKAGES = (
-    "torchrl_gn",
-    "torch",
-    "torchrl",
-    "tensordict",
-    "torch-geometric",
-    "mujoco",
-    "dm-control",
-    "numpy",
-)
+_PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
 
 Trained = ForwardModel | IdentifyingModel | Agent
 """What a checkpoint can hold."""
 
-KINDS: dict[str, type[Trained]] = {
-    "forward_model": ForwardModel,
-    "identifying_model": IdentifyingModel,
-    "agent": Agent,
-}
+KINDS: dict[str, type[Trained]] = {"forward_model": ForwardModel, "identifying_model": IdentifyingModel, "agent": Agent}
 """What checkpoints hold, by the name that they call it."""
 
 
@@ -61,48 +48,27 @@ class CheckpointError(ValueError):
 
 @dataclass
 class Checkpoint:
-    """What a checkpoint file holds.
-
-    Attributes:
-        trained: the model with its weights and normalisers.
-        scene_descriptions: descriptions of the scenes it was trained on.
-        config: configuration of the run that made it.
-        versions: package versions of that run.
-        metrics: what was measured of the model.
-        training: nested state of the training, empty if only the model was saved.
-    """
+    """What a checkpoint file holds."""
 
     trained: Trained
     scene_descriptions: list[dict]
-    config: dict
-    versions: dict
+    config: dict  # of the run that made it
+    versions: dict  # of packages, likewise
     metrics: dict = field(default_factory=dict)
-    training: dict = field(default_factory=dict)
+    training: dict = field(default_factory=dict)  # nested state to resume from
 
     @property
     def model(self) -> ForwardModel:
-        """The forward model.
-
-        Raises:
-            CheckpointError: if it is another kind of model.
-        """
+        """The forward model; CheckpointError if it is another kind of model."""
         return self._as(ForwardModel)
 
     def bind(self, scene: Scene, **options) -> Predictor:
-        """The forward model joined to a scene, see :meth:`ForwardModel.bind`.
-
-        Raises:
-            CheckpointError: if it is another kind of model.
-        """
+        """The forward model joined to a scene, see :meth:`ForwardModel.bind`."""
         return self.model.bind(scene, **options)
 
     @property
     def agent(self) -> Agent:
-        """The agent.
-
-        Raises:
-            CheckpointError: if it is a model without a policy.
-        """
+        """The agent; CheckpointError if it is a model without a policy."""
         return self._as(Agent)
 
     def _as(self, kind: type[_Kind]) -> _Kind:
@@ -113,15 +79,11 @@ class Checkpoint:
         return self.trained
 
     def scenes(self) -> list[Scene]:
-        """The scenes that the model was trained on, built again."""
+        """The scenes that the model was trained on."""
         return [scene_from_description(description) for description in self.scene_descriptions]
 
     def scene(self) -> Scene:
-        """The one scene that the model was trained on, built again.
-
-        Raises:
-            CheckpointError: if it was trained on several.
-        """
+        """The one scene that the model was trained on; CheckpointError if there were several."""
         if len(self.scene_descriptions) != 1:
             names = [scene.name for scene in self.scenes()]
             raise CheckpointError(
@@ -132,7 +94,7 @@ class Checkpoint:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of the packages that decide what a run computes."""
+    """Return the versions of the packages that decide what a run computes."""
     versions = {}
     for name in _PACKAGES:
         try:
@@ -154,17 +116,13 @@ def save_checkpoint(
     """Write a checkpoint, atomically and without pickle.
 
     Args:
-        path: file to write, ``.safetensors``.
-        model: the model.
         scene: the scene, or scenes, it is trained on; none of an agent, which holds its graph.
-        config: configuration of the run, plain JSON-able values.
-        metrics: what was measured of the model, plain JSON-able values.
+        config: configuration of the run; like ``metrics``, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
     """
     tensors: dict[str, Tensor] = {}
     plain = _flatten(training or {}, "training", tensors)
-    for name, value in model.state_dict().items():
-        tensors[f"model.{name}"] = value
+    tensors |= {f"model.{name}": value for name, value in model.state_dict().items()}
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     description = {
         "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind)),
@@ -182,15 +140,10 @@ def save_checkpoint(
 
 
 def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
-    """Read a checkpoint.
-
-    Weights stored in half precision, as shipped ones are, compute in single precision.
-
-    Args:
-        path: the file, or the run folder that holds it.
+    """Read a checkpoint file, or that of a run folder. Weights in half precision compute in single precision.
 
     Raises:
-        CheckpointError: if the file is missing, damaged, of a newer format or no checkpoint, or holds NaN or Inf.
+        CheckpointError: the file is missing, damaged, of another format or no checkpoint, or holds NaN or Inf.
     """
     path = Path(path)
     if path.is_dir():
@@ -228,14 +181,8 @@ def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
             f"Checkpoint {path} is of another version of torchrl_gn, whose networks are not built as here ({what});"
             " train again."
         ) from error
-    return Checkpoint(
-        trained=model,
-        scene_descriptions=description["scenes"],
-        config=description["config"],
-        versions=description["versions"],
-        metrics=description["metrics"],
-        training=_unflatten(description["training"], tensors),
-    )
+    plain = {name: description[name] for name in ("config", "versions", "metrics")}
+    return Checkpoint(model, description["scenes"], **plain, training=_unflatten(description["training"], tensors))
 
 
 def _digest(tensors: Mapping[str, Tensor], text: str) -> str:
@@ -253,8 +200,7 @@ def _flatten(value: Any, prefix: str, tensors: dict[str, Tensor]) -> Any:
         tensors[prefix] = value
         return {"tensor": prefix}
     if isinstance(value, Mapping):
-        items = [[key, _flatten(item, f"{prefix}.{key}", tensors)] for key, item in value.items()]
-        return {"dict": items}
+        return {"dict": [[key, _flatten(item, f"{prefix}.{key}", tensors)] for key, item in value.items()]}
     if isinstance(value, (list, tuple)):
         return {"list": [_flatten(item, f"{prefix}.{index}", tensors) for index, item in enumerate(value)]}
     if value is None or isinstance(value, (bool, int, float, str)):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import TensorDictReplayBuffer
@@ -18,13 +18,9 @@ from torchrl.envs.utils import ExplorationType
 def make_collector(
     env: EnvBase | Sequence[Callable[[], EnvBase]], policy: TensorDictModuleBase, *, seed: int | None, **options: Any
 ) -> BaseCollector:
-    """Make a collector that explores.
+    """Make a collector that explores, with further options of ``torchrl.collectors.Collector``.
 
-    Args:
-        env: environments, or functions that make some, each for a Ray actor.
-        policy: exploration policy.
-        seed: seed of the environments; None keeps theirs.
-        options: further options of ``torchrl.collectors.Collector``.
+    ``env`` are environments, or functions that make some, each for a Ray actor; ``seed=None`` keeps their seeds.
     """
     options |= {"exploration_type": ExplorationType.RANDOM}
     collector_kwargs: dict[str, Any] = {"track_traj_ids": False, "auto_register_policy_transforms": False}
@@ -51,7 +47,7 @@ def buffer_state(buffer: TensorDictReplayBuffer) -> dict[str, torch.Tensor]:
     """Return the transitions of a replay buffer by dotted key, oldest first, each ``[size, ...]``."""
     filled = buffer.storage[: len(buffer)] if len(buffer) else TensorDict()
     oldest = int(buffer.writer.state_dict()["_cursor"]) % max(1, len(buffer))
-    return {".".join(key): value.roll(-oldest, 0) for key, value in _leaves(filled)}
+    return {str(key): cast(torch.Tensor, value).roll(-oldest, 0) for key, value in filled.flatten_keys(".").items()}
 
 
 def load_buffer_state(buffer: TensorDictReplayBuffer, state: dict[str, torch.Tensor], capacity: int) -> None:
@@ -60,8 +56,3 @@ def load_buffer_state(buffer: TensorDictReplayBuffer, state: dict[str, torch.Ten
         flat = TensorDict(state)
         flat.auto_batch_size_(1)
         buffer.extend(flat.unflatten_keys(".")[-capacity:])
-
-
-def _leaves(tensordict: TensorDictBase) -> Iterator[tuple[tuple[str, ...], torch.Tensor]]:
-    for key, value in tensordict.items(include_nested=True, leaves_only=True):
-        yield ((key,) if isinstance(key, str) else key), cast(torch.Tensor, value)

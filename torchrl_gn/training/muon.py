@@ -25,15 +25,7 @@ class Muon(torch.optim.Optimizer):
 
     The update is the nearest semi-orthogonal matrix to the Nesterov momentum, times ``lr * sqrt(max(1, rows /
     columns))``: that of ``torch.optim.Muon`` without weight decay, but in the parameter's float32 or float64 (float32
-    for 16-bit ones) instead of bfloat16.
-
-    Args:
-        params: matrices, or parameter groups of them.
-        lr: learning rate: the singular values of an update.
-        momentum: weight of past gradients.
-
-    Raises:
-        ValueError: if a parameter is not a matrix, ``lr`` is negative or not finite, or ``momentum`` not in [0, 1).
+    for 16-bit ones) instead of bfloat16. ``params`` are matrices, or parameter groups of them.
     """
 
     def __init__(self, params: Iterable[Any], lr: float = 1e-2, *, momentum: float = 0.95) -> None:

@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import torch
@@ -14,35 +14,37 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import HardUpdate, LossModule
 
 from torchrl_gn.dynamics.executors.compiled import check_compiler, check_torch
 from torchrl_gn.finite import require_finite
 from torchrl_gn.policies import Agent
 from torchrl_gn.training.experience import buffer_state, load_buffer_state, make_collector
-from torchrl_gn.training.learning_curve import LearningCurve
 from torchrl_gn.training.optimizers import clip_gradients
 
 _KEPT = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
 
+@dataclass
+class LearningCurve:
+    """Mean returns, each with the frames, updates and seconds before it."""
+
+    frames: list[float] = field(default_factory=list)
+    updates: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
+
+
 @dataclass(frozen=True)
 class LearningProgress:
-    """State of the training after a batch of experience.
-
-    Attributes:
-        frames: environment steps, over all environments and resumed runs.
-        updates: gradient steps.
-        seconds: training seconds over all resumed runs, without evaluation.
-        losses: mean of each loss over the batch's updates.
-        evaluation: mean return of evaluation episodes, if there were any.
-    """
+    """State of the training after a batch of experience; frames, updates and seconds sum over resumed runs."""
 
     frames: int
     updates: int
-    seconds: float
-    losses: dict[str, float]
-    evaluation: float | None = None
+    seconds: float  # without evaluation
+    losses: dict[str, float]  # means over the batch's updates
+    evaluation: float | None = None  # mean return of evaluation episodes
 
 
 class OffPolicyTrainer:
@@ -52,26 +54,17 @@ class OffPolicyTrainer:
         agent: the networks; their normalisers take every new transition once.
         losses: first a loss with target networks (``DDPGLoss``, :class:`~torchrl_gn.objectives.SVGLoss`), then others.
         env: environments ``[num_envs]`` to collect in; or functions that make some, each for a collector on a Ray
-            cluster (enter :class:`~torchrl_gn.training.RayCluster` first), which gets the latest policy.
-        exploration_policy: policy to collect with.
+            cluster (enter :class:`~torchrl_gn.training.RayCluster` first).
         evaluate: returns the mean return of the current policy.
         optimizer: optimiser of all weights that the losses train.
-        frames: total number of environment steps.
-        batch_size: transitions per update.
         frames_per_batch: environment steps between updates; a multiple of ``num_envs``.
         updates_per_frame: gradient steps per environment step.
         random_frames: initial environment steps of random actions, without updates.
         evaluate_frames: environment steps between evaluations.
-        capacity: transitions that the replay buffer holds.
         target_interval: updates between copies to the target networks (paper: 1000).
         max_norm: norm that the joint gradient is clipped to.
         compile: compile losses and gradients: minutes at the second update, then 1.6 to 1.9 times as fast.
         seed: seed of the replay buffer, and of the environments of a resumed run.
-
-    Raises:
-        ValueError: if the frames do not fit the environments, or a number is not positive.
-        FileNotFoundError: with ``compile``, without a C++ compiler on a CPU.
-        RuntimeError: with ``compile``, if torch is too old.
     """
 
     def __init__(
@@ -99,15 +92,9 @@ class OffPolicyTrainer:
             raise ValueError(
                 f"frames_per_batch={frames_per_batch} must be a multiple of {env.batch_size.numel()} environments."
             )
-        for name, value in (
-            ("frames", frames),
-            ("batch_size", batch_size),
-            ("updates_per_frame", updates_per_frame),
-            ("evaluate_frames", evaluate_frames),
-            ("capacity", capacity),
-            ("target_interval", target_interval),
-            ("max_norm", max_norm),
-        ):
+        positive = {"frames": frames, "batch_size": batch_size, "updates_per_frame": updates_per_frame}
+        positive |= {"evaluate_frames": evaluate_frames, "capacity": capacity}
+        for name, value in {**positive, "target_interval": target_interval, "max_norm": max_norm}.items():
             if not 0 < value < math.inf:
                 raise ValueError(f"{name}={value} must be positive and finite.")
         self.agent, self.losses, self.env = agent, list(losses), env
@@ -134,11 +121,7 @@ class OffPolicyTrainer:
         self._loss = self._first_loss if compile else self._total_loss
 
     def run(self) -> Iterator[LearningProgress]:
-        """Train until all frames are spent, yielding after every batch.
-
-        Raises:
-            FloatingPointError: if a loss or a gradient is not finite; no weight changes.
-        """
+        """Train until all frames are spent, yielding after every batch; raises what :meth:`update` does."""
         if not self.curve.frames:
             self._evaluate()
         if self.owed >= 1 or self._evaluation_is_due:  # interrupted between a batch and its updates
@@ -188,11 +171,7 @@ class OffPolicyTrainer:
         return passed or self.frames >= self.total and self.frames > last
 
     def remember(self, batch: TensorDictBase) -> None:
-        """Add transitions ``[*B]`` to the replay buffer and the agent's normalisers.
-
-        Raises:
-            ValueError: if a number is not finite.
-        """
+        """Add finite transitions ``[*B]`` to the replay buffer and the agent's normalisers; else raise ValueError."""
         steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1).to(self._weights[0].device)
         require_finite(steps, "Experience")
         self.agent.update_normalizers(steps["observation"], steps["action"], steps["next", "observation"])
@@ -204,8 +183,7 @@ class OffPolicyTrainer:
     def update(self) -> dict[str, float]:
         """Take one gradient step on transitions from the replay buffer; return the losses by name.
 
-        Raises:
-            FloatingPointError: if a loss or a gradient is not finite; no weight changes.
+        FloatingPointError, and no change, if a loss or a gradient is not finite.
         """
         total, losses = self._loss(self.buffer.sample().to(self._weights[0].device))
         values = {name: float(value) for name, value in losses.items()}
@@ -238,9 +216,8 @@ class OffPolicyTrainer:
 
     def _evaluate(self) -> float:
         value = self.evaluate()
-        self.curve.frames.append(self.frames)
-        self.curve.updates.append(self.updates)
-        self.curve.seconds.append(self.seconds)
+        for name in ("frames", "updates", "seconds"):
+            getattr(self.curve, name).append(getattr(self, name))
         self.curve.returns.append(value)
         return value
 
@@ -257,11 +234,7 @@ class OffPolicyTrainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from what :meth:`state_dict` returned.
-
-        Raises:
-            ValueError: if it has more frames than this training; nothing changes.
-        """
+        """Resume from what :meth:`state_dict` returned; ValueError if it has more frames than this training."""
         frames = state["progress"]["frames"]
         if frames >= self.total + self.per_batch:
             raise ValueError(f"The checkpoint has {frames} frames already; give frames={frames} or more to resume.")
@@ -275,3 +248,18 @@ class OffPolicyTrainer:
         self.curve = LearningCurve(**{name: list(values) for name, values in state["curve"].items()})
         for name, value in state["progress"].items():
             setattr(self, name, value)
+
+
+@torch.no_grad()
+def mean_return(env: EnvBase, policy: TensorDictModuleBase, steps: int, *, seed: int = 0) -> float:
+    """Return the mean return of one episode per environment ``[num_envs]``, without exploration.
+
+    Episodes last ``steps`` control steps or less; compare policies with the same ``seed``.
+    """
+    env.set_seed(seed)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rollout = env.rollout(steps, policy, break_when_any_done=False, break_when_all_done=True)
+    reward, done = rollout["next", "reward"], rollout["next", "done"]
+    # Environments reset themselves when done: count the first episode only.
+    first_episode = torch.cat((torch.ones_like(done[:, :1]), (~done[:, :-1]).cumprod(1).bool()), dim=1)
+    return float((reward * first_episode).sum(1).mean())

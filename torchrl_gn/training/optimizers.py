@@ -21,7 +21,7 @@ class ScheduledOptimizer:
     Args:
         optimizers: the optimisers, at their peak learning rates.
         schedule: factor on the learning rates from ``(step, fraction of the budget spent)``; None: no change.
-        max_norm: positive norm (else a ValueError) that the joint gradient is clipped to; infinite: no clipping.
+        max_norm: positive norm that the joint gradient is clipped to; infinite: no clipping.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class ScheduledOptimizer:
 
     @classmethod
     def of(cls, optimizer: ScheduledOptimizer | torch.optim.Optimizer) -> ScheduledOptimizer:
-        """Wrap an optimiser of ``torch.optim`` without schedule or clipping; raise TypeError for anything else."""
+        """Wrap an optimiser of ``torch.optim`` without schedule or clipping."""
         if isinstance(optimizer, cls):
             return optimizer
         if not isinstance(optimizer, torch.optim.Optimizer):
@@ -56,12 +56,8 @@ class ScheduledOptimizer:
     def step(self, step: int, fraction: float) -> float:
         """Clip the gradients, set the learning rates, update the parameters; return the norm before clipping.
 
-        Args:
-            step: updates done before this one.
-            fraction: share of the training budget spent, 0 to 1.
-
-        Raises:
-            FloatingPointError: if the gradient is not finite; no parameter changes.
+        ``step`` updates are done, and a ``fraction`` 0 to 1 of the budget is spent. FloatingPointError, and no change,
+        if the gradient is not finite.
         """
         norm = clip_gradients(self._parameters, self.max_norm, f"step {step}")
         factor = None if self.schedule is None else self.schedule(step, fraction)
@@ -94,13 +90,9 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
     """Make a preset optimiser for a module's parameters.
 
     Args:
-        module: the module to train.
         preset: ``"muon"`` (Muon 1e-2 on matrices, Adam 1e-3 on the rest, cosine to 0), ``"adam"`` (1e-3, cosine to 0)
             or ``"paper"`` (Adam 1e-4, times 0.975 every 50,000 steps: SM "Training details").
         lr: peak learning rate (of Muon's matrices), instead of the preset's.
-
-    Raises:
-        ValueError: if the preset is unknown or ``lr`` is not positive and finite.
     """
     if preset not in get_args(Preset):
         raise ValueError(f"Optimiser preset {preset!r} is not known; use one of {list(get_args(Preset))}.")
@@ -113,11 +105,8 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
         return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or rate, fused=True)], schedule)
     matrices = [parameter for parameter in parameters if parameter.ndim == 2]
     rest = [parameter for parameter in parameters if parameter.ndim != 2]
-    optimizers: list[torch.optim.Optimizer] = []
-    if matrices:
-        optimizers.append(Muon(matrices, lr=lr or 1e-2))
-    if rest:
-        optimizers.append(torch.optim.Adam(rest, lr=1e-3, fused=True))
+    optimizers: list[torch.optim.Optimizer] = [Muon(matrices, lr=lr or 1e-2)] if matrices else []
+    optimizers += [torch.optim.Adam(rest, lr=1e-3, fused=True)] if rest else []
     return ScheduledOptimizer(optimizers, _cosine)
 
 
@@ -126,14 +115,7 @@ def make_agent_optimizer(
 ) -> torch.optim.Optimizer:
     """Make one Adam for an agent's networks.
 
-    Args:
-        losses: the loss of policy and value (``DDPGLoss``, ``SVGLoss``) first, then those of model and reward.
-        policy_lr: learning rate of the policy.
-        value_lr: learning rate of the value.
-        model_lr: learning rate of model and reward.
-
-    Raises:
-        ValueError: if a needed rate is missing, or not positive and finite.
+    ``losses`` are that of policy and value first, then those of model and reward, which need ``model_lr``.
     """
     first = cast(Any, losses[0])
     groups = [(first.actor_network_params, policy_lr, "policy_lr"), (first.value_network_params, value_lr, "value_lr")]

@@ -1,19 +1,23 @@
-"""Progress bars of long work: data collection and training, with checkpoints."""
+"""Progress bars, checkpoints and reports of data collection and training."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from torchrl_gn.atomic import write_json
 from torchrl_gn.data import TrajectoryDataset, create_dataset
+from torchrl_gn.evaluation import plot_learning_curves
 from torchrl_gn.evaluation.errors import HORIZONS
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
+from torchrl_gn.training.off_policy import OffPolicyTrainer
 from torchrl_gn.training.ray_cluster import RayCluster
+from torchrl_gn.training.run_folder import RunFolder
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
 
@@ -36,31 +40,21 @@ def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
 def dataset_with_progress(
     folder: Path, scene: Scene, data: Mapping[str, Any], *, variants: int | None = None
 ) -> TrajectoryDataset:
-    """Create, complete or open a system's data set, with a progress bar.
+    """Create, complete or open the data set ``<name>`` (``<name>_variants``) in ``folder``, with a progress bar.
 
-    Args:
-        folder: parent of the data sets ``<name>`` and, with variants, ``<name>_variants``.
-        scene: the scene.
-        data: numbers of ``train``, ``validation`` and ``test`` trajectories, ``length`` in control steps, ``seed``, and
-            optionally ``ray``, the address of a Ray cluster to simulate on.
-        variants: random variants per split. Default: the scene itself.
-
-    Raises:
-        ValueError: if trajectories are shorter than the longest rollout measured.
+    ``data`` holds the numbers of ``train``, ``validation`` and ``test`` trajectories, ``length`` in control steps,
+    ``seed`` and optionally ``ray``, the address of a Ray cluster to simulate on.
     """
     if data["length"] < HORIZON:
         raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
     name = scene.name if variants is None else f"{scene.name}_variants"
     options: dict[str, Any] = {split: data[split] for split in ("train", "validation", "test")}
     options |= {"steps": data["length"], "seed": data["seed"], "variants": variants}
-    address = data.get("ray")
-    with collecting(f"data of {scene.name}") as show:
-        if address is None:
-            return create_dataset(folder / name, scene, **options, progress=show)
-        with RayCluster(address) as cluster:
-            # The cluster simulates one chunk per core.
+    joined = RayCluster(data["ray"]) if data.get("ray") is not None else nullcontext()
+    with collecting(f"data of {scene.name}") as show, joined as cluster:
+        if cluster is not None:  # it simulates one chunk per core
             options |= {"map_chunks": cluster.imap, "num_threads": 1}
-            return create_dataset(folder / name, scene, **options, progress=show)
+        return create_dataset(folder / name, scene, **options, progress=show)
 
 
 def cut_short_note(trainer: Trainer, folder: Path) -> str | None:
@@ -104,19 +98,8 @@ def train_with_progress(
 ) -> dict[str, list]:
     """Train with a progress bar; save regularly, on Ctrl-C and, with the best weights, at the end.
 
-    With several processes, only rank 0 shows, logs and saves.
-
-    Args:
-        trainer: the trainer.
-        path: checkpoint to write.
-        resumed: checkpoint to resume from, if any.
-        tracker: logs losses and validation errors.
-        scene: the scene, or scenes, trained on.
-        config: configuration of the run; ``checkpoint_seconds`` are the training seconds between checkpoints.
-        name: prefix of logged names, if a run trains several models.
-
-    Returns:
-        ``"seconds"`` and mean ``"loss"`` of every 100 steps.
+    With several processes, only rank 0 shows, logs (with prefix ``name``) and saves, every ``checkpoint_seconds`` of
+    ``config``. Returns ``"seconds"`` and mean ``"loss"`` of every 100 steps.
     """
     prefix = f"{name}/" if name else ""
     curves: dict[str, list] = {"seconds": [], "loss": []}
@@ -160,3 +143,64 @@ def train_with_progress(
     trainer.restore_best()
     save()
     return curves
+
+
+def learn_with_progress(
+    trainer: OffPolicyTrainer, path: Path, resumed: Checkpoint | None, tracker: Tracker, *, config: Mapping[str, Any]
+) -> None:
+    """Train a policy with a progress bar; save every ``checkpoint_seconds`` of ``config``, on Ctrl-C and at the end."""
+    if resumed is not None:
+        trainer.load_state_dict(resumed.training)
+
+    def save() -> None:
+        save_checkpoint(path, trainer.agent, config=config, training=trainer.state_dict())
+
+    with (
+        tqdm(total=trainer.total, initial=trainer.frames, unit=" frames", desc="learning", leave=False) as bar,
+        saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
+    ):
+        for progress in trainer.run():
+            bar.update(progress.frames - bar.n)
+            tracker.log({f"train/{name}": value for name, value in progress.losses.items()}, progress.frames)
+            if progress.evaluation is not None:
+                bar.set_postfix({"return": f"{progress.evaluation:.4g}", "updates": progress.updates})
+                numbers = {"return": progress.evaluation, "updates": progress.updates, "seconds": progress.seconds}
+                tracker.log({f"evaluation/{name}": value for name, value in numbers.items()}, progress.frames)
+            save_when_due()
+    save()
+
+
+def report_learning(
+    trainer: OffPolicyTrainer,
+    run: RunFolder,
+    tracker: Tracker,
+    *,
+    label: str,
+    seed: int,
+    more: Mapping[str, float] | None = None,
+) -> None:
+    """Write ``curve.json``, ``curve.png`` and ``metrics.json``; print a table and the paths.
+
+    ``label`` names the agent in the figure; ``more`` are further metrics.
+    """
+    curve = trainer.curve
+    write_json(run.file("curve.json"), vars(curve))
+    plot_learning_curves({label: (curve.frames, [curve.returns])}, run.file("curve.png"))
+    last = curve.returns[-max(1, len(curve.returns) // 10) :]
+    numbers = {
+        "return": curve.returns[-1],
+        "best_return": max(curve.returns),
+        "last_tenth_return": sum(last) / len(last),
+        "frames": trainer.frames,
+        "updates": trainer.updates,
+        "learning_seconds": trainer.seconds,
+        "updates_per_second": trainer.updates / max(trainer.seconds, 1e-9),
+        "frames_per_second": trainer.frames / max(trainer.seconds, 1e-9),
+        **(more or {}),
+    }
+    run.write_metrics(numbers, seed=seed)
+    files = [*run.written, run.checkpoint]
+    tracker.finish(numbers, files, trainer.frames)
+    width = max(map(len, numbers))
+    for line in [*(f"{name:{width}}  {value:,.4g}" for name, value in numbers.items()), *map(str, files)]:
+        tqdm.write(line)

@@ -15,13 +15,8 @@ R = TypeVar("R")
 class RayCluster:
     """Context manager that joins a Ray cluster, whose machines have this package and share the files of the tasks.
 
-    Args:
-        address: ``"auto"``, the address of a running cluster, or ``"local"`` for a temporary one on this machine.
-        cpus: cores per task.
-
-    Raises:
-        ImportError: if Ray is not installed.
-        ConnectionError: on entry, if there is no cluster at the address.
+    The address is ``"auto"``, that of a running cluster, or ``"local"`` for a temporary one on this machine; a task
+    takes ``cpus`` cores. ConnectionError on entry if there is no cluster at the address.
     """
 
     def __init__(self, address: str, *, cpus: int = 1) -> None:

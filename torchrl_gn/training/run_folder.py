@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,23 +13,29 @@ from typing import Any, ClassVar
 from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.processor import instruction_sets, processor_name, restrictions
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
-from torchrl_gn.training.config import plain_config
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.json"
 _RECIPE = "# A run of "  # the first line of CONFIG_FILE, with the recipe's name
 
 
+def plain_config(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration, as Hydra gives it or otherwise, in dictionaries, lists and plain values, references resolved."""
+    return {str(name): _plain(value) for name, value in config.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return plain_config(value)
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(each) for each in value]
+    return value
+
+
 class RunFolder:
     """Folder with a run's configuration, metrics, checkpoint, figures and videos; an existing one is resumed.
 
-    Args:
-        path: the folder. Default: ``runs/<name>/<time>``.
-        name: name of the recipe.
-
-    Raises:
-        NotADirectoryError: if ``path`` is a file.
-        ValueError: if it holds a run of another recipe.
+    Default: ``runs/<name>/<time>``. A ValueError if it holds a run of another recipe.
     """
 
     _latest: ClassVar[RunFolder | None] = None
@@ -38,19 +44,14 @@ class RunFolder:
         self.path = Path(path) if path else _new_folder(Path("runs") / name)
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"run_dir={self.path} is a file; name a folder.")
-        self.name = name
-        self._refuse_another_recipe()
+        self.name, config = name, self.path / CONFIG_FILE
+        first = config.read_text().partition("\n")[0] if config.exists() else ""
+        if first.startswith(_RECIPE) and (other := first.removeprefix(_RECIPE)) != name:
+            raise ValueError(f"run_dir={self.path} holds a run of {other}, not of {name}. Name a new run_dir.")
         self.path.mkdir(parents=True, exist_ok=True)
         self._start = time.perf_counter()
         self._written: list[Path] = []
         RunFolder._latest = self
-
-    def _refuse_another_recipe(self) -> None:
-        config = self.path / CONFIG_FILE
-        first = config.read_text().partition("\n")[0] if config.exists() else ""
-        if first.startswith(_RECIPE) and first != _RECIPE + self.name:
-            other = first.removeprefix(_RECIPE)
-            raise ValueError(f"run_dir={self.path} holds a run of {other}, not of {self.name}. Name a new run_dir.")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -87,15 +88,9 @@ class RunFolder:
         return [path for path in self._written if path.exists()]
 
     def refuse_changes(self, before: Mapping[str, Any], now: Mapping[str, Any], *, free: Collection[str]) -> None:
-        """Refuse to resume a run with other options.
+        """Raise ValueError, naming the options that differ, if a run would resume with others than ``free`` ones.
 
-        Args:
-            before: configuration of the run so far.
-            now: configuration to resume with.
-            free: options that may differ: ``"minutes"``, ``"data.folder"`` or all of ``"data"``, for example.
-
-        Raises:
-            ValueError: naming every other option that differs.
+        ``"data.folder"`` frees one option of a group, ``"data"`` all of it.
         """
         old, new = _flat(plain_config(before)), _flat(plain_config(now))
         changed = [
@@ -114,12 +109,9 @@ class RunFolder:
             temporary.write_text(f"{_RECIPE}{self.name}\n{text}")
 
     def write_metrics(self, metrics: Mapping[str, Any], *, seed: int) -> dict[str, Any]:
-        """Write ``metrics.json``, with processor, versions, seed and seconds; return its content.
-
-        Numbers that are not finite, such as the error of a diverged rollout, become null.
-        """
+        """Write ``metrics.json``, with processor, versions, seed and seconds; NaN and infinity become null."""
         everything = {
-            **{key: _finite_or_none(value) for key, value in metrics.items()},
+            **{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in metrics.items()},
             "seed": seed,
             "wall_clock_seconds": round(time.perf_counter() - self._start, 3),
             "processor": ", ".join([processor_name(), instruction_sets(), *restrictions()]),
@@ -145,12 +137,5 @@ def _new_folder(parent: Path) -> Path:
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[f"{prefix}{name}"] = value
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return flat
-
-
-def _finite_or_none(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -10,24 +10,17 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
-from torchrl_gn.training.config import plain_config
+from torchrl_gn.training.run_folder import plain_config
 
 LoggerKind = Literal["none", "csv", "tensorboard", "wandb"]
 
 
 class Tracker:
-    """Log numbers, figures, videos and configuration of a run.
+    """Log numbers, figures, videos and configuration of a run; ImportError if wandb or tensorboard is not installed.
 
     Args:
-        kind: ``"none"``, ``"csv"``, ``"tensorboard"`` or ``"wandb"``; wandb runs offline without an account (API key or
-            login), and ``wandb sync`` uploads later.
+        kind: wandb runs offline without an account (API key or login), and ``wandb sync`` uploads later.
         folder: the logger's folder, inside the run folder.
-        name: name of the run.
-        config: configuration of the run, from Hydra or as plain values.
-
-    Raises:
-        ValueError: if the kind is unknown.
-        ImportError: if wandb or tensorboard is not installed.
     """
 
     def __init__(self, kind: LoggerKind, folder: Path, *, name: str, config: Mapping[str, Any]) -> None:
@@ -37,9 +30,9 @@ class Tracker:
         self._logger: Any = None
         if kind == "none":
             return
-        config = plain_config(config)
         from torchrl.record.loggers import get_logger
 
+        config, versions = plain_config(config), package_versions()
         options: dict[str, Any] = {}
         if kind == "wandb":
             options["wandb_kwargs"] = {
@@ -54,12 +47,12 @@ class Tracker:
         folder.mkdir(parents=True, exist_ok=True)
         self._logger = get_logger(kind, logger_name=str(folder), experiment_name=name, **options)
         if kind == "wandb":
-            self._logger.experiment.config.update({"versions": package_versions()})
+            self._logger.experiment.config.update({"versions": versions})
         elif kind == "tensorboard":
-            text = json.dumps({**config, "versions": package_versions()}, indent=2)
+            text = json.dumps({**config, "versions": versions}, indent=2)
             self._logger.experiment.add_text("config", f"```json\n{text}\n```")
         else:
-            self._logger.log_hparams({**config, "versions": package_versions()})
+            self._logger.log_hparams({**config, "versions": versions})
 
     def log(self, numbers: Mapping[str, float], step: int) -> None:
         """Log numbers at a step; skip other entries."""

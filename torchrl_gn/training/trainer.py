@@ -19,45 +19,28 @@ from torchrl_gn.training.workers import Workers
 
 @dataclass(frozen=True)
 class Progress:
-    """State of the training after a step.
-
-    Attributes:
-        step: optimiser steps done.
-        seconds: training seconds over all resumed runs.
-        fraction: share of the budget spent, 0 to 1.
-        loss: loss of this step's batch.
-        validation: validation error, if measured after this step.
-    """
+    """State of the training after a step."""
 
     step: int
-    seconds: float
-    fraction: float
+    seconds: float  # over all resumed runs
+    fraction: float  # of the budget spent
     loss: float
-    validation: float | None = None
+    validation: float | None = None  # error, if measured after this step
 
 
 class Trainer:
     """Train a forward model from a replay buffer; iterate over :meth:`run`.
 
-    With several ``workers``, each process runs a trainer on its shard of every batch; gradients are averaged, and the
-    clock, validation and checkpoint of rank 0 count. The result equals that of one process up to rounding and input
-    noise, which every process draws on its own.
+    With several ``workers``, each process trains on its shard of every batch; gradients are averaged, and the clock,
+    validation and checkpoint of rank 0 count. The result equals that of one process up to rounding and input noise.
 
     Args:
-        loss: the loss of one or several scenes; holds the model to train.
-        buffer: replay buffer of transitions.
         optimizer: from ``make_optimizer``, or any of ``torch.optim`` (no schedule, no clipping).
-        budget: limits of the training.
-        unroll: replay buffer of windows of several steps, for the end of the training.
-        unroll_fraction: share of the work, 0 to 1, that trains on ``unroll``.
+        unroll: replay buffer of windows of several steps, for the last ``unroll_fraction`` of the work.
         unroll_cost: cost of an update on windows, in updates on transitions.
         validate: returns the validation error; the weights with the lowest are kept (paper: 20-step rollouts).
-        validations: number of validations over the whole budget.
         patience: validations without a new best before training stops. Default: never stop early.
         workers: the processes that train together. Default: this one alone.
-
-    Raises:
-        ValueError: if ``unroll_fraction`` is not in [0, 1], or ``unroll_cost`` not positive.
     """
 
     def __init__(
@@ -106,11 +89,10 @@ class Trainer:
     def run(self) -> Iterator[Progress]:
         """Train until the budget is spent, yielding after every step.
 
-        Raises:
-            FloatingPointError: if the loss or the gradient is not finite; no weight changes.
+        FloatingPointError, and no change, if the loss or the gradient is not finite.
         """
         module, fraction = self.workers.wrap(self.loss), self.workers.agree(lambda: self.fraction)
-        while fraction < 1 and not self._patience_is_over():
+        while fraction < 1 and (self.patience is None or self.since_best < self.patience):
             with fast_matmul():
                 loss = self._update(module, fraction)
             fraction = self.workers.agree(lambda: self.fraction)
@@ -154,9 +136,6 @@ class Trainer:
         self._lap("validation", start)
         return error
 
-    def _patience_is_over(self) -> bool:
-        return self.patience is not None and self.since_best >= self.patience
-
     def _lap(self, part: str, since: float) -> float:
         now = self.budget.now()
         self.spent[part] += now - since
@@ -182,12 +161,9 @@ class Trainer:
             "samplers": {name: buffer.sampler.state_dict() for name, buffer in buffers.items() if buffer is not None},
             "best_weights": self.best_weights,
             "progress": {
-                "step": self.step,
-                "seconds": self.seconds,
+                **{name: getattr(self, name) for name in ("step", "seconds")},
                 "best": self.best if math.isfinite(self.best) else None,
-                "since_best": self.since_best,
-                "validated": self.validated,
-                "spent": self.spent,
+                **{name: getattr(self, name) for name in ("since_best", "validated", "spent")},
             },
         }
 
@@ -195,7 +171,11 @@ class Trainer:
         """Resume from what :meth:`state_dict` returned."""
         self.optimizer.load_state_dict(state["optimizer"])
         self.loss.load_training_state(state["loss"])
-        self._reseed_noise()
+        for module in () if self.workers.first else self.loss.modules():  # the state is that of rank 0
+            if isinstance(generator := getattr(module, "generator", None), torch.Generator):
+                # Drawn from the loaded state, so that every resumed run gets new seeds.
+                seeds = torch.randint(2**62, (self.workers.size,), generator=generator)
+                generator.manual_seed(int(seeds[self.workers.rank]))
         self.buffer.sampler.load_state_dict(state["samplers"]["main"])
         if self.unroll is not None and "unroll" in state["samplers"]:
             self.unroll.sampler.load_state_dict(state["samplers"]["unroll"])
@@ -206,11 +186,3 @@ class Trainer:
         self.since_best = progress["since_best"]
         # With a larger budget, a smaller share is spent and fewer validations are done.
         self.validated = min(progress["validated"], math.floor(self.fraction * self.validations))
-
-    def _reseed_noise(self) -> None:
-        """Reseed the noise on every rank but 0 after loading the state of rank 0."""
-        for module in () if self.workers.first else self.loss.modules():
-            if isinstance(generator := getattr(module, "generator", None), torch.Generator):
-                # Drawn from the loaded state, so that every resumed run gets new seeds.
-                seeds = torch.randint(2**62, (self.workers.size,), generator=generator)
-                generator.manual_seed(int(seeds[self.workers.rank]))

@@ -23,15 +23,10 @@ _TIMEOUT = timedelta(hours=12)
 
 @dataclass(frozen=True)
 class Workers:
-    """The processes that train together, as seen by this one.
+    """The processes that train together, as seen by this one."""
 
-    Attributes:
-        rank: rank of this process, from 0.
-        size: number of processes.
-    """
-
-    rank: int = 0
-    size: int = 1
+    rank: int = 0  # of this process
+    size: int = 1  # number of processes
 
     @property
     def first(self) -> bool:
@@ -60,11 +55,7 @@ class Workers:
         return float(shared) / self.size
 
     def device(self, name: str) -> torch.device:
-        """Return this process's device: ``"cuda"`` means one GPU per process of a machine.
-
-        Raises:
-            ValueError: if there is no such device.
-        """
+        """Return this process's device: ``"cuda"`` means one GPU per process. ValueError if there is no such device."""
         try:
             device = torch.device(name)
         except RuntimeError as error:

@@ -1,0 +1,47 @@
+"""Checks of what a loss reads: entries of a batch, and normalisers that have seen data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.finite import require_finite
+from torchrl_gn.policies import ObservationModel, ObservationNetwork
+
+
+def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:
+    """Entries of a batch, in the order of ``keys``; KeyError if one is missing, ValueError if NaN or Inf."""
+    values = []
+    for key in keys:
+        value = tensordict.get(key, None)
+        if value is None:
+            present = sorted(map(str, tensordict.keys(True)))
+            raise KeyError(f"{type(loss).__name__} needs {key!r}, the batch has {present}.")
+        require_finite(value, f"{key!r} of the batch")
+        values.append(value)
+    return values
+
+
+def require_fitted(loss: Any, *networks: nn.Module, remedy: str, also: Callable[[], None] | None = None) -> None:
+    """Raise RuntimeError, with a ``remedy``, if normalisers of the loss's networks have seen no data.
+
+    Reading statistics waits for the device, so a loss checks until it passes once, and never while being compiled:
+    compile it after its first call. ``also`` is a second check, which raises its own error.
+    """
+    if getattr(loss, "_fitted", False) or torch.compiler.is_compiling():
+        return
+    for part in (part for network in networks for part in network.modules()):
+        if isinstance(part, (ForwardModel, ObservationModel, ObservationNetwork)) and not part.fitted:
+            raise RuntimeError(
+                f"{type(loss).__name__}: normalisers of its {type(part).__name__} have seen no data, so it would"
+                f" read zeros. {remedy}"
+            )
+    if also is not None:
+        also()
+    loss._fitted = True
