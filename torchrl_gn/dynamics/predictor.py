@@ -224,16 +224,13 @@ class Predictor(TensorDictModuleBase):
         parameters: TensorDictBase | None = None,
         hidden_state: TensorDictBase | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
-        """Next state, and the hidden state of a recurrent model.
+        """Next state ``[*B, N, 13]``, and the next hidden state, None of a feed-forward model.
 
         Args:
             state: ``[*B, N, 13]``.
             action: ``[*B, A]``.
             parameters: physical parameters of each sample, or without batch; default: the scene's.
             hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
-
-        Returns:
-            ``[*B, N, 13]``, and the hidden state after the step, None of a feed-forward model.
 
         Raises:
             ValueError: if a shape does not fit the scene.

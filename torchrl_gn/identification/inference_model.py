@@ -51,12 +51,8 @@ class InferenceModel(nn.Module):
 
     Args:
         observed: features of a normalised observation.
-        inferred: features of the inferred static graph.
-        hidden_state: features of the hidden graph.
-        edge_hidden: hidden sizes of the edge MLP.
-        node_hidden: hidden sizes of the node MLP.
-        global_hidden: hidden sizes of the global MLP.
-        activation: between the layers.
+        inferred: numbers of node, edge and global features of the inferred static graph.
+        hidden_state: the same of the hidden graph.
         readout: estimate from several observations: the ``"mean"`` of the network's output after each, or its output
             after the ``"last"`` (paper).
 
@@ -154,16 +150,13 @@ class BoundInferenceModel(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.infer(state, action, next_state).parameters)
 
     def infer(self, state: Tensor, action: Tensor, next_state: Tensor, context: Context | None = None) -> Estimate:
-        """Estimate from a sequence of transitions.
+        """Estimate after a sequence of transitions.
 
         Args:
             state: ``[*B, T, N, 13]``.
             action: ``[*B, T, A]``, each applied in the state of its step.
             next_state: ``[*B, T, N, 13]``.
             context: of earlier observations of the same systems; default: none.
-
-        Returns:
-            The estimate after the last transition.
 
         Raises:
             ValueError: if there is no transition, or a shape does not fit the scene.
@@ -172,12 +165,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         return self._estimate(last)
 
     def identify(self, states: Tensor, actions: Tensor) -> TensorDict:
-        """The inferred graph of whole trajectories.
-
-        Args:
-            states: ``[*B, T + 1, N, 13]``.
-            actions: ``[*B, T, A]``; each leads from a state to the next.
-        """
+        """The inferred graph of whole trajectories: states ``[*B, T + 1, N, 13]``, actions ``[*B, T, A]``."""
         return self.infer(states[..., :-1, :, :], actions, states[..., 1:, :, :]).parameters
 
     def infer_each(
