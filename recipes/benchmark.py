@@ -3,11 +3,11 @@
     python recipes/benchmark.py [system=swimmer6] [minutes=4] [sizes=[64,128,256]] [mlps=[[512,512,512]]]
 
 Measures, on the same rollouts (starts and random controls as in the data sets), GN forward models of several sizes and
-MLPs, trained here for `minutes` each (or `checkpoints=[FOLDER,...]`) and evaluated plain, specialised (with
-`fast_matmul`) and, where this processor is fast at it, in bfloat16; and MuJoCo at its own and at coarser settings.
-Errors are against a finely stepped MuJoCo, relative to the constant prediction, over equal simulated time. Run time is
-wall time per simulated second of one trajectory, on `threads` threads, at every batch size: medians, all methods in
-turn. A method is on the Pareto front of a batch size if no other is both faster and more accurate.
+MLPs, trained here for `minutes` each (or `checkpoints=[FOLDER,...]`) and evaluated by message passing (reference),
+specialised (with `fast_matmul`) and, where this processor is fast at it, in bfloat16; and MuJoCo at its own and at
+coarser settings. Errors are against a finely stepped MuJoCo, relative to the persistence baseline, over equal simulated
+time. Run time is wall time per simulated second of one trajectory, on `threads` threads, at every batch size: medians,
+all methods in turn. A method is on the Pareto front of a batch size if no other is both faster and more accurate.
 
 Writes config.yaml, metrics.json, the figure work_precision.png and the trained models to its run folder; the same
 run_dir goes on where it was interrupted. Results, and when a learned model is the right choice: docs/performance.md.
@@ -22,20 +22,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 from tqdm import tqdm
 
 from _common import clean_exit, finish_run, open_run, with_help
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from _common.timing import time_in_turn
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
-from torchrl_gn.dynamics import Predictor, specialize
+from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import plot_loglog, squared_errors
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import product_speeds
@@ -59,12 +59,9 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[Path]:
     """Run folders of the models to measure, training those that are not there."""
     if cfg.checkpoints:
         return [Path(folder) for folder in cfg.checkpoints]
-    variants = {}
-    for size in cfg.sizes:
-        sizes = [f"model.{part}_hidden=[{size},{size}]" for part in ("edge", "node", "global")]
-        variants[f"gn_{size}"] = [f"model.latent={size}", *sizes]
+    variants = {f"gn_{size}": [f"model.hidden={size}"] for size in cfg.sizes}
     for hidden in cfg.mlps:
-        variants[f"mlp_{len(hidden)}x{hidden[0]}"] = ["model.core=mlp", f"model.mlp_hidden={list(hidden)}"]
+        variants[f"mlp_{len(hidden)}x{hidden[0]}"] = ["model.core=mlp", f"model.hidden={list(hidden)}"]
     shared = [f"system={cfg.system}", f"data.folder={run.data}", f"seed={cfg.seed}", f"threads={cfg.threads}"]
     shared += ["steps=null", f"minutes={cfg.minutes}", "clock=processor", *cfg.training]
     runs = [Run(FORWARD_MODEL, run.path / "models" / name, (*shared, *sizes), name) for name, sizes in variants.items()]
@@ -72,17 +69,18 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[Path]:
     return [each.folder for each in runs]
 
 
-def title(options: dict[str, Any]) -> tuple[str, str]:
+def title(model: ForwardModel) -> tuple[str, str]:
     """Kind and size of a model."""
-    if options["core"] == "mlp":
-        return "MLP", f"MLP {len(options['mlp_hidden'])} x {options['mlp_hidden'][0]}"
-    return "GN", f"GN {len(options['edge_hidden'])} x {options['edge_hidden'][0]}"
+    kind = "MLP" if model.core_name == "mlp" else "GN"
+    first = next(module for module in model.core.modules() if isinstance(module, MLP))
+    widths = [layer.out_features for layer in first if isinstance(layer, nn.Linear)]
+    return kind, f"{kind} {len(widths) - 1} x {widths[0]}"
 
 
 def predict(model: Predictor, fast: bool, physics: Tensor, state: Tensor, actions: Tensor) -> Tensor:
     """States that the model predicts."""
     with torch.no_grad(), fast_matmul() if fast else contextlib.nullcontext():
-        return model.rollout(state, actions)
+        return model.rollout(state, actions)[0]
 
 
 def learned(folders: list[Path], scene: Scene) -> list[Method]:
@@ -90,10 +88,10 @@ def learned(folders: list[Path], scene: Scene) -> list[Method]:
     methods = []
     for folder in folders:
         model = load_pretrained(folder).model.requires_grad_(False)
-        bound, (kind, name) = model.bind(scene), title(model.options)
+        bound, (kind, name) = model.bind(scene), title(model)
         if any(other.name.startswith(f"{name},") for other in methods):
             name = f"{name} ({folder.name})"
-        ways = {"plain": (model.bind(scene, plain=True), False), "specialised": (specialize(bound), True)}
+        ways = {"reference": (model.bind(scene, reference=True), False), "specialised": (specialize(bound), True)}
         if product_speeds().pays(torch.bfloat16):
             ways["bfloat16"] = (specialize(bound, dtype=torch.bfloat16), True)
         for way, (module, fast) in ways.items():

@@ -29,7 +29,7 @@ from _common import clean_exit, finish_run, open_run, with_help
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, Workers, join_workers, make_optimizer
 
 PART = "TORCHRL_GN_BENCHMARK"  # set in the processes that are timed: where they leave their times
@@ -41,7 +41,7 @@ def measure(cfg: DictConfig, batch: int, workers: Workers) -> dict[str, float]:
     torch.set_num_threads(cfg.threads)
     scene = load_scene(cfg.system)
     trajectories = collect_trajectories(scene, cfg.trajectories, seed=cfg.seed)
-    model = ForwardModel(ParameterNames.of(scene), activation="silu")
+    model = ForwardModel.for_scene(scene)
     loss = ForwardModelLoss(model.bind(scene))
     loss.fit_normalizers(trajectory_buffer(trajectories, batch_size=2000, seed=cfg.seed).sample())
     buffer = trajectory_buffer(trajectories, batch_size=batch, seed=cfg.seed, shard=workers.shard)

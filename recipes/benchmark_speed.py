@@ -1,15 +1,15 @@
-"""Run time of the forward model: specialised and plain, the same work in turn.
+"""Run time of the forward model: specialised and reference, the same work in turn.
 
     python recipes/benchmark_speed.py [system=swimmer6] [hidden=[128,128]] [compile=true] [curves=true]
 
 Times one step, rollouts, gradients through rollouts and a training step of one forward model (random weights, true
-static features), evaluated in several ways: `plain` (PyG message passing, eager: the baseline), `folded` (what training
-uses), `specialised`, and on top of it oneDNN's matrix products (`fast`), bfloat16 products (where this processor is
-fast at them) and `torch.compile`. Each way does each piece of work in turn, several times. The table shows medians,
-speed-ups over `plain`, peak memory, and errors against the plain model in float64. The share of the limit compares the
-specialised model's FLOP/s with those of a large matrix product. `curves=true` draws the time of a step over links,
-batch sizes and hidden sizes, and of a rollout's gradient over its length. No figure of the paper. Takes about ten
-minutes, half of it compiling. Results: docs/performance.md.
+physical parameters), evaluated in several ways: `reference` (PyG message passing, eager: the baseline), `folded` (what
+training uses), `specialised`, and on top of it oneDNN's matrix products (`fast`), bfloat16 products (where this
+processor is fast at them) and `torch.compile`. Each way does each piece of work in turn, several times. The table shows
+medians, speed-ups over `reference`, peak memory, and errors against the reference in float64. The share of the limit
+compares the specialised model's FLOP/s with those of a large matrix product. `curves=true` draws the time of a step
+over links, batch sizes and hidden sizes, and of a rollout's gradient over its length. No figure of the paper. Takes
+about ten minutes, half of it compiling. Results: docs/performance.md.
 
 Writes config.yaml, metrics.json and with curves the figure speed.png to its run folder.
 """
@@ -34,7 +34,7 @@ from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import plot_loglog
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import product_speeds
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import load_scene
 
 
 def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[ForwardModel, TensorDict]:
@@ -44,8 +44,8 @@ def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[Forward
     transitions = cast(TensorDict, trajectory_buffer(trajectories, batch_size=64 * 64, seed=cfg.seed).sample())
     torch.manual_seed(cfg.seed)
     edges = hidden if cfg.edge_hidden is None else list(cfg.edge_hidden)
-    sizes = {"edge_hidden": edges, "node_hidden": hidden, "global_hidden": hidden, "latent": cfg.latent}
-    model = ForwardModel(ParameterNames.of(scene), activation=cfg.activation, **sizes)
+    sizes = {"hidden": hidden, "edge_hidden": edges, "latent": cfg.latent}
+    model = ForwardModel.for_scene(scene, activation=cfg.activation, **sizes)
     ForwardModelLoss(model.bind(scene)).fit_normalizers(transitions)
     return model, transitions
 
@@ -55,8 +55,8 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
     scene = load_scene(system)
     bound = model.bind(scene)
     ways = {
-        "plain": Way(model.bind(scene, plain=True)),
-        "plain, fast": Way(model.bind(scene, plain=True), fast=True),
+        "reference": Way(model.bind(scene, reference=True)),
+        "reference, fast": Way(model.bind(scene, reference=True), fast=True),
         "folded, fast": Way(bound, fast=True),
         "specialised": Way(specialize(bound)),
         "specialised, fast": Way(specialize(bound), fast=True),
@@ -65,11 +65,11 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
     if rounded:
         ways["specialised, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16))
     if cfg.compile:
-        compiled = specialize(bound, compile=True)
+        compiled = specialize(bound, executor="compiled")
         ways["compiled"] = Way(compiled)
         ways["compiled, fast"] = Way(compiled, fast=True)
         if rounded:
-            ways["compiled, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, compile=True))
+            ways["compiled, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, executor="compiled"))
     return ways
 
 
@@ -122,7 +122,7 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
         model, transitions = make_model(cfg, system, [hidden, hidden])
         bound = model.bind(load_scene(system))
         ways = {
-            "plain": Way(model.bind(bound.scene, plain=True)),
+            "reference": Way(model.bind(bound.scene, reference=True)),
             "specialised": Way(specialize(bound)),
             "specialised, fast": Way(specialize(bound), fast=True),
         }
@@ -150,21 +150,21 @@ def main(cfg: DictConfig) -> None:
     model, transitions = make_model(cfg, cfg.system, list(cfg.hidden))
     ways, works = make_ways(cfg, model, cfg.system), make_works(cfg, model, transitions)
     model.requires_grad_(False)
-    reference = copy.deepcopy(model).double().bind(load_scene(cfg.system), plain=True)
+    reference = copy.deepcopy(model).double().bind(load_scene(cfg.system), reference=True)
     compile_seconds = measure(works, ways, reference)
     model.requires_grad_(True)
     training = train_work(cfg, model, transitions)
-    measure([training], {name: way for name, way in ways.items() if "plain" in name or "folded" in name}, None)
+    measure([training], {name: way for name, way in ways.items() if "reference" in name or "folded" in name}, None)
 
     print(ways["specialised"].model)
     print(
-        f"\nMilliseconds a step, median of {cfg.repeats}, {cfg.threads} threads; speed-up over plain; most MB of"
+        f"\nMilliseconds a step, median of {cfg.repeats}, {cfg.threads} threads; speed-up over reference; most MB of"
         " memory; error"
     )
     metrics: dict[str, float | int] = {"threads": cfg.threads}
     for work in [*works, training]:
         print(work.name)
-        baseline = statistics.median(work.milliseconds["plain"])
+        baseline = statistics.median(work.milliseconds["reference"])
         for name, values in work.milliseconds.items():
             median = statistics.median(values)
             error = f"{work.errors[name]:11.1e}" if name in work.errors else ""

@@ -1,9 +1,9 @@
-"""Run time of policy learning: environment steps, and updates with the plain and the fast model.
+"""Run time of policy learning: environment steps, and updates with the reference and the fast model.
 
     python recipes/benchmark_svg.py [repeats=30] [batch_size=256] [horizons=[0,1,3]]
 
 Times one update (sampling, losses of policy, value and model, gradients, optimiser) of SVG(N), in turn and several
-times: with a graph network evaluated by message passing (plain), folded, folded and compiled (what recipes/svg.py
+times: with a graph network evaluated by message passing (reference), folded, folded and compiled (what recipes/svg.py
 uses), and with an MLP in its place, beside a step of the environments. No figure of the paper. Results:
 docs/performance.md.
 
@@ -36,9 +36,10 @@ from torchrl_gn.training import OffPolicyTrainer, make_agent_optimizer
 def make_update(
     cfg: DictConfig, graph: ObservationGraph, env: EnvBase, data: TensorDictBase, horizon: int, way: str
 ) -> Callable[[], dict[str, float]]:
-    """One update of an agent whose model is ``plain``, ``folded`` or an ``mlp``, perhaps ``compiled``."""
+    """One update of an agent whose model is ``reference``, ``folded`` or an ``mlp``, perhaps ``compiled``."""
     kind = None if horizon == 0 else ("mlp" if "mlp" in way else "gn")
-    agent = Agent(graph, hidden=cfg.hidden, model=kind, model_options={**cfg.model_options, "plain": way == "plain"})
+    options = {**cfg.model_options, "plain": way == "reference"}
+    agent = Agent(graph, hidden=cfg.hidden, model=kind, model_options=options)
     reward = TargetDistance(graph) if horizon else None
     loss = SVGLoss(agent.policy, agent.value, agent.model, reward, steps=horizon, delay_actor=True)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.99)
@@ -64,18 +65,17 @@ def main(cfg: DictConfig) -> None:
     experience = torch.no_grad()(lambda: env.step(policy(start.copy())))
     ways: dict[str, Callable] = {f"{cfg.num_envs} environment steps": experience}
     for horizon in cfg.horizons:
-        of = ("plain", "folded", "compiled", "mlp", "mlp compiled") if horizon else ("plain", "compiled")
+        of = ("reference", "folded", "compiled", "mlp", "mlp compiled") if horizon else ("reference", "compiled")
         for way in of if cfg.compile else (way for way in of if "compiled" not in way):
             ways[f"SVG({horizon}), {way}"] = make_update(cfg, graph, env, data, horizon, way)
 
     seconds = time_in_turn(ways, cfg.repeats, warm_up=3)
     medians = {name: statistics.median(found) for name, found in seconds.items()}
-    lines = ["| | ms | a second | against plain |", "|---|---|---|---|"]
+    lines = ["| | ms | a second | against reference |", "|---|---|---|---|"]
     for name, median in medians.items():
-        plain = medians.get(f"{name.split(',')[0]}, plain")
-        lines.append(
-            f"| {name} | {1e3 * median:.2f} | {1 / median:.0f} | {f'{plain / median:.2f}x' if plain else ''} |"
-        )
+        reference = medians.get(f"{name.split(',')[0]}, reference")
+        faster = f"{reference / median:.2f}x" if reference else ""
+        lines.append(f"| {name} | {1e3 * median:.2f} | {1 / median:.0f} | {faster} |")
     with atomic_path(run.file("table.md")) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     print("\n".join(lines))

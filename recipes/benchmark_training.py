@@ -27,7 +27,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import ParameterNames, load_scene
+from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import ScheduledOptimizer, make_optimizer
 
 PARTS = ("sampling", "loss", "gradient", "optimiser")
@@ -47,7 +47,7 @@ def measure(cfg: DictConfig) -> dict[str, dict[str, float]]:
     """Median milliseconds of every part, by optimiser."""
     scene = load_scene(cfg.system)
     trajectories = collect_trajectories(scene, cfg.trajectories, 100, cfg.seed)
-    fresh = ForwardModel(ParameterNames.of(scene))
+    fresh = ForwardModel.for_scene(scene)
     ForwardModelLoss(fresh.bind(scene)).fit_normalizers(trajectory_buffer(trajectories, batch_size=5000).sample())
     models = {name: copy.deepcopy(fresh) for name in as_list(cfg.optimizers)}
     losses = {name: ForwardModelLoss(model.bind(scene)) for name, model in models.items()}

@@ -29,13 +29,14 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, resumed_checkpoint, with_help
+from _common.models import build_model
 from _common.training_data import Task, make_buffer, make_tasks
+from torchrl_gn import load_pretrained
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_training_curve, report, summary
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
-from torchrl_gn.training import load_pretrained
-from torchrl_gn.scenes import ParameterNames, Scene, load_scene
+from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import Budget, RunFolder, Tracker, Trainer, Workers, join_workers, make_optimizer, plain_config
 from torchrl_gn.training.progress import cut_short_note, train_with_progress
 
@@ -66,8 +67,7 @@ def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
         return load_pretrained(cfg.start_from).model
     if cfg.model.core == "mlp" and len(scenes) > 1:
         raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
-    items = (scenes[0].num_nodes, scenes[0].num_edges) if cfg.model.core == "mlp" else None
-    return ForwardModel(ParameterNames.of(scenes[0]), items=items, **plain_config(cfg.model))
+    return build_model(scenes, cfg.model)
 
 
 def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], workers: Workers) -> Trainer:

@@ -4,10 +4,10 @@
 
 Reproduces the paper's Figures "System identification performance" and "System identification analysis in Pendulum".
 Trains both models on random variants of the system whose parameters they never see (paper, "Inference models"; SM
-"End-to-end training algorithm for System ID"). On new variants, every system is identified once, from `context_length` steps of
-one trajectory, and another of its trajectories is predicted: with its own estimate, and with that of another system.
-`baselines=true` also trains models without identification and with the true parameters for the same time. Ctrl-C saves
-everything; the same `run_dir` goes on.
+"End-to-end training algorithm for System ID"). On new variants, every system is identified once, from `context_length`
+steps of one trajectory, and another of its trajectories is predicted: with its own estimate, and with that of another
+system. `baselines=true` also trains models without identification and with the true parameters for the same time.
+Ctrl-C saves everything; the same `run_dir` goes on.
 
 Writes config.yaml, metrics.json, the checkpoint, and figures to its run folder: errors as bars (errors.png), error
 against the number of observed steps (steps.png), and predictions of three systems identified with and without control
@@ -28,9 +28,9 @@ from torch import nn
 
 from _common import clean_exit, finish_run, open_log, resumed_checkpoint, with_help
 from _common.identification import TestSystems, control_figure, identified_errors, probe
+from _common.models import build_model, model_overrides
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import (
     ErrorTable,
     evaluate_errors,
@@ -42,7 +42,7 @@ from torchrl_gn.evaluation import (
 )
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.objectives import IdentificationLoss
-from torchrl_gn.scenes import ParameterNames, Scene, load_scene
+from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import Budget, RunFolder, Trainer, load_pretrained, make_optimizer, plain_config
 from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
 
@@ -113,13 +113,13 @@ def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, s
     """Errors of models without identification and with the true parameters, trained for the same time."""
     runs = {}
     for name, parameters in (("no identification", "none"), ("true parameters", "scene")):
-        sizes = {key: value for key, value in plain_config(cfg)["model"].items() if key != "inferred"}
-        model = [f"model.{key}={value}".replace(" ", "") for key, value in sizes.items()]
+        block = {key: value for key, value in plain_config(cfg.model).items() if key != "inferred"}
+        model = model_overrides(block | {"parameters": parameters})
         shared = [f"system={cfg.system}", "parametrized=true", f"data.folder={data}", f"seed={cfg.seed}"]
         budget = {key: "null" if cfg[key] is None else cfg[key] for key in ("minutes", "steps", "clock", "threads")}
         shared += [f"{key}={value}" for key, value in budget.items()]
         shared += [f"data.{key}={cfg.data[key]}" for key in ("train", "validation", "test", "length", "seed")]
-        shared += [f"noise={cfg.noise}", *model, f"model.parameters={parameters}"]
+        shared += [f"noise={cfg.noise}", *model]
         place = folder / name.replace(" ", "_")
         runs[name] = Run(FORWARD_MODEL, place, tuple(shared), name, goes_on=("minutes", "steps", "clock"))
     refuse_failures(run_all(runs.values(), cfg.jobs, desc="training baselines"))
@@ -143,8 +143,7 @@ def main(cfg: DictConfig) -> None:
     if resumed:
         model = cast(IdentifyingModel, resumed.trained)
     else:
-        forward_model = ForwardModel(ParameterNames.of(scene), parameters="inferred", **plain_config(cfg.model))
-        model = IdentifyingModel(forward_model, **plain_config(cfg.inference))
+        model = IdentifyingModel(build_model(scene, cfg.model), **plain_config(cfg.inference))
     tracker = open_log(cfg, run, label=f"inference_model-{scene.name}")
 
     data = Path(cfg.data.folder) if cfg.data.folder else run.data

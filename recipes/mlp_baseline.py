@@ -56,8 +56,7 @@ def candidates(cfg: DictConfig) -> dict[str, list[str]]:
     """Options of every MLP of the sweep by its name."""
     found = {}
     for (layers, cells), optimizer in itertools.product(cfg.sizes, cfg.optimizers):
-        hidden = "[" + ",".join([str(cells)] * layers) + "]"
-        options = ["model.core=mlp", f"model.mlp_hidden={hidden}", *optimizer]
+        options = ["model.core=mlp", f"model.hidden={cells}", f"model.layers={layers}", *optimizer]
         found[f"MLP {layers} x {cells}, {', '.join(optimizer)}"] = options
     return found
 

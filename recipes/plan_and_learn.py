@@ -24,9 +24,8 @@ from safetensors.torch import load_file
 from _common import as_list, clean_exit, open_log, with_help
 from _common.sweeps import FORWARD_MODEL, MPC, Run, refuse_changes, report_sweep, run_all
 from torchrl_gn.evaluation import plot_rewards
-from torchrl_gn.training import load_pretrained
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder
+from torchrl_gn.training import RunFolder, load_pretrained
 
 
 def planning(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
@@ -48,7 +47,7 @@ def learning(cfg: DictConfig, folder: Path, index: int, model: str, executed: li
 
 
 def make_runs(cfg: DictConfig, folder: Path, model: str) -> tuple[list[Run], list[Run]]:
-    """Every round's learning, of which the first has none, and playing."""
+    """Every round's learning, of which the first has none, and planned episodes."""
     learned: list[Run] = []
     executed = [planning(cfg, folder, 0, model)]
     for index in range(1, cfg.rounds + 1):

@@ -5,7 +5,7 @@
 Follows the paper's "Real robot data" and SM "Recurrent one-step predictions". Reads angles, velocities and commands of
 the joints (docs/data.md has the format), cuts them where they break, prints what was dropped, and trains a feed-forward
 and a recurrent graph network for equal time. Compares both on episodes never trained on (of a log with few episodes: on
-its last part), after `warm_up` true steps. Without a log it simulates one: the JACO arm, with lagging motors, play, and
+its last part), after `burn_in` true steps. Without a log it simulates one: the JACO arm, with lagging motors, play, and
 noisy, coarse encoders. Ctrl-C saves everything; the same `run_dir` goes on.
 
 Writes config.yaml, metrics.json, a checkpoint of each model, and figures of measured and predicted joint angles
@@ -25,12 +25,12 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
 from _common import clean_exit, finish_run, open_log, with_help
+from _common.models import build_model
 from torchrl_gn.data import RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_joints, summary
-from torchrl_gn.maths import joint_layout
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import KinematicTree, ParameterNames, load_scene
+from torchrl_gn.scenes import KinematicTree, load_scene
 from torchrl_gn.training import (
     Budget,
     Checkpoint,
@@ -44,7 +44,6 @@ from torchrl_gn.training import (
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 from torchrl_gn.training.progress import train_with_progress
 
-MODELS = {"feed-forward": "gn", "recurrent": "recurrent"}
 # Options that may differ when a run goes on.
 MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")
 
@@ -88,15 +87,15 @@ def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
 
 def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data: dict[str, TensorDictBase]) -> Trainer:
     """Wire data, loss and optimiser together."""
-    bound, recurrent = model.bind(cast(Any, tree)), model.options["core"] == "recurrent"
+    bound, recurrent = model.bind(cast(Any, tree)), model.core.recurrent
     loss = ForwardModelLoss(
         bound,
         noise=cfg.noise,
-        teacher_forced_steps=cfg.warm_up if recurrent else 1,
+        teacher_forced_steps=cfg.burn_in if recurrent else 1,
         generator=torch.Generator().manual_seed(cfg.seed),
     )
-    # Teacher-forced over the warm-up, then fed its own predictions.
-    window = cfg.warm_up + cfg.unroll_steps if recurrent else 1
+    # Teacher-forced over the burn-in, then fed its own predictions.
+    window = cfg.burn_in + cfg.unroll_steps if recurrent else 1
     size = cfg.sequence_batch_size if recurrent else cfg.batch_size
     unroll = None
     if not recurrent and cfg.unroll_fraction > 0:
@@ -106,7 +105,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
 
     def validate() -> float:
         horizons = (cfg.validation_steps,)
-        table = evaluate_errors(bound, data["validation"], horizons=horizons, one_step=False, warm_up=cfg.warm_up)
+        table = evaluate_errors(bound, data["validation"], horizons=horizons, one_step=False, burn_in=cfg.burn_in)
         return table[f"rollout_error_{cfg.validation_steps}"].total
 
     return Trainer(
@@ -134,15 +133,7 @@ def train(
         model = resumed.model
     else:
         torch.manual_seed(cfg.seed)
-        model = ForwardModel(
-            ParameterNames.of(cast(Any, tree)),
-            layout=joint_layout(tree.extras),
-            controls=tree.edge_action.shape[1],
-            joint_axes=False,
-            contacts=False,
-            core=cast(Any, MODELS[name]),
-            **plain_config(cfg.model),
-        )
+        model = build_model(tree, cfg.model, **plain_config(cfg.models[name]))
     trainer = make_trainer(cfg, model, tree, data)
     if not resumed:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
@@ -156,17 +147,17 @@ def train(
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)
-    horizon = cfg.length - cfg.warm_up
+    horizon = cfg.length - cfg.burn_in
     if not 0 < cfg.validation_steps <= horizon:
         raise ValueError(
-            f"length={cfg.length} leaves {horizon} steps behind warm_up={cfg.warm_up}, too few for"
+            f"length={cfg.length} leaves {horizon} steps behind burn_in={cfg.burn_in}, too few for"
             f" validation_steps={cfg.validation_steps}."
         )
     log, tree = read(cfg)
     print(tree)
     data = split(cfg, log)
     run = RunFolder(cfg.run_dir, "real_robot")
-    paths = {name: run.path / name / CHECKPOINT_FILE for name in MODELS}
+    paths = {name: run.path / name / CHECKPOINT_FILE for name in cfg.models}
     resumed = {name: load_pretrained(path) for name, path in paths.items() if path.exists()}
     for checkpoint in resumed.values():
         run.refuse_changes(checkpoint.config, cfg, free=MAY_CHANGE)
@@ -179,7 +170,7 @@ def main(cfg: DictConfig) -> None:
             model.bind(cast(Any, tree)),
             data["test"],
             horizons=(min(20, horizon), horizon),
-            warm_up=cfg.warm_up,
+            burn_in=cfg.burn_in,
             keep=1,
         )
         metrics |= {f"{name}/{key}": value for key, value in tables[name].to_metrics().items()}

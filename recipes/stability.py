@@ -30,9 +30,9 @@ from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.maths import BODY_STATE
-from torchrl_gn.training import load_pretrained
 from torchrl_gn.processor import SlowDtypeWarning
 from torchrl_gn.scenes import Scene, has_variants
+from torchrl_gn.training import load_pretrained
 
 
 def all_checks(scene: Scene, steps: int) -> list[Check]:

@@ -1,5 +1,9 @@
-"""What recipes share. They import it as ``_common``: Python looks for modules beside the script that it runs."""
+"""What recipes share. They import it as ``_common``: Python looks for modules beside the script that it runs.
 
+Importing it registers the core ``"ablated"``, which the ablation study's checkpoints name.
+"""
+
+from _common.ablated_core import AblatedCore as AblatedCore
 from _common.exit import clean_exit as clean_exit
 from _common.help import with_help as with_help
 from _common.options import as_list as as_list

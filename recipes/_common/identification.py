@@ -77,6 +77,6 @@ def control_figure(cfg: DictConfig, model: IdentifyingModel, scene: Scene, path:
         actions = torch.from_numpy(actions)
         with torch.no_grad():
             parameters = inference.identify(states[:, : cfg.context_length + 1], actions[:, : cfg.context_length])
-            predicted = bound.rollout(states[:, cfg.context_length], actions[:, cfg.context_length :], parameters)
+            predicted, _ = bound.rollout(states[:, cfg.context_length], actions[:, cfg.context_length :], parameters)
         panels[f"identified {title}"] = (states, predicted)
     return plot_motions(panels, scene, path, labels=("smallest", "middle", "largest"))

@@ -15,9 +15,9 @@ from torchrl_gn.dynamics import Predictor, specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.training import load_pretrained, pretrained_names
 from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
+from torchrl_gn.training import load_pretrained, pretrained_names
 
 ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
 
@@ -86,13 +86,12 @@ def bind_model(cfg: DictConfig, scene: Scene):
 
 
 def fast_model(bound: Predictor, compile: bool) -> Predictor:
-    """Specialise the model, if its core allows it."""
+    """Specialise the model, and compile it if its core allows it."""
     try:
-        return specialize(bound, compile=compile)
+        return specialize(bound, executor="compiled" if compile else "eager")
     except TypeError:
-        core = bound.model.options["core"]
-        print(f"Planning through the bound model, more slowly: core={core} can be neither specialised nor compiled.")
-        return bound
+        print(f"Planning without compile=true, more slowly: core={bound.model.core_name} cannot be compiled.")
+        return specialize(bound)
 
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:
@@ -108,7 +107,7 @@ def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -
 
 
 def start_states(cfg: DictConfig, env: SceneEnv, bound, inference) -> TensorDictBase:
-    """Start states with each system's static graph: its true parameters, or identified from random controls."""
+    """Start states with each system's physical parameters: the true ones, or identified from random controls."""
     now = env.reset(TensorDict(batch_size=[cfg.episodes])).exclude("done", "terminated")
     if inference is not None:
         controls = torch.from_numpy(spline_controls(env.scene, cfg.episodes, cfg.context_length, cfg.seed + 1))
@@ -116,8 +115,8 @@ def start_states(cfg: DictConfig, env: SceneEnv, bound, inference) -> TensorDict
         unstable = int((~simulated["stable"]).sum())
         if unstable:
             raise UnstableSimulationError(
-                f"{unstable} of {cfg.episodes} simulations became unstable under the {cfg.context_length} random controls that a"
-                " system is identified from; try another seed, or a smaller context_length."
+                f"{unstable} of {cfg.episodes} simulations became unstable under the {cfg.context_length} random"
+                " controls that a system is identified from; try another seed, or a smaller context_length."
             )
         now.update({key: simulated[key][:, -1] for key in ("state", "physics")})
         with torch.no_grad():

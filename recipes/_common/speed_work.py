@@ -75,13 +75,13 @@ def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
 @torch.no_grad()
 def step_once(model: Predictor, state: Tensor, action: Tensor) -> Tensor:
     """Next state."""
-    return model.step(state, action)
+    return model.step(state, action)[0]
 
 
 def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
     """Gradient of a rollout to its actions."""
     leaf = actions.clone().requires_grad_()
-    model.rollout(state, leaf)[..., 7:].square().sum().backward()
+    model.rollout(state, leaf)[0][..., 7:].square().sum().backward()
     assert leaf.grad is not None
     return leaf.grad
 
@@ -107,7 +107,7 @@ def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
 
         def run(way: Way) -> Tensor:
             with torch.no_grad():
-                return way.model.rollout(state, actions)[:, -1] - state
+                return way.model.rollout(state, actions)[0][:, -1] - state
 
         return Work(f"rollout of {horizon}, batch {batch}", run, horizon, cfg.repeats)
 

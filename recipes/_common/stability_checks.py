@@ -12,15 +12,15 @@ from typing import cast
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.data import Simulator, collect_trajectories, sample_start_states, spline_controls, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor, UnseenFeatureWarning, specialize
+from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor, UnseenParameterWarning, specialize
 from torchrl_gn.evaluation import guarded_rollout, kinetic_energy
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import ParameterNames, Scene, load_scene, make_variants, parameter_ranges
+from torchrl_gn.scenes import Scene, load_scene, make_variants, parameter_ranges
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
 
@@ -123,7 +123,7 @@ def zero_quaternion(s: Setting) -> float:
     """Deviation of the next quaternions' lengths from 1 where one had none."""
     broken = s.state.clone()
     broken[:, 1, 3:7] = 0
-    after = s.model.step(broken, s.action)
+    after, _ = s.model.step(broken, s.action)
     return float((after[..., 3:7].norm(dim=-1) - 1).abs().nan_to_num(torch.inf).max())
 
 
@@ -156,7 +156,7 @@ def corners(exact: Predictor, count: int, seed: int) -> TensorDictBase:
     chosen = np.random.default_rng(seed).integers(2, size=(count, len(ends)))
     variants = make_variants(system, ends[np.arange(len(ends)), chosen], timestep=exact.scene.timestep)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnseenFeatureWarning)  # far outside of what was trained on, on purpose
+        warnings.simplefilter("ignore", UnseenParameterWarning)  # far outside of what was trained on, on purpose
         return cast(TensorDictBase, torch.stack([exact.parameters_of(variant) for variant in variants]))
 
 
@@ -168,26 +168,26 @@ def variants_at_corners(s: Setting) -> tuple[float, float]:
         s.bind(s.model.model, s.scene, parameters_key="parameters"),
         s.exact.model.bind(s.scene, parameters_key="parameters"),
     )
-    delta, exact = (model.delta(s.state, s.action, model.fold(parameters)) for model in models)
+    delta, exact = (model.delta(s.state, s.action, parameters) for model in models)
     return s.size(delta), s.error(delta, exact)
 
 
 def small_scenes(s: Setting) -> float:
-    """Difference from the plain model on the smallest graphs; infinite if a rollout or its gradient is not finite."""
+    """Difference from the reference on the smallest graphs; infinite if a rollout or its gradient is not finite."""
     worst = 0.0
     for source in SMALL_SCENES:
         scene = load_scene(source, timestep=0.02)
         data = collect_trajectories(scene, 8, 20, s.cfg.seed)
-        for features in (ParameterNames.of(scene), ParameterNames()):  # with and without globals
+        for read in ("scene", "none"):  # with and without globals
             torch.manual_seed(s.cfg.seed)
-            weights = ForwardModel(features, latent=32).to(s.model.network_dtype)
-            plain = weights.bind(scene, plain=True)
-            ForwardModelLoss(plain).fit_normalizers(trajectory_buffer(data, batch_size=100, seed=0).sample())
+            weights = ForwardModel.for_scene(scene, parameters=read, latent=32).to(s.model.dtype)
+            reference = weights.bind(scene, reference=True)
+            ForwardModelLoss(reference).fit_normalizers(trajectory_buffer(data, batch_size=100, seed=0).sample())
             model, state, action = s.bind(weights, scene), data["state"][:, 0].clone().requires_grad_(), data["action"]
-            states = model.rollout(state, action)
+            states, _ = model.rollout(state, action)
             (gradient,) = torch.autograd.grad(states[:, -1].square().sum(), state)
             with torch.no_grad():
-                error = s.error(model.delta(state, action[:, 0]), plain.delta(state, action[:, 0]).double())
+                error = s.error(model.delta(state, action[:, 0]), reference.delta(state, action[:, 0]).double())
             worst = max(worst, error if bool(states.isfinite().all() & gradient.isfinite().all()) else torch.inf)
     return worst
 
@@ -199,15 +199,18 @@ def unstable_model(s: Setting) -> float:
         for parameter in weights.core.parameters():
             parameter *= 2
     model = s.bind(weights, s.scene)
-    rollout = model.rollout_and_hidden_state
+    rollout = model.rollout
 
     def counted(
-        state: Tensor, actions: Tensor, parameters: TensorDictBase | None = None, memory: TensorDictBase | None = None
-    ) -> tuple[Tensor, TensorDictBase | None]:
+        state: Tensor,
+        actions: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDict | None]:
         predicted.append(actions.shape[:-1].numel())
-        return rollout(state, actions, parameters, memory)
+        return rollout(state, actions, parameters, hidden_state)
 
-    model.rollout_and_hidden_state = counted
+    model.rollout = counted
     guarded = guarded_rollout(model, s.state, s.action.unsqueeze(1).expand(-1, 1000, -1))
     return sum(predicted) / (1000 * len(s.state)) if bool(guarded.diverged.all()) else torch.inf
 
@@ -224,7 +227,7 @@ def long_gradient(s: Setting) -> float:
 
     def gradient(model: Predictor) -> Tensor:
         leaf = actions.clone().requires_grad_()
-        model.rollout(s.state[:4], leaf)[:, -1, 1:, :3].square().sum().backward()
+        model.rollout(s.state[:4], leaf)[0][:, -1, 1:, :3].square().sum().backward()
         assert leaf.grad is not None
         return leaf.grad
 
@@ -238,10 +241,10 @@ def finite_difference(s: Setting) -> float:
     generator = torch.Generator().manual_seed(0)
     weight = torch.randn(state.shape, generator=generator, dtype=torch.float64)
     along = torch.randn(action.shape, generator=generator, dtype=torch.float64)
-    (slope,) = torch.autograd.grad((s.model.step(state, action) * weight).sum(), action)
-    step = 1e-7 if s.model.network_dtype == torch.float64 else 1e-3
+    (slope,) = torch.autograd.grad((s.model.step(state, action)[0] * weight).sum(), action)
+    step = 1e-7 if s.model.dtype == torch.float64 else 1e-3
     with torch.no_grad():
-        ends = [((s.model.step(state, action + sign * step * along)) * weight).sum((-2, -1)) for sign in (1, -1)]
+        ends = [(s.model.step(state, action + sign * step * along)[0] * weight).sum((-2, -1)) for sign in (1, -1)]
     return s.error((slope * along).sum(-1), (ends[0] - ends[1]) / (2 * step))
 
 
@@ -251,7 +254,7 @@ def orientation_loss(s: Setting) -> float:
     turned = s.state.clone()
     off = 1e-6 * torch.as_tensor(s.scene.movable[:, 3:6], dtype=torch.float64)
     turned[..., 3:7] = quaternion.product(quaternion.exp(off.expand(len(turned), -1, -1)), turned[..., 3:7])
-    target = BODY_STATE.delta(s.state, turned).to(s.model.network_dtype).double()
+    target = BODY_STATE.delta(s.state, turned).to(s.model.dtype).double()
     where = BODY_STATE.delta_slices["orientation"]
     scale = s.exact.model.delta_normalizer.inverse_std[where]
     weight = s.exact.movable[:, where] * scale

@@ -43,7 +43,7 @@ class Task:
         """Bind the weights to the scene, or to its variants, whose parameters come with the samples."""
         if not self.parametrized:
             return model.bind(self.scene)
-        return model.bind(self.scene, parameters_key="parameters", static_features=self.dataset.features)
+        return model.bind(self.scene, parameters_key="parameters", parameter_names=self.dataset.features)
 
 
 def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]:

@@ -142,7 +142,7 @@ def test_a_checkpoint_is_evaluated_on_another_scene(interrupted, tmp_path, call)
 def test_comparing_goes_on_past_a_failed_run_and_keeps_finished_ones(tmp_path, call):
     small = ["data.train=20", "data.validation=5", "data.test=5"]
     options = ["systems=[pendulum]", "minutes=0.01", f"run_dir={tmp_path}", f"overrides={small}"]
-    bad = "+variants.bad=['model.latent=zero']"
+    bad = "+variants.bad=['model.hidden=zero']"
     code, output, errors = call(*options, bad, "only=[default,bad]", recipe="compare")
     assert code == 1 and "1 runs failed" in errors
     rows = {line.split("|")[1].strip(): line for line in output.splitlines() if line.startswith("|")}

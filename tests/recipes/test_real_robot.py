@@ -13,12 +13,13 @@ from torchrl_gn.training import load_pretrained
 SMALL = (
     "steps=2",
     "length=12",
-    "warm_up=4",
+    "burn_in=4",
     "validation_steps=6",
     "unroll_steps=3",
     "batch_size=16",
     "sequence_batch_size=4",
-    "model={memory: [4, 4, 4], latent: 8, edge_hidden: [8], node_hidden: [8], global_hidden: [8]}",
+    "model.hidden=[8]",
+    "models.recurrent.hidden_state=[4, 4, 4]",
 )
 
 

@@ -1,0 +1,40 @@
+"""The forward model of a recipe's ``model:`` block."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, ForwardModel, JointAxes
+from torchrl_gn.scenes import KinematicTree, Scene
+from torchrl_gn.training import plain_config
+
+
+def build_model(
+    scenes: Scene | KinematicTree | Sequence[Scene], options: Mapping[str, Any], **more: Any
+) -> ForwardModel:
+    """A model with fresh weights.
+
+    Args:
+        scenes: the scene, or scenes that share the model.
+        options: the block; what is null keeps its default. All but ``features`` and ``canonicalizer`` are options of
+            :class:`~torchrl_gn.dynamics.ForwardModel` and its core.
+        **more: further options, which replace those of the block.
+    """
+    given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
+    canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
+    optional = {"joint_axes": JointAxes(), "contacts": Contacts()}
+    chosen = [feature for name, feature in optional.items() if shown.pop(name)]
+    features = (BodyState(**shown), Controls(), *chosen)
+    return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
+
+
+def model_overrides(options: Mapping[str, Any], prefix: str = "model") -> list[str]:
+    """A block as overrides of another recipe."""
+    found = []
+    for name, value in plain_config(options).items():
+        if isinstance(value, dict):
+            found += model_overrides(value, f"{prefix}.{name}")
+        else:
+            found.append(f"++{prefix}.{name}={'null' if value is None else value}".replace(" ", ""))
+    return found
