@@ -22,17 +22,16 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
 from _common import clean_exit, open_log, resumed_checkpoint, with_help
+from _common.progress import learn_with_progress, report_learning
 from torchrl_gn.envs import observation_env
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training import (
     OffPolicyTrainer,
     RunFolder,
-    learn_with_progress,
     make_agent_optimizer,
     mean_return,
     plain_config,
-    report_learning,
 )
 
 # Options that may differ when a run goes on.

@@ -16,11 +16,11 @@ import torch
 from omegaconf import DictConfig
 
 from _common import clean_exit, finish_run, open_run, with_help
+from _common.progress import HORIZON, collecting
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.evaluation import report
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained
-from torchrl_gn.training.progress import HORIZON, collecting
 
 
 @with_help

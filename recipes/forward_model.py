@@ -30,6 +30,7 @@ from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, resumed_checkpoint, with_help
 from _common.models import build_model
+from _common.progress import cut_short_note, train_with_progress
 from _common.training_data import Task, make_buffer, make_tasks
 from torchrl_gn import load_pretrained
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
@@ -38,7 +39,6 @@ from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import Budget, RunFolder, Tracker, Trainer, Workers, join_workers, make_optimizer, plain_config
-from torchrl_gn.training.progress import cut_short_note, train_with_progress
 
 # Options that may differ when a run goes on.
 MAY_CHANGE = (

@@ -29,6 +29,7 @@ from torch import nn
 from _common import clean_exit, finish_run, open_log, resumed_checkpoint, with_help
 from _common.identification import TestSystems, control_figure, identified_errors, probe
 from _common.models import build_model, model_overrides
+from _common.progress import dataset_with_progress, train_with_progress
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
 from torchrl_gn.evaluation import (
@@ -44,7 +45,6 @@ from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.objectives import IdentificationLoss
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import Budget, RunFolder, Trainer, load_pretrained, make_optimizer, plain_config
-from torchrl_gn.training.progress import dataset_with_progress, train_with_progress
 
 # Options that may differ when a run goes on.
 MAY_CHANGE = (

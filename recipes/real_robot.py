@@ -26,6 +26,7 @@ from tensordict import TensorDictBase
 
 from _common import clean_exit, finish_run, open_log, with_help
 from _common.models import build_model
+from _common.progress import train_with_progress
 from torchrl_gn.data import RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_joints, summary
@@ -42,7 +43,6 @@ from torchrl_gn.training import (
     plain_config,
 )
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
-from torchrl_gn.training.progress import train_with_progress
 
 # Options that may differ when a run goes on.
 MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")

@@ -23,6 +23,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
 
 from _common import clean_exit, open_log, resumed_checkpoint, with_help
+from _common.progress import learn_with_progress, report_learning
 from torchrl_gn.envs import observation_env
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
 from torchrl_gn.policies import Agent
@@ -32,11 +33,9 @@ from torchrl_gn.training import (
     OffPolicyTrainer,
     RayCluster,
     RunFolder,
-    learn_with_progress,
     make_agent_optimizer,
     mean_return,
     plain_config,
-    report_learning,
 )
 
 # Options that may differ when a run goes on.

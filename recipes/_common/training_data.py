@@ -13,11 +13,11 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
 
 from _common import as_list
+from _common.progress import dataset_with_progress
 from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.scenes import Scene, has_variants
 from torchrl_gn.training import Workers
-from torchrl_gn.training.progress import dataset_with_progress
 
 
 @dataclass

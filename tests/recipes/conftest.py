@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from ..learner import make_learner as make_learner
+
 ROOT = Path(__file__).parents[2]
 # As Python does for a script in recipes, which imports _common; Ray's workers read the variable.
 sys.path.append(str(ROOT / "recipes"))

@@ -14,8 +14,6 @@ from torchrl_gn.training.optimizers import make_agent_optimizer as make_agent_op
 from torchrl_gn.training.optimizers import make_optimizer as make_optimizer
 from torchrl_gn.training.pretrained import load_pretrained as load_pretrained
 from torchrl_gn.training.pretrained import pretrained_names as pretrained_names
-from torchrl_gn.training.progress import learn_with_progress as learn_with_progress
-from torchrl_gn.training.progress import report_learning as report_learning
 from torchrl_gn.training.ray_cluster import RayCluster as RayCluster
 from torchrl_gn.training.run_folder import RunFolder as RunFolder
 from torchrl_gn.training.run_folder import plain_config as plain_config

@@ -8,12 +8,11 @@ import math
 import pytest
 import torch
 
+from _common.progress import learn_with_progress, report_learning
 from torchrl_gn.training import (
     RunFolder,
     Tracker,
-    learn_with_progress,
     load_pretrained,
-    report_learning,
 )
 
 CONFIG = {"checkpoint_seconds": 1000}
