@@ -27,7 +27,7 @@ from tensordict import TensorDictBase
 from _common import clean_exit, finish_run, open_log, with_help
 from _common.models import build_model
 from _common.progress import train_with_progress
-from torchrl_gn.data import RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log, trajectory_buffer
+from torchrl_gn.data import RobotLog, load_robot_log, log_trajectories, log_tree, simulate_log, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_joints, summary
 from torchrl_gn.objectives import ForwardModelLoss
@@ -59,7 +59,7 @@ def read(cfg: DictConfig) -> tuple[RobotLog, KinematicTree]:
         scene = load_scene("jaco", timestep=own.timestep)
         log = simulate_log(scene, own.episodes, own.steps, cfg.seed, **plain_config(own.faults))
         name, joint_parents = "simulated jaco", [-1, 0, 1, 2, 3, 4, 5, 5, 5]
-    return log, log_chain(log, name, resample=cfg.resample, commands=commands, joint_parents=joint_parents)
+    return log, log_tree(log, name, resample=cfg.resample, commands=commands, joint_parents=joint_parents)
 
 
 def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:

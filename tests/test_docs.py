@@ -57,8 +57,8 @@ def test_links_lead_somewhere(page):
         file = page.parent / target if target else page
         assert file.exists(), f"{name(page)} links to {link}"
         if anchor:
-            headings = re.findall(r"^#+ (.+)$", FENCE.sub("", file.read_text()), re.MULTILINE)
-            anchors = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            titles = re.findall(r"^#+ (.+)$", FENCE.sub("", file.read_text()), re.MULTILINE)
+            anchors = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
             assert anchor in anchors, f"{name(page)} links to {link}"
 
 

@@ -284,3 +284,38 @@ def test_warnings_of_the_package_fail_tests(pytestconfig):
 
 def test_package_is_typed():
     assert (PACKAGE / "py.typed").exists()
+
+
+# Words that the field does not use, and the field's own (docs/concepts.md has the glossary).
+RETIRED = {
+    r"linking|linkage": "constraint projection, joint anchors",
+    r"pins?|pinned|pin[_ ]finder": "joint anchor, anchor estimation",
+    r"levers?|parent_arm": "anchor offset",
+    r"headings?": "yaw, yaw frame",
+    r"live (channels?|components?)": "movable components",
+    r"SceneValues|static_key|static values": "physical parameters",
+    r"JointChain|carried_by": "kinematic tree, parent",
+    r"constant prediction": "persistence baseline",
+    r"rivals?|contestants?": "baseline",
+    r"foreseen|FixTask": "planned, freeze goal",
+}
+
+
+def test_retired_words_come_back_nowhere():
+    root = PACKAGE.parent
+    places = (
+        "torchrl_gn/**/*.py",
+        "recipes/**/*.py",
+        "recipes/**/*.yaml",
+        "tests/**/*.py",
+        "docs/**/*.md",
+        "README.md",
+    )
+    files = [file for place in places for file in root.glob(place) if file != Path(__file__)]
+    found = [
+        f"{file.relative_to(root)}: {match[0]!r}, use {better}"
+        for file in files
+        for pattern, better in RETIRED.items()
+        for match in re.finditer(rf"\b({pattern})\b", file.read_text(), re.IGNORECASE)
+    ]
+    assert not found, "\n".join(found)

@@ -141,7 +141,7 @@ def test_an_unfinished_data_set_is_finished_with_the_columns_it_was_begun_with(t
             create_dataset(tmp_path / "gained", load_scene("pendulum"), **SIZES, progress=interrupt)
     for file in (tmp_path / "whole").rglob("*.*"):
         assert file.read_bytes() == (tmp_path / "parts" / file.relative_to(tmp_path / "whole")).read_bytes(), file
-    with pytest.raises(DatasetError, match=r"was begun with static features \['charm'\]"):
+    with pytest.raises(DatasetError, match=r"was resumed with static features \['charm'\]"):
         create_dataset(tmp_path / "gained", scene, **SIZES)
 
 

@@ -87,11 +87,11 @@ def test_a_step_equals_that_of_a_rollout(memory: int | None) -> None:
     scene = load_scene("cheetah")
     simulator = Simulator(scene, 1, memory=memory)
     physics, actions = _inputs(scene, 3, 2)
-    played = simulator.rollout(physics, actions)
+    executed = simulator.rollout(physics, actions)
     for t in range(2):
         after, state = simulator.step(physics, actions[:, t])
-        np.testing.assert_array_equal(after, played["physics"][:, t + 1])
-        np.testing.assert_array_equal(state, played["state"][:, t])
+        np.testing.assert_array_equal(after, executed["physics"][:, t + 1])
+        np.testing.assert_array_equal(state, executed["state"][:, t])
         physics = after
 
 

@@ -55,19 +55,19 @@ def test_together_as_each_alone(system: str) -> None:
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
-def test_pinned_bodies_stay_pinned(system: str) -> None:
+def test_joined_bodies_stay_joined(system: str) -> None:
     scenes = sample_variants(system, 5, 2)
     state = collect_trajectories(scenes, 5, 20)["state"]
     for scene, states in zip(scenes, state.numpy(), strict=True):
-        pins = []
+        positions = []
         for node, anchors in (
             (scene.joint_anchors.parent, scene.joint_anchors.parent_anchor),
             (np.arange(scene.num_nodes), scene.joint_anchors.child_anchor),
         ):
             w, v = states[:, node, 3:4], states[:, node, 4:7]
             turned = np.cross(v, np.cross(v, anchors) + w * anchors)
-            pins.append(states[:, node, :3] + anchors + 2 * turned)
-        assert np.abs(pins[1] - pins[0]).max() < 1e-12
+            positions.append(states[:, node, :3] + anchors + 2 * turned)
+        assert np.abs(positions[1] - positions[0]).max() < 1e-12
         assert np.ptp(states[:, 1:, :7], axis=0).max() > 1e-3  # and something moves
 
 
@@ -90,8 +90,8 @@ def test_variants_are_stable() -> None:
         scenes = sample_variants(system, 12 if system == "jaco" else 60, 5)  # an arm takes its time
         rng = np.random.default_rng(0)
         starts = np.concatenate([sample_start_states(scene, 1, rng) for scene in scenes])
-        played = Simulator(scenes).rollout(starts, spline_controls(scenes[0], len(scenes), 30, rng))
-        assert played["stable"].all(), system
+        executed = Simulator(scenes).rollout(starts, spline_controls(scenes[0], len(scenes), 30, rng))
+        assert executed["stable"].all(), system
 
 
 @pytest.mark.usefixtures("_small_chunks")

@@ -16,8 +16,8 @@ def gap(scene, states, anchors):
     parent = torch.as_tensor(scene.joint_anchors.parent)
     upper = quaternion.rotate(states[..., parent, 3:7], anchors[0][:, None])
     lower = quaternion.rotate(states[..., 3:7], anchors[1][:, None])
-    pinned = parent != torch.arange(len(parent))
-    return (states[..., parent, :3] + upper - states[..., :3] - lower)[..., pinned, :].abs().max()
+    joined = parent != torch.arange(len(parent))
+    return (states[..., parent, :3] + upper - states[..., :3] - lower)[..., joined, :].abs().max()
 
 
 @pytest.fixture(scope="module", params=["swimmer6", "cheetah", "jaco"])

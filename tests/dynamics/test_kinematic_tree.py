@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_gn.data import log_chain, log_trajectories, simulate_log, trajectory_buffer
+from torchrl_gn.data import log_trajectories, log_tree, simulate_log, trajectory_buffer
 from torchrl_gn.dynamics import BodyState, Controls, ForwardModel, JointAxes, specialize
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.envs import ModelEnv
@@ -25,7 +25,7 @@ SMALL = {"hidden": (16,)}
 @pytest.fixture(scope="module")
 def robot():
     log = simulate_log(load_scene("jaco"), 20, 42, 0, delay=0, time_constant=0.0, play=0.0)
-    return log_chain(log, "jaco"), log_trajectories(log, 40)[0]
+    return log_tree(log, "jaco"), log_trajectories(log, 40)[0]
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ def test_joints_with_fewer_commands_or_none(robot):
 def test_a_double_pendulum_with_one_motor_or_none(core, motors):
     log = simulate_log(load_scene("acrobot"), 10, 42, 0)
     log = dataclasses.replace(log, command=log.command[:, :motors])
-    tree, data = log_chain(log, "double", commands=[[0], []] if motors else None), log_trajectories(log, 40)[0]
+    tree, data = log_tree(log, "double", commands=[[0], []] if motors else None), log_trajectories(log, 40)[0]
     assert tree.num_actions == motors and tree.edge_action[:, 0].tolist() == [motors - 1] * 2 + [-1] * 2
     torch.manual_seed(0)
     model = ForwardModel.for_scene(tree, core=core, **SMALL)

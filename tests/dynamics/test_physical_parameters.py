@@ -193,15 +193,15 @@ def test_a_model_env_of_variants(variants, samples, model, folds):
     for module in (bound, specialize(bound)):
         folds.clear()
         env = ModelEnv(module, seed=0)
-        played = env.rollout(4, tensordict=env.reset(start.clone(), set_state=True), auto_reset=False)
+        executed = env.rollout(4, tensordict=env.reset(start.clone(), set_state=True), auto_reset=False)
         made = len(folds)
-        expected = bound.rollout(state, played["action"], parameters)[0]
-        torch.testing.assert_close(played["next", "state"], expected[:, 1:])
+        expected = bound.rollout(state, executed["action"], parameters)[0]
+        torch.testing.assert_close(executed["next", "state"], expected[:, 1:])
     assert made == 1  # not at every step
     # Without values of its own a start has the scene's.
-    played = env.rollout(3, tensordict=TensorDict(batch_size=[2]))
-    expected = model.bind(variants[0]).rollout(played["state"][:, 0], played["action"])[0]
-    torch.testing.assert_close(played["next", "state"], expected[:, 1:])
+    executed = env.rollout(3, tensordict=TensorDict(batch_size=[2]))
+    expected = model.bind(variants[0]).rollout(executed["state"][:, 0], executed["action"])[0]
+    torch.testing.assert_close(executed["next", "state"], expected[:, 1:])
 
 
 @pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenParameterWarning")
@@ -216,7 +216,7 @@ def test_an_inferred_graph_is_read_as_it_is_and_gets_gradients(variants, samples
     leaves = {name: torch.randn(3, *shape, dtype=torch.float64, requires_grad=True) for name, shape in shapes.items()}
     parameters = (
         bounds[0].own_parameters().expand(3).clone().update(leaves)
-    )  # joint anchors beside the graph, where bodies are linked
+    )  # joint anchors beside the graph, where bodies are projected
     outs = [bound.step(state, action, parameters)[0] for bound in bounds]
     torch.testing.assert_close(*outs, rtol=0, atol=1e-12)
     gradients = [torch.autograd.grad(out.square().sum(), list(leaves.values())) for out in outs]

@@ -16,7 +16,7 @@ from torchrl_gn.scenes.joint_axes import joint_axes
 from .. import zoo
 
 SYSTEMS = ["cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", "jaco"]
-LINKED = [*SYSTEMS, "creature"]
+CONSTRAINED = [*SYSTEMS, "creature"]
 
 
 def project(bound, state, delta):
@@ -40,7 +40,7 @@ def gaps(scene, state):
     return (places[1] - places[0]).abs().max(), (speeds[1] - speeds[0]).abs().max()
 
 
-@pytest.mark.parametrize("name", LINKED)
+@pytest.mark.parametrize("name", CONSTRAINED)
 def test_true_changes_are_linked_already(make_model, name):
     scene = zoo.load(name)
     trajectories = collect_trajectories(scene, 2, 20)
@@ -51,7 +51,7 @@ def test_true_changes_are_linked_already(make_model, name):
     torch.testing.assert_close(project(bound, state, delta), delta, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("name", LINKED)
+@pytest.mark.parametrize("name", CONSTRAINED)
 def test_pinned_bodies_stay_together(make_model, random_actions, name):
     scene = zoo.load(name)
     trajectories = collect_trajectories(scene, 2, 20)
@@ -179,12 +179,12 @@ def test_a_linkage_moves_as_its_bodies_mean(scenes, make_model, random_actions):
     generator = torch.Generator().manual_seed(0)
     change = 0.01 * torch.randn(2, 7, 12, generator=generator, dtype=torch.float64) * bound.movable
     change[..., 3:6] = change[..., 9:] = 0
-    linked = project(bound, state, change)
+    projected = project(bound, state, change)
     shared = change[:, 1:, [0, 1, 6, 7]].mean(1, keepdim=True).expand(-1, 6, -1)
-    torch.testing.assert_close(linked[:, 1:, [0, 1, 6, 7]], shared, rtol=0, atol=1e-12)
+    torch.testing.assert_close(projected[:, 1:, [0, 1, 6, 7]], shared, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", LINKED)
+@pytest.mark.parametrize("name", CONSTRAINED)
 def test_the_jacobian_is_the_derivative_of_positions(make_model, name):
     """How rotations move joined bodies, against differences."""
     scene = zoo.load(name)
@@ -214,23 +214,23 @@ def test_the_jacobian_is_the_derivative_of_positions(make_model, name):
 
 
 def test_what_bodies_disagree_on_is_settled_by_least_squares(make_model):
-    """No other linked change is nearer to the network's, in units of each component's spread."""
+    """No other projected change is nearer to the network's, in units of each component's spread."""
     scene = load_scene("swimmer6")
     bound = make_model(scene).bind(scene)
     state = collect_trajectories(scene, 2, 5)["state"][:, -1]
     generator = torch.Generator().manual_seed(0)
     raw = 1e-5 * torch.randn(2, 7, 12, generator=generator, dtype=torch.float64) * bound.movable
-    linked = project(bound, state, raw)
+    projected = project(bound, state, raw)
     std = bound.model.delta_normalizer.std
     v, w = std[6:9].norm(), std[9:].norm()
 
     def distance(delta):
         return ((delta - raw)[..., 6:9] / v).square().sum() + ((delta - raw)[..., 9:] / w).square().sum()
 
-    nearest = distance(linked)
+    nearest = distance(projected)
     assert nearest < distance(torch.zeros_like(raw))
     for seed in range(5):
         other = (
             torch.randn(2, 7, 12, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * bound.movable
         )
-        assert distance(project(bound, state, linked + 1e-6 * other)) > nearest * (1 - 1e-6)
+        assert distance(project(bound, state, projected + 1e-6 * other)) > nearest * (1 - 1e-6)

@@ -183,11 +183,11 @@ def test_it_stands_in_for_the_bound_model(scenes, make_model, random_states, ran
     quick = specialize(bound)
     state, actions = random_states(scene, 4, scale=0.1), random_actions(scene, 4, 6)
     torch.testing.assert_close(rollout(quick, state, actions), rollout(bound, state, actions).detach())
-    played = []
+    executed = []
     for model in (quick, bound):
         torch.manual_seed(0)
-        played.append(ModelEnv(model, seed=0).rollout(5).detach())
-    torch.testing.assert_close(played[0], played[1])
+        executed.append(ModelEnv(model, seed=0).rollout(5).detach())
+    torch.testing.assert_close(executed[0], executed[1])
     tensordict = TensorDict({"state": state, "action": actions[:, 0]}, [4])
     assert torch.equal(ModelEnv(quick).step(tensordict)["next", "state"], quick.step(state, actions[:, 0])[0])
 

@@ -134,8 +134,8 @@ def test_bad_inputs_are_named(model_env):
 
 def test_steps_a_true_environments_tensordict(scene_env, model_env):
     true = scene_env.reset(TensorDict(batch_size=[2]))
-    played = model_env.rollout(3, tensordict=true, auto_reset=False)
-    assert played["next", "reward"].shape == (2, 3, 1)
+    executed = model_env.rollout(3, tensordict=true, auto_reset=False)
+    assert executed["next", "reward"].shape == (2, 3, 1)
 
 
 def test_runs_a_bound_forward_model(swimmer):
@@ -147,9 +147,9 @@ def test_runs_a_bound_forward_model(swimmer):
     update_parameter_normalizers(env.world_model)
     update_dynamic_normalizers(env.world_model, true["state"], true["action"], true["next", "state"])
     actions = true["action"].clone().requires_grad_()
-    played = rollout(env, true[:, 0].select("state"), actions)
-    played["next", "state"].square().sum().backward()
-    assert played["next", "state"].isfinite().all()
+    executed = rollout(env, true[:, 0].select("state"), actions)
+    executed["next", "state"].square().sum().backward()
+    assert executed["next", "state"].isfinite().all()
     assert (actions.grad != 0).any()
 
 

@@ -34,11 +34,11 @@ def test_a_batch_steps_as_its_members_do(swimmer):
 def test_a_recorded_rollout_replays_bit_for_bit(swimmer):
     env = SceneEnv(swimmer, seed=0)
     env.set_seed(3)
-    played = env.rollout(10, tensordict=batch(4))
-    replayed = SceneEnv(swimmer, num_threads=1).step(played.select("physics", "action"))["next"]
+    executed = env.rollout(10, tensordict=batch(4))
+    replayed = SceneEnv(swimmer, num_threads=1).step(executed.select("physics", "action"))["next"]
     for key in ("state", "physics"):
-        assert torch.equal(replayed[key], played["next", key])
-        assert torch.equal(played[key][:, 1:], played["next", key][:, :-1])
+        assert torch.equal(replayed[key], executed["next", key])
+        assert torch.equal(executed[key][:, 1:], executed["next", key][:, :-1])
 
 
 def test_a_step_leaves_its_input_alone(scene_env):
@@ -52,20 +52,20 @@ def test_the_pendulum_obeys_its_equation_of_motion(scene_env):
     # Semi-implicit Euler on I w' = m g l sin(q) - d w + u, the suite's pendulum, damping implicit.
     mass, length, damping, step = 1.0, 0.5, 0.1, 0.02
     inertia = mass * length**2 + 2 / 5 * mass * 0.05**2
-    played = scene_env.rollout(20, tensordict=batch(5))
-    angle, speed = played["physics"][..., 1], played["physics"][..., 2]
-    torque = mass * 9.81 * length * angle.sin() - damping * speed + played["action"][..., 0].double()
+    executed = scene_env.rollout(20, tensordict=batch(5))
+    angle, speed = executed["physics"][..., 1], executed["physics"][..., 2]
+    torque = mass * 9.81 * length * angle.sin() - damping * speed + executed["action"][..., 0].double()
     next_speed = speed + step * torque / (inertia + step * damping)
-    torch.testing.assert_close(played["next", "physics"][..., 2], next_speed, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(played["next", "physics"][..., 1], angle + step * next_speed, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(executed["next", "physics"][..., 2], next_speed, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(executed["next", "physics"][..., 1], angle + step * next_speed, rtol=1e-9, atol=1e-9)
 
 
 def test_the_reward_is_the_angle_from_upright(scene_env):
-    played = scene_env.rollout(20, tensordict=batch(5))
-    angle = played["next", "physics"][..., 1]
+    executed = scene_env.rollout(20, tensordict=batch(5))
+    angle = executed["next", "physics"][..., 1]
     wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
     expected = -wrapped.abs().unsqueeze(-1).float()
-    torch.testing.assert_close(played["next", "reward"], expected, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(executed["next", "reward"], expected, rtol=1e-6, atol=1e-6)
 
 
 def test_takes_actions_of_either_precision(scene_env):
@@ -96,8 +96,8 @@ def test_reset_starts_from_given_physics_only_when_asked(scene_env):
     assert (kept.select("physics", "state") == start.select("physics", "state")).all()
     drawn = scene_env.reset(start.clone(), set_state=False)
     assert (drawn["physics"] != start["physics"]).any(-1).all()
-    played = scene_env.rollout(2, tensordict=start.clone(), set_state=True)
-    assert torch.equal(played["physics"][:, 0], start["physics"])
+    executed = scene_env.rollout(2, tensordict=start.clone(), set_state=True)
+    assert torch.equal(executed["physics"][:, 0], start["physics"])
 
 
 def test_a_partial_reset_moves_the_masked_only(scene_env):
@@ -149,9 +149,9 @@ def test_an_unstable_step_ends_the_episode_and_keeps_the_last_good_state(tmp_pat
 
 def test_a_scene_without_motors_steps(capfd):
     env = SceneEnv(zoo.load("falling"), seed=0)
-    played = env.rollout(5, tensordict=batch(2))
-    assert played["action"].shape == (2, 5, 0)
-    assert not played["next", "done"].any()
+    executed = env.rollout(5, tensordict=batch(2))
+    assert executed["action"].shape == (2, 5, 0)
+    assert not executed["next", "done"].any()
     assert "".join(capfd.readouterr()) == ""
 
 
@@ -183,8 +183,8 @@ def test_resets_and_steps_share_one_simulator(env, monkeypatch):
 def test_a_task_entry_reaches_the_reward(pendulum):
     env = SceneEnv(pendulum, lambda state, action, next_state, task: task, seed=0)
     start = env.reset(batch(3)).set("task", torch.arange(3.0).unsqueeze(-1))
-    played = env.rollout(4, tensordict=start, auto_reset=False)
-    assert torch.equal(played["next", "reward"], torch.arange(3.0).reshape(3, 1, 1).expand(3, 4, 1))
+    executed = env.rollout(4, tensordict=start, auto_reset=False)
+    assert torch.equal(executed["next", "reward"], torch.arange(3.0).reshape(3, 1, 1).expand(3, 4, 1))
 
 
 def test_a_reward_of_a_wrong_shape_is_named(pendulum):

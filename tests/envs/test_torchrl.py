@@ -66,22 +66,22 @@ def test_specs_hold_for_a_swimmer(swimmer):
 
 
 def test_rollout_of_a_batch(env):
-    played = env.rollout(6, tensordict=TensorDict(batch_size=[4]))
-    assert played.shape == (4, 6)
-    assert played["next", "reward"].shape == (4, 6, 1)
-    assert played["action"].dtype == played["next", "reward"].dtype == torch.float32
-    assert played["state"].dtype == torch.float64
-    assert not played["next", "done"].any()
+    executed = env.rollout(6, tensordict=TensorDict(batch_size=[4]))
+    assert executed.shape == (4, 6)
+    assert executed["next", "reward"].shape == (4, 6, 1)
+    assert executed["action"].dtype == executed["next", "reward"].dtype == torch.float32
+    assert executed["state"].dtype == torch.float64
+    assert not executed["next", "done"].any()
 
 
 def test_time_limits_by_step_counter(env):
     limited = TransformedEnv(env, StepCounter(max_steps=4))
     assert limited.rollout(10).shape == (4,)
-    played = limited.rollout(10, break_when_any_done=False)
-    assert played["next", "truncated"].flatten().tolist() == [False, False, False, True] * 2 + [False, False]
-    assert not played["next", "terminated"].any()
-    again = played["state"][4]  # a fresh start, and the state before it is kept under "next"
-    assert not torch.equal(again, played["next", "state"][3])
+    executed = limited.rollout(10, break_when_any_done=False)
+    assert executed["next", "truncated"].flatten().tolist() == [False, False, False, True] * 2 + [False, False]
+    assert not executed["next", "terminated"].any()
+    again = executed["state"][4]  # a fresh start, and the state before it is kept under "next"
+    assert not torch.equal(again, executed["next", "state"][3])
 
 
 @pytest.mark.parametrize("size", [None, 4])
@@ -120,9 +120,9 @@ def test_serial_env(pendulum):
     env = SerialEnv(3, lambda: SceneEnv(pendulum, make_reward("balance", pendulum)))
     env.set_seed(0)
     check_env_specs(env)
-    played = env.rollout(3)
-    assert played.shape == (3, 3)
-    assert len(set(played["physics"][:, 0, 1].tolist())) == 3
+    executed = env.rollout(3)
+    assert executed.shape == (3, 3)
+    assert len(set(executed["physics"][:, 0, 1].tolist())) == 3
     env.close()
 
 
@@ -132,17 +132,17 @@ def test_planners_run(env, planner):
     act = planner(env)
     for size in ([], [2]):
         start = env.reset(TensorDict(batch_size=size))
-        played = env.rollout(3, act, tensordict=start, auto_reset=False)
-        assert played["action"].shape == (*size, 3, 1)
-        assert played["action"].abs().max() <= 1
-        assert played["next", "reward"].isfinite().all()
+        executed = env.rollout(3, act, tensordict=start, auto_reset=False)
+        assert executed["action"].shape == (*size, 3, 1)
+        assert executed["action"].abs().max() <= 1
+        assert executed["next", "reward"].isfinite().all()
 
 
 def test_planner_on_the_model_acts_in_the_true_environment(scene_env, model_env):
     act = cem(model_env)
-    played = scene_env.rollout(3, act, tensordict=scene_env.reset(TensorDict(batch_size=[2])), auto_reset=False)
-    replayed = scene_env.step(played.exclude("next"))["next"]
-    assert torch.equal(replayed["physics"], played["next", "physics"])
+    executed = scene_env.rollout(3, act, tensordict=scene_env.reset(TensorDict(batch_size=[2])), auto_reset=False)
+    replayed = scene_env.step(executed.exclude("next"))["next"]
+    assert torch.equal(replayed["physics"], executed["next", "physics"])
 
 
 def test_planner_as_collector_policy(env):
@@ -185,6 +185,6 @@ def test_an_unstable_candidate_neither_ends_nor_wins_a_search():
     scene = zoo.load("cart", ('gear="1"', 'gear="2e10"'))
     env = SceneEnv(scene, lambda state, action, next_state, task: -torch.ones_like(action), seed=0)
     act = CEMPlanner(env, planning_horizon=2, optim_steps=2, num_candidates=128, top_k=5)
-    played = env.rollout(2, act)
-    assert played["action"].abs().max() < 0.5
-    assert not played["next", "terminated"].any()
+    executed = env.rollout(2, act)
+    assert executed["action"].abs().max() < 0.5
+    assert not executed["next", "terminated"].any()

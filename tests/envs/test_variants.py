@@ -58,8 +58,8 @@ def test_every_sample_moves_as_its_own_variant_does(env, scenes):
 
 
 def test_episodes_that_begin_anew_keep_their_variant(env):
-    played = batched(env, 3).append_transform(StepCounter(2)).rollout(5, break_when_any_done=False)
-    assert (played["variant"].squeeze(-1) == torch.arange(3)[:, None]).all()
+    executed = batched(env, 3).append_transform(StepCounter(2)).rollout(5, break_when_any_done=False)
+    assert (executed["variant"].squeeze(-1) == torch.arange(3)[:, None]).all()
 
 
 def test_planners_plan_with_the_variant_of_every_sample(env, scenes):
@@ -69,12 +69,12 @@ def test_planners_plan_with_the_variant_of_every_sample(env, scenes):
     for row, scene in enumerate(scenes):
         own = SceneEnv(scene, env.reward)
         planner = ILQGPlanner(own, 4, 1, warm_up=2, seed=0)
-        begun = start[row : row + 1].exclude("variant")
-        begun["plan"] = TensorDict({"actions": plan[row : row + 1], "planned": torch.ones(1, 1).bool()}, [1])
-        again = start[row : row + 1].clone().set("plan", begun["plan"])
-        assert torch.equal(planner.plan(begun), together.plan(again))
-    played = env.rollout(2, CEMPlanner(env, 3, 1, 4, 2), tensordict=start, auto_reset=False)
-    assert played["action"].shape == (3, 2, 1)
+        resumed = start[row : row + 1].exclude("variant")
+        resumed["plan"] = TensorDict({"actions": plan[row : row + 1], "planned": torch.ones(1, 1).bool()}, [1])
+        again = start[row : row + 1].clone().set("plan", resumed["plan"])
+        assert torch.equal(planner.plan(resumed), together.plan(again))
+    executed = env.rollout(2, CEMPlanner(env, 3, 1, 4, 2), tensordict=start, auto_reset=False)
+    assert executed["action"].shape == (3, 2, 1)
 
 
 def test_bad_variants_are_named(env):

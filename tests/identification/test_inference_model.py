@@ -172,7 +172,7 @@ def test_true_parameters_cannot_leak(system, parameters):
         gradients = torch.autograd.grad(predicted[-1].sum(), list(true.values()), allow_unused=True)
         assert all(gradient is None for gradient in gradients)
     assert torch.equal(predicted[0], predicted[1]) and torch.equal(predicted[0], predicted[2])
-    # Bodies would be linked by a variant's own lengths, and their joint anchors looked for near there.
+    # Bodies would be projected by a variant's own lengths, and their joint anchors looked for near there.
     with pytest.raises(ValueError, match="is a variant, whose joint anchors would show its lengths"):
         model.bind(variants[1])
 

@@ -166,12 +166,12 @@ def test_a_trained_kind_of_model_imagines_what_stepping_gives_and_differentiates
 
 def test_the_next_call_goes_on_from_the_last_plan():
     env, planner = point_env(20.0), GradientPlanner(point_env(20.0), HORIZON, 2, warm_up=200, samples=4, seed=0)
-    played = env.rollout(4, planner, tensordict=at(1.0), auto_reset=False)
+    executed = env.rollout(4, planner, tensordict=at(1.0), auto_reset=False)
     optimum = best_actions(1.0)[:4]
-    torch.testing.assert_close(played["action"][0].double(), optimum, rtol=0.1, atol=0.3)
+    torch.testing.assert_close(executed["action"][0].double(), optimum, rtol=0.1, atol=0.3)
     fresh = GradientPlanner(env, HORIZON, 2, warm_up=2, samples=4, seed=0)
     alone = at(1.0)
-    assert (fresh(alone)["action"].double() - optimum[0]).abs() > (played["action"][0, 0].double() - optimum[0]).abs()
+    assert (fresh(alone)["action"].double() - optimum[0]).abs() > (executed["action"][0, 0].double() - optimum[0]).abs()
 
 
 @pytest.mark.slow
@@ -179,15 +179,15 @@ def test_steps_shrink_where_they_gain_nothing_and_grow_where_they_do():
     env, error, sizes = point_env(20.0), {}, {}
     for shrink in (1.0, 0.7):
         planner = GradientPlanner(env, HORIZON, 3, shrink=shrink, warm_up=200, samples=4, seed=0)
-        played = env.rollout(30, planner, tensordict=at(1.0, -0.5, 2.0), auto_reset=False)
-        best = -played["state"][:, :, 1, [0, 7]] @ torch.from_numpy(best_gains()[0]).T
-        error[shrink] = (played["action"] - best)[:, 15:].abs().mean()
-        sizes[shrink] = played["plan", "step_size"][..., 0]
+        executed = env.rollout(30, planner, tensordict=at(1.0, -0.5, 2.0), auto_reset=False)
+        best = -executed["state"][:, :, 1, [0, 7]] @ torch.from_numpy(best_gains()[0]).T
+        error[shrink] = (executed["action"] - best)[:, 15:].abs().mean()
+        sizes[shrink] = executed["plan", "step_size"][..., 0]
     assert error[0.7] < 0.4 * error[1.0]
     assert (sizes[1.0] == 1).all()
     assert (sizes[0.7][:, :1] == 1).all() and (sizes[0.7] <= 1).all() and 0.01 <= sizes[0.7][:, 15:].mean() < 0.5
     # Two rows that go on from here, one of them thrown off: its steps grow at every step, the other's do not.
-    now = torch.cat([played[:1, -1].exclude("next", "action")] * 2)
+    now = torch.cat([executed[:1, -1].exclude("next", "action")] * 2)
     now["plan", "step_size"] = torch.full((2, 1), 0.05)
     now["state"][1, 1, 0] += 5.0
     for _ in range(3):
@@ -271,9 +271,9 @@ def test_a_task_is_fixed_when_planning_starts():
     start = env.reset(TensorDict(batch_size=[2]))
     start["target"] = start["state"][:, 1, :3] + torch.tensor([[2.0, 0, 0], [0, 2, 0]])
     with torch.no_grad():
-        played = env.rollout(3, TensorDictSequential(FreezeGoal(reward), planner), tensordict=start, auto_reset=False)
-    assert played["action"].shape == (2, 3, scene.num_actions)
-    assert (played["next", "reward"] != 0).any()
+        executed = env.rollout(3, TensorDictSequential(FreezeGoal(reward), planner), tensordict=start, auto_reset=False)
+    assert executed["action"].shape == (2, 3, scene.num_actions)
+    assert (executed["next", "reward"] != 0).any()
 
 
 def test_what_is_not_finite_keeps_the_last_good_plan_and_says_so():

@@ -65,11 +65,11 @@ def test_a_recurrent_model_remembers_what_was_played():
     with pytest.raises(KeyError, match="make_tensordict_primer"):
         acted.rollout(2, planner, tensordict=start.clone(), auto_reset=False)
     primed = batched(acted, 2).append_transform(planner.make_tensordict_primer())
-    played = primed.rollout(4, planner)
-    _, hidden_state = bound.teacher_forced(played["state"], played["action"])
+    executed = primed.rollout(4, planner)
+    _, hidden_state = bound.teacher_forced(executed["state"], executed["action"])
     for key, value in hidden_state.items():
-        torch.testing.assert_close(played["next", "hidden_state", key][:, -1], value)
-        assert (played["hidden_state", key][:, 0] == 0).all()
+        torch.testing.assert_close(executed["next", "hidden_state", key][:, -1], value)
+        assert (executed["hidden_state", key][:, 0] == 0).all()
 
 
 def test_what_an_inference_model_wrote_is_planned_with(folds):
@@ -105,5 +105,5 @@ def test_a_model_on_a_gpu_plans_for_states_elsewhere():
     env = SceneEnv(scene, make_reward("balance", scene), seed=0)
     planner = GradientPlanner(ModelEnv(bound, make_reward("balance", scene)), 3, 1, warm_up=2, samples=3, seed=0)
     with torch.no_grad():
-        played = env.rollout(3, planner)
-    assert played["action"].device.type == played["plan", "actions"].device.type == "cpu"
+        executed = env.rollout(3, planner)
+    assert executed["action"].device.type == executed["plan", "actions"].device.type == "cpu"

@@ -129,8 +129,8 @@ def test_swings_the_pendulum_up():
     planner = ILQGPlanner(env, 50, 1, seed=0)
     acted = TransformedEnv(env, planner.make_tensordict_primer())
     start = acted.reset(TensorDict({"physics": physics_of(env, [1.3, 0.0])[0]}), set_state=True)
-    played = acted.rollout(160, planner, tensordict=start, auto_reset=False)
-    angle = -played["next", "reward"].flatten()
+    executed = acted.rollout(160, planner, tensordict=start, auto_reset=False)
+    angle = -executed["next", "reward"].flatten()
     assert angle.max() > 2.5  # torque alone does not lift it: it must swing the other way first
     assert angle[-25:].max() < 0.1
 
@@ -216,7 +216,7 @@ def test_primer_and_collector():
     planner.plan = watched
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        played = acted.rollout(5, planner)
+        executed = acted.rollout(5, planner)
         assert known == [False] + [True] * 4
         known.clear()
         collector = Collector(
@@ -224,7 +224,7 @@ def test_primer_and_collector():
         )
         data = next(iter(collector))
         collector.shutdown()
-    assert played["plan", "actions"].shape == (5, 8, 1)
+    assert executed["plan", "actions"].shape == (5, 8, 1)
     assert data["action"].shape == (12, 1)
     # Before it begins, the collector tries the policy once.
     assert known[-12:] == ([False] + [True] * 4) * 2 + [False, True]

@@ -35,13 +35,13 @@ def test_an_interrupted_run_is_saved_and_goes_on(make_learner, tracker, tmp_path
     trainer.evaluate = interrupt
     with pytest.raises(KeyboardInterrupt):
         learn_with_progress(trainer, path, None, tracker, config=CONFIG)
-    begun = load_pretrained(path)
-    assert begun.config == CONFIG and begun.training["progress"]["frames"] == 100
-    again = make_learner(begun.agent, frames=140)
-    learn_with_progress(again, path, begun, tracker, config=CONFIG)
+    resumed = load_pretrained(path)
+    assert resumed.config == CONFIG and resumed.training["progress"]["frames"] == 100
+    again = make_learner(resumed.agent, frames=140)
+    learn_with_progress(again, path, resumed, tracker, config=CONFIG)
     saved = load_pretrained(path).training
     assert saved["progress"]["frames"] == 140 and saved["curve"]["frames"] == [0, 100, 140]
-    assert torch.equal(saved["buffer"]["action"][:100], begun.training["buffer"]["action"])
+    assert torch.equal(saved["buffer"]["action"][:100], resumed.training["buffer"]["action"])
 
 
 def test_a_report_holds_the_curve_and_its_last_tenth(make_learner, tracker, tmp_path, capsys):

@@ -32,15 +32,15 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, cal
     code, output, errors = call(*options, "steps=4", "planner=[gn,ilqg,mppi,cem_true,random]", recipe="mpc")
     assert code == 0, errors
     assert "warning" not in errors.lower()
-    played = {path.stem: load_file(path)["state"] for path in tmp_path.glob("*.safetensors")}
+    executed = {path.stem: load_file(path)["state"] for path in tmp_path.glob("*.safetensors")}
     controls = torch.from_numpy(spline_controls(load_scene("pendulum"), 2, 4, 2)).float()
     # The rest of an episode, and not one anew.
     assert torch.equal(load_file(tmp_path / "random.safetensors")["action"][:, 2:], controls[:, 2:])
-    assert len(played) == 5 and {len(states[0]) for states in played.values()} == {5}
-    assert (played["gn"][:, :3] == first).all()
-    assert all((states[:, 0] == first[:, 0]).all() for states in played.values())
+    assert len(executed) == 5 and {len(states[0]) for states in executed.values()} == {5}
+    assert (executed["gn"][:, :3] == first).all()
+    assert all((states[:, 0] == first[:, 0]).all() for states in executed.values())
     metrics = json.loads((tmp_path / "metrics.json").read_text())
-    assert all(metrics[f"{name}/mean_reward"] < 0 for name in played)
+    assert all(metrics[f"{name}/mean_reward"] < 0 for name in executed)
     printed = {Path(line).name for line in output.splitlines() if Path(line).is_file()}
     assert printed >= {"metrics.json", "rewards.png", "gn.gif", "ilqg.gif"}
 
@@ -96,9 +96,9 @@ def test_an_episode_ends_where_its_simulation_becomes_unstable(tmp_path, call, m
         assert kept["reward"].isnan().tolist() == [[False] * 3 + [True] * (steps - 3), [False] * steps]
         assert (kept["state"].isnan().flatten(2).any(2).sum(1) == torch.tensor([steps - 3, 0])).all()
         metrics = json.loads((tmp_path / "metrics.json").read_text())
-        played = kept["reward"][~kept["reward"].isnan()]
+        executed = kept["reward"][~kept["reward"].isnan()]
         assert metrics["random/unstable"] == 1
-        assert metrics["random/mean_reward"] == pytest.approx(played.mean().item())
+        assert metrics["random/mean_reward"] == pytest.approx(executed.mean().item())
     assert set(threads) == {1} and len(threads) == 8
 
 
@@ -167,9 +167,9 @@ def test_planners_that_go_on_draw_other_numbers(load):
     cfg = OmegaConf.create({"seed": 3, "horizon": 2, "episodes": 1, "steps": 9})
     cfg.cem = {"iterations": 1, "top_k": 2, "candidates": 4}
     drawn = []
-    for played in (0, 5, 5):
-        recipe.make_planner("cem_true", cfg, env, None, played)
+    for executed in (0, 5, 5):
+        recipe.make_planner("cem_true", cfg, env, None, executed)
         drawn.append(torch.rand(3))
     assert torch.equal(drawn[1], drawn[2]) and not torch.equal(drawn[0], drawn[1])
     torch.manual_seed(3)
-    assert torch.equal(torch.rand(3), drawn[0])  # whoever played before
+    assert torch.equal(torch.rand(3), drawn[0])  # whoever executed before

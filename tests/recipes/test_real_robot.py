@@ -52,7 +52,7 @@ def test_a_double_pendulum_needs_options_alone(pendulum, call, tmp_path):
     tree = load_pretrained(run / "recurrent").scene()
     assert tree.num_actions == 1 and tree.edge_action[:, 0].tolist() == [0, 0, -1, -1]
     before = (run / "config.yaml").read_text()
-    # Other options, with which the folder must stay as it is: of the first model, and of one that was not begun.
+    # Other options, with which the folder must stay as it is: of the first model, and of one that was not resumed.
     (run / "feed-forward" / "checkpoint" / "checkpoint.safetensors").unlink()
     code, output, errors = call(*options, "lr=0.5", recipe="real_robot")
     assert code != 0 and "lr=0.5 (was None)" in output + errors

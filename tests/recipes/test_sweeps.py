@@ -76,7 +76,7 @@ def ended(*_):
     sys.exit(143)
 signal.signal(signal.SIGTERM, ended)
 folder = pathlib.Path(sys.argv[1].split("=", 1)[1])
-(folder / "begun").touch()
+(folder / "resumed").touch()
 time.sleep(300)
 """
 
@@ -93,7 +93,7 @@ def test_an_interrupt_ends_the_runs(tmp_path, jobs):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def interrupt() -> None:
-        while not (run.folder / "begun").exists():
+        while not (run.folder / "resumed").exists():
             time.sleep(0.1)
         os.kill(os.getpid(), signal.SIGINT)
 

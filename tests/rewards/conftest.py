@@ -31,10 +31,10 @@ class Steps:
         rng = np.random.default_rng(3)
         physics = sample_start_states(scene, count, rng)
         actions = spline_controls(scene, count, length, rng)
-        played = Simulator(scene, num_threads=1).rollout(physics, actions)
-        assert played["stable"].all()
-        self.scene, self.physics = scene, played["physics"]
-        self.path = played["state"]  # [M, T + 1, N, 13]
+        executed = Simulator(scene, num_threads=1).rollout(physics, actions)
+        assert executed["stable"].all()
+        self.scene, self.physics = scene, executed["physics"]
+        self.path = executed["state"]  # [M, T + 1, N, 13]
         self.actions = torch.as_tensor(actions)
         self.action = self.actions[:, -1]
         self.state, self.next_state = self.path[:, -2], self.path[:, -1]

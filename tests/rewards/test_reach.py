@@ -116,18 +116,18 @@ def test_freeze_goal_writes_the_task_of_every_step(swimming, reward):
     policy = TensorDictModule(lambda state: next(actions), in_keys=["state"], out_keys=["action"])
     start = env.reset()
     start["target"] = torch.tensor([3.0, 4.0, 0.0], dtype=torch.float64)
-    played = env.rollout(10, TensorDictSequential(FreezeGoal(reward), policy), tensordict=start, auto_reset=False)
-    assert torch.equal(played["target"], start["target"].expand(10, 3))
-    head, after = played["state"][:, 1, :2], played["next", "state"][:, 1, :2]
+    executed = env.rollout(10, TensorDictSequential(FreezeGoal(reward), policy), tensordict=start, auto_reset=False)
+    assert torch.equal(executed["target"], start["target"].expand(10, 3))
+    head, after = executed["state"][:, 1, :2], executed["next", "state"][:, 1, :2]
     way = start["target"][:2] - head
     direction = way / way.norm(dim=-1, keepdim=True)
-    torch.testing.assert_close(played["task"][:, :2], direction)
+    torch.testing.assert_close(executed["task"][:, :2], direction)
     moved = after - head
     across = moved[:, 1] * direction[:, 0] - moved[:, 0] * direction[:, 1]
     wanted = (moved * direction).sum(-1) - 0.01 * across**2
-    torch.testing.assert_close(played["next", "reward"].squeeze(-1), wanted.float(), rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(executed["next", "reward"].squeeze(-1), wanted.float(), rtol=1e-5, atol=1e-9)
     assert wanted.abs().max() > 1e-5
-    assert (played["task"][0] != played["task"][-1]).any()  # fixed anew with every plan
+    assert (executed["task"][0] != executed["task"][-1]).any()  # fixed anew with every plan
 
 
 def test_without_a_task_the_environment_says_what_is_missing(swimming, reward):

@@ -29,7 +29,7 @@ def _motor(joint: str, kind: str = "motor") -> str:
     return f'<actuator><{kind} joint="{joint}" ctrlrange="-1 1"/></actuator>'
 
 
-HEADINGS = {
+YAW_FRAMES = {
     "hinge on the world": (_scene(_HINGE), True),
     "hinge in a plane": (_scene(_PLANE + _HINGE), True),
     "with a lift": (_scene('<joint type="slide" axis="0 0 1"/>' + _PLANE + _HINGE), True),
@@ -60,9 +60,9 @@ HEADINGS = {
 }
 
 
-@pytest.mark.parametrize("case", HEADINGS)
+@pytest.mark.parametrize("case", YAW_FRAMES)
 def test_heading_of_small_models(case):
-    xml, exact = HEADINGS[case]
+    xml, exact = YAW_FRAMES[case]
     yaw_frame = load_scene(xml).yaw_frame
     assert (None if yaw_frame is None else yaw_frame.exact) is exact
 
@@ -89,9 +89,9 @@ def _simulate(scene: Scene, qpos: np.ndarray, qvel: np.ndarray) -> torch.Tensor:
     return torch.as_tensor(np.array(states))
 
 
-@pytest.mark.parametrize("case", [*(case for case, (_, exact) in HEADINGS.items() if exact), "swimmer6"])
+@pytest.mark.parametrize("case", [*(case for case, (_, exact) in YAW_FRAMES.items() if exact), "swimmer6"])
 def test_turned_start_gives_turned_trajectory(case):
-    scene = load_scene(HEADINGS[case][0] if case in HEADINGS else case)
+    scene = load_scene(YAW_FRAMES[case][0] if case in YAW_FRAMES else case)
     model, yaw_frame = scene.model, scene.yaw_frame
     assert yaw_frame is not None
     rng = np.random.default_rng(0)
@@ -126,7 +126,7 @@ def test_turned_start_gives_turned_trajectory(case):
 
 @pytest.mark.parametrize("case", ["across gravity", "in wind", "sprung", "unlike slides", "position servo"])
 def test_what_has_no_heading_moves_differently_when_turned(case):
-    scene = load_scene(HEADINGS[case][0])
+    scene = load_scene(YAW_FRAMES[case][0])
     model = scene.model
     hinge = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, "turn")
     knee = model.jnt_dofadr[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, "knee")]

@@ -10,8 +10,8 @@ from torchrl_gn.data.errors import UnstableSimulationError as UnstableSimulation
 from torchrl_gn.data.logs import LogReport as LogReport
 from torchrl_gn.data.logs import RobotLog as RobotLog
 from torchrl_gn.data.logs import load_robot_log as load_robot_log
-from torchrl_gn.data.logs import log_chain as log_chain
 from torchrl_gn.data.logs import log_trajectories as log_trajectories
+from torchrl_gn.data.logs import log_tree as log_tree
 from torchrl_gn.data.logs import simulate_log as simulate_log
 from torchrl_gn.data.replay import TrajectoryStorage as TrajectoryStorage
 from torchrl_gn.data.replay import WindowSampler as WindowSampler

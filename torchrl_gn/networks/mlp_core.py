@@ -1,4 +1,4 @@
-"""The graph networks' rival: one MLP over the flattened graph."""
+"""The baseline of the graph networks: one MLP over the flattened graph."""
 
 from __future__ import annotations
 

@@ -177,12 +177,12 @@ class KinematicTree:
             "action_low": [None if np.isinf(value) else float(value) for value in self.action_low],
             "action_high": [None if np.isinf(value) else float(value) for value in self.action_high],
         }
-        return {"joint_chain": tree, "fingerprint": self.fingerprint()}
+        return {"kinematic_tree": tree, "fingerprint": self.fingerprint()}
 
     @classmethod
     def from_description(cls, description: dict) -> KinematicTree:
         """Rebuild from :meth:`description`."""
-        tree = dict(description["joint_chain"])
+        tree = dict(description["kinematic_tree"])
         for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
             tree[which] = np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
         for which in ("joint_names", "extras"):

@@ -75,7 +75,7 @@ def scene_from_description(description: dict) -> Scene:
 
     Warns SceneChangedWarning if its physics differ, as with another version of MuJoCo or of the model files.
     """
-    if "joint_chain" in description:
+    if "kinematic_tree" in description:
         # It has every attribute of a scene that models and errors read.
         return cast(Scene, KinematicTree.from_description(description))
     system = find_system(description["system"]) if "system" in description else None

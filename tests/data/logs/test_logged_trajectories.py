@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.data import RobotLog, load_robot_log, log_chain, log_trajectories
+from torchrl_gn.data import RobotLog, load_robot_log, log_trajectories, log_tree
 
 STEP = 0.01
 
@@ -168,5 +168,5 @@ def test_a_command_that_never_varies_is_named():
     log.command[:, 1] = 3.0
     report = log_trajectories(log, 10)[1]
     assert report.constant == (1,) and "commands that never vary: 1;" in str(report)
-    tree = log_chain(log, "arm")
+    tree = log_tree(log, "arm")
     assert tree.action_low[1] == tree.action_high[1] == 3 and tree.action_low[0] < tree.action_high[0]

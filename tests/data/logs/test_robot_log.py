@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.data import DatasetError, RobotLog, load_robot_log, log_chain, log_trajectories, simulate_log
+from torchrl_gn.data import DatasetError, RobotLog, load_robot_log, log_trajectories, log_tree, simulate_log
 from torchrl_gn.scenes import KinematicTree, load_scene, scene_from_description
 
 PAM = Path(__file__).parents[4] / "shared" / "data" / "pam_arm" / "pam_arm_clean_f32.npz"
@@ -206,7 +206,7 @@ def test_a_robot_without_motors_says_so(tmp_path):
         load_robot_log(tmp_path / "log.npz", timestep=0.01)
     read = load_robot_log(tmp_path / "log.npz", timestep=0.01, names={"command": ""})
     assert log_trajectories(read, 12)[0]["action"].shape == (6, 12, 0)
-    assert log_chain(read, "swing").num_actions == 0
+    assert log_tree(read, "swing").num_actions == 0
 
 
 def test_a_time_step_does_not_contradict_the_log(tmp_path):
@@ -233,14 +233,14 @@ def test_other_bad_input_is_named(tmp_path):
         ValueError, match=r"2 commands do not divide evenly among 3 joints; .* commands=\[\[0\], \[\]\]"
     ):
         log = smooth_log(joints=3)
-        log_chain(RobotLog(log.angle, log.velocity, log.command[:, :2], log.length, 0.01), "arm")
+        log_tree(RobotLog(log.angle, log.velocity, log.command[:, :2], log.length, 0.01), "arm")
     with pytest.raises(DatasetError, match="has no 'q'"):
         np.savez(tmp_path / "ok.npz", **arrays_of(smooth_log()), timestep=0.01)
         load_robot_log(tmp_path / "ok.npz", names={"angle": "q"})
 
 
 def test_a_chain_is_a_graph_that_comes_back_from_its_description():
-    tree = log_chain(smooth_log(joints=3), "arm", joint_parents=[-1, 0, 0])
+    tree = log_tree(smooth_log(joints=3), "arm", joint_parents=[-1, 0, 0])
     assert isinstance(tree, KinematicTree)
     assert tree.senders.tolist() == [0, 1, 1, 2, 1, 3] and tree.receivers.tolist() == [1, 0, 2, 1, 3, 1]
     assert tree.edge_action[:, 0].tolist() == [0, 0, 1, 1, 2, 2]
@@ -248,13 +248,13 @@ def test_a_chain_is_a_graph_that_comes_back_from_its_description():
     assert again.fingerprint() == tree.fingerprint() and again.senders.tolist() == tree.senders.tolist()
     assert "joint2, parent joint0" in str(tree)
     with pytest.raises(ValueError, match="joint_parents="):
-        log_chain(smooth_log(), "arm", joint_parents=[0, 1])
+        log_tree(smooth_log(), "arm", joint_parents=[0, 1])
 
 
 def test_a_chain_of_numpy_numbers_can_be_saved():
-    plain = log_chain(smooth_log(joints=3), "arm", commands=[[2], [0], [1]], joint_parents=[-1, 0, 0])
+    plain = log_tree(smooth_log(joints=3), "arm", commands=[[2], [0], [1]], joint_parents=[-1, 0, 0])
     own = {"commands": np.array([[2], [0], [1]]), "joint_parents": np.array([-1, 0, 0])}
-    tree = log_chain(dataclasses.replace(smooth_log(joints=3), timestep=np.float32(0.01)), "arm", **own)
+    tree = log_tree(dataclasses.replace(smooth_log(joints=3), timestep=np.float32(0.01)), "arm", **own)
     assert json.loads(json.dumps(tree.description())) == tree.description()
     assert tree.fingerprint() == plain.fingerprint()
 
@@ -263,7 +263,7 @@ def test_bounds_are_of_every_command():
     with pytest.raises(ValueError, match=r"action_low of 'arm' must be \[2\], one a command, got \[1\]"):
         KinematicTree("arm", ("a", "b"), 0.01, ((0,), (1,)), action_low=np.zeros(1))
     with pytest.raises(ValueError, match=r"action_low of 'arm' must be \[1\], one a command, got \[2\]"):
-        log_chain(smooth_log(), "arm", commands=[[0], [0]])
+        log_tree(smooth_log(), "arm", commands=[[0], [0]])
 
 
 def test_a_simulated_robot_has_the_faults_of_a_real_one():

@@ -3,6 +3,6 @@
 from torchrl_gn.data.logs.logged_trajectories import LogReport as LogReport
 from torchrl_gn.data.logs.logged_trajectories import log_trajectories as log_trajectories
 from torchrl_gn.data.logs.robot_log import RobotLog as RobotLog
-from torchrl_gn.data.logs.robot_log import log_chain as log_chain
+from torchrl_gn.data.logs.robot_log import log_tree as log_tree
 from torchrl_gn.data.logs.robot_log_files import load_robot_log as load_robot_log
 from torchrl_gn.data.logs.simulated_log import simulate_log as simulate_log

@@ -96,7 +96,7 @@ def short_way(change: np.ndarray) -> np.ndarray:
     return (change + np.pi) % (2 * np.pi) - np.pi
 
 
-def log_chain(
+def log_tree(
     log: RobotLog,
     name: str,
     *,
