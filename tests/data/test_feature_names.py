@@ -121,7 +121,7 @@ def test_what_is_missing_is_named(tmp_path, model, monkeypatch):
         fresh.bind(load_scene("pendulum"))
 
 
-def test_an_unfinished_data_set_is_finished_with_the_columns_it_was_begun_with(tmp_path, monkeypatch):
+def test_an_unfinished_data_set_is_finished_with_the_columns_it_was_started_with(tmp_path, monkeypatch):
     for module in (collect, dataset):
         monkeypatch.setattr(module, "CHUNK", 4)
     scene = load_scene("pendulum")
@@ -141,7 +141,7 @@ def test_an_unfinished_data_set_is_finished_with_the_columns_it_was_begun_with(t
             create_dataset(tmp_path / "gained", load_scene("pendulum"), **SIZES, progress=interrupt)
     for file in (tmp_path / "whole").rglob("*.*"):
         assert file.read_bytes() == (tmp_path / "parts" / file.relative_to(tmp_path / "whole")).read_bytes(), file
-    with pytest.raises(DatasetError, match=r"was resumed with static features \['charm'\]"):
+    with pytest.raises(DatasetError, match=r"was started with static features \['charm'\]"):
         create_dataset(tmp_path / "gained", scene, **SIZES)
 
 

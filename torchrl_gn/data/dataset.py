@@ -71,7 +71,7 @@ def create_dataset(
     chunks; after an interruption the same call continues and gives the same bits. Other processes wait for the first.
 
     Args:
-        path: folder of the data set, new, empty or begun by an equal call.
+        path: folder of the data set, new, empty or started by an equal call.
         seed: not negative; splits are independent.
         variants: number of random variants that the sequences of each split take in turn, no split another's; at least
             as many as sequences: one each. Default: all are of the scene itself. The paper does not give it.
@@ -135,7 +135,7 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
         done = {split: len(chunks) for split, chunks in manifest["chunks"].items()}
         raise DatasetError(
             f"{files.manifest_path}: the data set is unfinished (chunks done: {done}). Call create_dataset "
-            "with the arguments it was begun with to finish it."
+            "with the arguments it was started with to finish it."
         )
     if scene is None:
         if manifest["description"] is None:
@@ -163,13 +163,13 @@ def _collect_missing(
     request, versions = files.manifest["request"], simulation_versions()
     if files.manifest["versions"] != versions:
         raise DatasetError(
-            f"{files.manifest_path}: the data set was begun with {files.manifest['versions']} and would go on "
+            f"{files.manifest_path}: the data set was started with {files.manifest['versions']} and would go on "
             f"differently with {versions}. Finish it with those versions, or use another folder."
         )
     stored, here = _stored_features(files), ParameterNames.of(scene)
     if stored and (missing := stored.missing_in(here)):
         raise DatasetError(
-            f"{files.manifest_path}: the data set was begun with static features {missing}, which this version of"
+            f"{files.manifest_path}: the data set was started with static features {missing}, which this version of"
             " torchrl_gn does not have. Finish it with that version, or use another folder."
         )
     chunks = list(_missing_chunks(files, scene))

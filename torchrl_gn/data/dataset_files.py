@@ -55,7 +55,7 @@ class DatasetFiles:
         return FileLock(root.with_name(f".{root.name}.lock")) if writable else nullcontext()
 
     def find(self, request: dict) -> bool:
-        """Whether the data set of a request is there, finished or begun; reads its manifest and checks all its files.
+        """Whether the data set of a request is there, finished or started; reads its manifest and checks all its files.
 
         Raises DatasetError if something else is there, another or a damaged data set.
         """
@@ -145,7 +145,7 @@ class DatasetFiles:
         self._write()
 
     def open(self, split: str, *, checksums: bool) -> TensorDict:
-        """A split that was begun, mapped from disk copy-on-write: writing to it never reaches the files.
+        """A split that was started, mapped from disk copy-on-write: writing to it never reaches the files.
 
         Raises DatasetError if a file is missing, changed, of another size or, of a finished chunk, fails its checksum.
         """
