@@ -44,15 +44,18 @@ BOUNDS = {torch.float64: 1e-10, torch.float32: 1e-5}
 
 
 def cases() -> list:
-    """Executor, system, model, batches, and whether each sample has parameters of its own."""
+    """Executor, system, model, batches, whether each sample has parameters of its own, and dtype."""
     systems, batches = [*SYSTEMS, "joints"], [(), (1,), (5,)]
-    found: list = [("eager", *each, batches, False) for each in itertools.product(systems, MODELS)]
-    found += [("eager", *each, [(5,)], True) for each in itertools.product(systems, MODELS)]
+    found: list = []
+    for each in itertools.product(systems, MODELS):
+        for dtype in BOUNDS:
+            found += [("eager", *each, batches, False, dtype), ("eager", *each, [(5,)], True, dtype)]
+    # A gradient takes up to minutes to compile.
     few = [
-        ("pendulum", "gn", [()], False),
-        ("pendulum", "recurrent", [(1,)], False),
-        ("pendulum", "mlp", [(5,)], True),
-        ("swimmer6", "gn", [(5,)], True),
+        ("pendulum", "gn", [()], False, torch.float64),
+        ("pendulum", "recurrent", [(1,)], False, torch.float32),
+        ("pendulum", "mlp", [(5,)], True, torch.float32),
+        ("swimmer6", "gn", [(5,)], True, torch.float32),
     ]
     for executor in sorted(EXECUTORS.keys() - {"eager"}):
         found += [pytest.param(executor, *each, marks=[pytest.mark.slow, compiles]) for each in few]
@@ -86,8 +89,7 @@ def own_parameters(predictor: Predictor, batch: tuple[int, ...]) -> TensorDictBa
     return parameters
 
 
-@pytest.mark.parametrize("dtype", BOUNDS, ids=str)
-@pytest.mark.parametrize(("executor", "name", "kind", "batches", "own"), cases())
+@pytest.mark.parametrize(("executor", "name", "kind", "batches", "own", "dtype"), cases())
 def test_every_executor_is_the_reference(
     fit, random_states, random_actions, monkeypatch, executor, name, kind, batches, own, dtype
 ):
