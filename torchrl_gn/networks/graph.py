@@ -47,11 +47,7 @@ class Graph:
 
 
 def graph_concat(first: Graph, second: Graph) -> Graph:
-    """Concatenate edge, node and global features of two graphs of one topology.
-
-    The batch shapes are broadcast, so a graph without batch (a scene's static
-    graph) joins any batch. Paper: "graph-concatenation".
-    """
+    """Concatenate the features of two graphs of one topology, whose batches broadcast. Paper: "graph-concatenation"."""
     return Graph(
         nodes=_concat(first.nodes, second.nodes, 2),
         edges=_concat(first.edges, second.edges, 2),
@@ -61,31 +57,13 @@ def graph_concat(first: Graph, second: Graph) -> Graph:
 
 
 def graph_split(graph: Graph, sizes: Sequence[int]) -> tuple[Graph, Graph]:
-    """Split edge, node and global features into two graphs. Paper: "graph-splitting".
-
-    Args:
-        graph: the graph to split.
-        sizes: ``(F_n, F_e, F_g)`` of the first graph; the second gets the rest.
-    """
-    nodes, edges, globals_ = sizes
-    return (
-        Graph(
-            graph.nodes[..., :nodes],
-            graph.edges[..., :edges],
-            graph.globals_[..., :globals_],
-            graph.edge_index,
-        ),
-        Graph(
-            graph.nodes[..., nodes:],
-            graph.edges[..., edges:],
-            graph.globals_[..., globals_:],
-            graph.edge_index,
-        ),
-    )
+    """Split features, the first graph's from the rest; ``sizes`` are ``(F_n, F_e, F_g)``. Paper: "graph-splitting"."""
+    n, e, g = sizes
+    nodes, edges, globals_ = graph.nodes, graph.edges, graph.globals_
+    first = Graph(nodes[..., :n], edges[..., :e], globals_[..., :g], graph.edge_index)
+    return first, Graph(nodes[..., n:], edges[..., e:], globals_[..., g:], graph.edge_index)
 
 
 def _concat(first: Tensor, second: Tensor, trailing: int) -> Tensor:
     batch = torch.broadcast_shapes(first.shape[:-trailing], second.shape[:-trailing])
-    first = first.expand(*batch, *first.shape[-trailing:])
-    second = second.expand(*batch, *second.shape[-trailing:])
-    return torch.cat((first, second), dim=-1)
+    return torch.cat([part.expand(*batch, *part.shape[-trailing:]) for part in (first, second)], dim=-1)

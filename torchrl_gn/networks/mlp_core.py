@@ -23,13 +23,9 @@ class MLPCore(Core):
     to graphs of one size.
 
     Args:
-        dynamic: features of the dynamic graph.
-        static: features of the static graph.
-        out_nodes: features of every output node.
         counts: numbers of nodes and edges of the graphs.
         hidden: width of the hidden layers, or their sizes.
         layers: number of hidden layers, if ``hidden`` is one width.
-        activation: between the layers.
 
     Raises:
         ValueError: if ``counts`` is missing, there is no hidden layer, or the activation is not known.
@@ -61,7 +57,6 @@ class MLPCore(Core):
         self.mlp = MLP(inputs, nodes * out_nodes, num_cells=cells, activation_class=activation_class(activation))
 
     def forward(self, graph: Graph) -> Graph:
-        """Graph with dynamic and static features in, graph with ``out_nodes`` node features out."""
         out = self.mlp(torch.cat(_flat(graph), dim=-1))
         empty = out[..., :0]
         assert self.counts is not None
