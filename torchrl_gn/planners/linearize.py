@@ -59,13 +59,10 @@ class Linearization:
 def linearize(
     simulator: Simulator, physics: np.ndarray, actions: np.ndarray, *, epsilon: float = 1e-6, central: bool = False
 ) -> Linearization:
-    """Linearise a trajectory by finite differences of whole control steps, inwards at the controls' bounds.
+    """Linearise states ``[T + 1, S]`` and ``actions`` ``[T, A]`` by finite differences, inwards at the bounds.
 
-    Args:
-        physics: states ``[T + 1, S]``, float64.
-        actions: ``[T, A]``, within the bounds.
-        epsilon: size of the perturbations, in SI units, and of controls in halves of their range.
-        central: central differences, error ``O(epsilon ** 2)``, at twice the cost of forward ones, ``O(epsilon)``.
+    ``epsilon`` perturbs in SI units, and controls in halves of their range. ``central`` differences have an error
+    ``O(epsilon ** 2)``, at twice the cost of forward ones, ``O(epsilon)``.
     """
     scene, tangent = simulator.scene, Tangent(simulator.scene.model)
     times, num = len(physics), tangent.size + scene.num_actions

@@ -19,8 +19,7 @@ class RewardExpansion:
     """
 
     def __init__(self, reward: Callable[..., Tensor], task: Any, device: torch.device | str | None):
-        self.reward = reward
-        self.device = device
+        self.reward, self.device = reward, device
         with torch.inference_mode(False):
             # Autograd refuses tensors made in inference mode: clone it.
             self.task = None if task is None else task.detach().clone()
@@ -40,10 +39,8 @@ class RewardExpansion:
         with torch.inference_mode(False), torch.enable_grad():
             columns = [torch.from_numpy(np.ascontiguousarray(j)).to(self.device) for j in jacobians]
             gradients, _ = self._gradients(self._tensors(inputs))
-            terms = [
-                (j.transpose(1, 2) @ g.flatten(1).unsqueeze(-1)).squeeze(-1)
-                for j, g in zip(columns, gradients, strict=True)
-            ]
+            pairs = zip(columns, gradients, strict=True)
+            terms = [(j.mT @ g.flatten(1).unsqueeze(-1)).squeeze(-1) for j, g in pairs]
             gradient = (terms[0] + terms[1] + terms[2]).detach().cpu().numpy()
             hessian = torch.zeros(len(inputs[1]), num, num, dtype=torch.float64)
             if any(g.requires_grad for g in gradients):

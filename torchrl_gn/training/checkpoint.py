@@ -23,22 +23,12 @@ from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import Scene, scene_from_description
 
-CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
-"""Checkpoint of a run folder."""
-
-FORMAT = 4
-"""Version of the checkpoint format that this package writes and reads."""
-
+CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"  # of a run folder
+FORMAT = 4  # version of the checkpoint format that this package writes and reads
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
-
-Trained = ForwardModel | IdentifyingModel | Agent
-"""What a checkpoint can hold."""
-
+Trained = ForwardModel | IdentifyingModel | Agent  # what a checkpoint can hold
 KINDS: dict[str, type[Trained]] = {"forward_model": ForwardModel, "identifying_model": IdentifyingModel, "agent": Agent}
-"""What checkpoints hold, by the name that they call it."""
-
-
 _Kind = TypeVar("_Kind", bound=Trained)
 
 
@@ -142,8 +132,7 @@ def save_checkpoint(
 def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
     """Read a checkpoint file, or that of a run folder. Weights in half precision compute in single precision.
 
-    Raises:
-        CheckpointError: the file is missing, damaged, of another format or no checkpoint, or holds NaN or Inf.
+    CheckpointError if the file is missing, damaged, of another format or no checkpoint, or holds NaN or Inf.
     """
     path = Path(path)
     if path.is_dir():

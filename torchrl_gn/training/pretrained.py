@@ -9,8 +9,7 @@ from pathlib import Path
 import torchrl_gn
 from torchrl_gn.training.checkpoint import Checkpoint, CheckpointError, read_checkpoint
 
-WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")
-"""Folder of the models that come with the package."""
+WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")  # the models that come with the package
 
 
 def pretrained_names() -> list[str]:
@@ -19,17 +18,10 @@ def pretrained_names() -> list[str]:
 
 
 def load_pretrained(source: str | os.PathLike) -> Checkpoint:
-    """Load a trained model.
+    """Load a trained model: one of :func:`pretrained_names`, or the path of a run folder or checkpoint file.
 
-    Args:
-        source: one of :func:`pretrained_names`, or the path of a run folder or checkpoint file; ``"./cheetah"`` for a
-            folder that has the name of a model.
-
-    Returns:
-        The checkpoint: model, scenes it was trained on, and its errors in ``metrics``.
-
-    Raises:
-        CheckpointError: if it is neither, or the file cannot be used.
+    ``"./cheetah"`` is a folder that has the name of a model. The checkpoint's ``metrics`` hold the model's errors.
+    CheckpointError if there is no such source, or the file cannot be used.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
