@@ -85,7 +85,7 @@ class InferenceModel(nn.Module):
         """Output of one observation, and the hidden graph for the next."""
         size = self.inferred_size
         output, rest = graph_split(self.block(graph_concat(observed, hidden)), (size.nodes, size.edges, size.globals_))
-        return output, Graph(rest.nodes.tanh(), rest.edges.tanh(), rest.globals_.tanh(), rest.edge_index)
+        return output, Graph(*[part.tanh() for part in rest.features], edge_index=rest.edge_index)
 
 
 class BoundInferenceModel(TensorDictModuleBase):
@@ -169,7 +169,8 @@ class BoundInferenceModel(TensorDictModuleBase):
             output, hidden = self.model(now, self.model.start(now) if context is None else context.hidden)
             count = 1 if context is None else context.count + 1
             if context is not None and self.model.readout == "mean":
-                output = _lerp(context.estimate, output, 1 / count)
+                parts = zip(context.estimate.features, output.features, strict=True)
+                output = Graph(*[torch.lerp(mean, new, 1 / count) for mean, new in parts], edge_index=output.edge_index)
             context = Context(hidden, output, count, None if anchors is None else anchors[..., step, :, :, :])
             yield context
 
@@ -187,16 +188,6 @@ class BoundInferenceModel(TensorDictModuleBase):
             parent_anchor, child_anchor = self.anchors.solve(context.anchors)
             parameters.update({"parent_anchor": parent_anchor, "child_anchor": child_anchor})
         return Estimate(parameters, context)
-
-
-def _lerp(first: Graph, second: Graph, share: float) -> Graph:
-    """Features between those of two graphs of one topology."""
-    return Graph(
-        torch.lerp(first.nodes, second.nodes, share),
-        torch.lerp(first.edges, second.edges, share),
-        torch.lerp(first.globals_, second.globals_, share),
-        first.edge_index,
-    )
 
 
 class IdentifyingModel(nn.Module):

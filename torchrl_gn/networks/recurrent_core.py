@@ -39,12 +39,8 @@ class RecurrentCore(Core):
 
     def update(self, dynamic: Graph, static: Graph, hidden: Graph) -> Graph:
         graph = graph_concat(dynamic, static)
-        return Graph(
-            _each(self.nodes, graph.nodes, hidden.nodes),
-            _each(self.edges, graph.edges, hidden.edges),
-            _each(self.globals_, graph.globals_, hidden.globals_),
-            dynamic.edge_index,
-        )
+        cells = zip((self.nodes, self.edges, self.globals_), graph.features, hidden.features, strict=True)
+        return Graph(*[_each(*cell) for cell in cells], edge_index=dynamic.edge_index)
 
     def forward(self, graph: Graph) -> Graph:
         return self.core(graph)

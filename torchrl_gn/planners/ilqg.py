@@ -18,8 +18,8 @@ from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
+from torchrl_gn.planners.linearize import RewardExpansion
 from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
-from torchrl_gn.planners.reward_expansion import RewardExpansion
 
 _INITIAL_SAMPLES = 16  # random sequences; a first plan starts from the best
 

@@ -56,10 +56,9 @@ class CompiledExecutor:
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         inputs = [state, action]
-        recurrent = self.program.recurrent
-        if recurrent is not None:
+        if self.program.recurrent is not None:
             hidden = self._start(state, action) if hidden is None else hidden
-            inputs += [hidden.nodes, hidden.edges, hidden.globals_]
+            inputs += hidden.features
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
             after, *rest = _Differentiable.apply(self, *inputs)
         else:
@@ -87,7 +86,7 @@ def _recurrent_functions(program: StepProgram) -> tuple[Callable, Callable]:
     def run(state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor) -> tuple[Tensor, ...]:
         after, hidden = eager.step(program, state, action, Graph(nodes, edges, globals_, program.edge_index))
         assert hidden is not None
-        return after, hidden.nodes, hidden.edges, hidden.globals_
+        return after, *hidden.features
 
     def pull(
         state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor, *gradients: Tensor
