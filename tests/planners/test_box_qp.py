@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from torchrl_gn.planners.box_qp import solve_box_qp
+from torchrl_gn.planners.ddp import solve_box_qp
 
 
 def problems(count: int, num: int, seed: int = 0) -> tuple[np.ndarray, ...]:

@@ -19,7 +19,7 @@ from torchrl_gn.data import sample_start_states
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.planners.ilqg import ILQGPlanner
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
-from torchrl_gn.planners.reward_expansion import RewardExpansion
+from torchrl_gn.planners.linearize import RewardExpansion
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import Scene, load_scene
 

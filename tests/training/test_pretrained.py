@@ -10,7 +10,7 @@ from torchrl_gn.evaluation import fresh_errors
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import CheckpointError, load_pretrained, pretrained_names, save_checkpoint
-from torchrl_gn.training.pretrained import WEIGHTS
+from torchrl_gn.training.checkpoint import WEIGHTS
 
 QUICK = {"pendulum", "cartpole", "acrobot"}
 

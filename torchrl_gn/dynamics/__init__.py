@@ -1,6 +1,7 @@
 """Forward models: weights, predictors of one scene, and what executes their steps."""
 
 from torchrl_gn.dynamics.as_predictor import as_predictor as as_predictor
+from torchrl_gn.dynamics.checks import UnseenParameterWarning as UnseenParameterWarning
 from torchrl_gn.dynamics.export import export_step as export_step
 from torchrl_gn.dynamics.features import BodyState as BodyState
 from torchrl_gn.dynamics.features import Canonicalizer as Canonicalizer
@@ -12,4 +13,3 @@ from torchrl_gn.dynamics.model import ForwardModel as ForwardModel
 from torchrl_gn.dynamics.predictor import Predictor as Predictor
 from torchrl_gn.dynamics.specialized import SpecializedPredictor as SpecializedPredictor
 from torchrl_gn.dynamics.specialized import specialize as specialize
-from torchrl_gn.dynamics.unseen_parameters import UnseenParameterWarning as UnseenParameterWarning

@@ -15,8 +15,7 @@ from torchrl_gn.dynamics.predictor import Predictor
 def as_predictor(module: TensorDictModuleBase) -> Predictor | ModulePredictor:
     """The module itself if it is a predictor, else wrapped to have its methods.
 
-    Args:
-        module: reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
+    It reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
     """
     return module if isinstance(module, Predictor) else ModulePredictor(module)
 
@@ -25,14 +24,10 @@ class ModulePredictor:
     """Methods of a :class:`Predictor` over another TensorDict module.
 
     Its other inputs are the hidden state: carried from step to step, updated by what the module writes at ``next``.
-
-    Args:
-        module: as of :func:`as_predictor`.
     """
 
     fixed_batch = False
-    check_every = 1
-    """Steps between two checks of a guarded rollout: a module may refuse states that are not finite."""
+    check_every = 1  # steps between two checks of a guarded rollout: a module may refuse states that are not finite
 
     def __init__(self, module: TensorDictModuleBase) -> None:
         self.module = module
@@ -45,7 +40,6 @@ class ModulePredictor:
         """None: only predictors read physical parameters."""
 
     def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The module's inputs other than state and action."""
         return tensordict.select(*self.rest, strict=False)
 
     def in_range(self, states: Tensor, limit: float) -> Tensor:
@@ -55,7 +49,6 @@ class ModulePredictor:
     def step(
         self, state: Tensor, action: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDictBase]:
-        """Next state and hidden state, see :meth:`Predictor.step`."""
         batch = state.shape[:-2]
         entries = TensorDict(batch_size=batch) if hidden_state is None else hidden_state.copy()
         for key, value in zip(self.keys, (state, action), strict=True):
@@ -70,7 +63,6 @@ class ModulePredictor:
     def rollout(
         self, state: Tensor, actions: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDictBase | None]:
-        """States ``[*B, T + 1, N, C]`` and hidden state, see :meth:`Predictor.rollout`."""
         states = [state]
         for action in actions.unbind(-2):
             state, hidden_state = self.step(state, action, None, hidden_state)
@@ -80,7 +72,6 @@ class ModulePredictor:
     def teacher_forced(
         self, states: Tensor, actions: Tensor, parameters: None = None
     ) -> tuple[Tensor, TensorDictBase | None]:
-        """Predictions from true states, see :meth:`Predictor.teacher_forced`."""
         batch = actions.shape[:-1]
         after, _ = self.step(states.flatten(0, -3), actions.flatten(0, -2))
         return after.unflatten(0, batch), None

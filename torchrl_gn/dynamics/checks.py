@@ -1,7 +1,8 @@
-"""Check what a predictor is given."""
+"""Check what a predictor is given: shapes, scenes, and parameters that never varied in training."""
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 from tensordict import TensorDictBase
@@ -11,20 +12,16 @@ from torchrl_gn.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.model import ForwardModel
+    from torchrl_gn.dynamics.predictor import Predictor
+    from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+
+class UnseenParameterWarning(UserWarning):
+    """A scene has a physical parameter that the model never saw vary in training."""
 
 
 def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> None:
-    """Refuse what does not fit a scene.
-
-    Args:
-        scene: the scene.
-        state: should be ``[*B, N, C]``, with ``C`` the scene's ``state_size``.
-        action: should be ``[*B, A]``.
-        parameters: should have the same batch, or none.
-
-    Raises:
-        ValueError: naming what does not.
-    """
+    """ValueError unless states are ``[*B, N, C]``, actions ``[*B, A]``, and parameters have that batch or none."""
     batch, wanted = state.shape[:-2], [scene.num_nodes, scene.state_size]
     if list(state.shape[-2:]) != wanted:
         raise ValueError(
@@ -42,11 +39,7 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
 
 
 def check_scene(model: ForwardModel, scene: Scene) -> None:
-    """Refuse a scene that a model cannot be bound to.
-
-    Raises:
-        ValueError: if its graph has another size than the core reads, or it shows parameters hidden from the model.
-    """
+    """ValueError if the graph has another size than the core reads, or shows parameters hidden from the model."""
     counts = model.core.counts
     if counts is not None and counts != (scene.num_nodes, scene.num_edges):
         raise ValueError(
@@ -58,3 +51,30 @@ def check_scene(model: ForwardModel, scene: Scene) -> None:
             f"The model must not see true parameters (parameters={model.parameter_source!r}), and {scene.name!r} is a"
             " variant, whose joint anchors would show its lengths. Bind the model to the standard scene."
         )
+
+
+def warn_of_unseen(predictor: Predictor, values: PhysicalParameters, name: str, *, stacklevel: int) -> None:
+    """Warn, or raise ValueError with ``strict``, where a scene differs in a parameter constant in training."""
+    model, unseen = predictor.model, []
+    for part, normalizer in model.parameter_normalizers.items() if model.parameter_source == "scene" else ():
+        mean = normalizer.mean
+        given = getattr(values, part).to(mean.device)
+        if given.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
+            continue
+        # 1e-6: the same scene compiled on another machine may differ in the last digits.
+        differs = ((given - mean).abs() > 1e-6 * mean.abs().clamp(min=1e-12)).reshape(-1, given.shape[-1]).any(0)
+        for index in (normalizer.constant & differs).nonzero().flatten().tolist():
+            unseen.append(getattr(model.parameter_names, part)[index])
+    residual = model.residual_normalizer
+    if bool((residual.count > 0).any()):
+        fixed = (predictor.movable & residual.constant).any(0).nonzero().flatten().tolist()
+        unseen += [f"state change {index}" for index in fixed]
+    if not unseen:
+        return
+    message = (
+        f"Scene {name!r} has values that the model never saw, in features that never varied in its"
+        f" training: {', '.join(unseen)}. They are ignored and predictions may be wrong."
+    )
+    if predictor.strict:
+        raise ValueError(message)
+    warnings.warn(message, UnseenParameterWarning, stacklevel=stacklevel)

@@ -25,14 +25,7 @@ def export_step(predictor: Predictor, path: str | os.PathLike) -> Path:
         step = torch.export.load("swimmer6.pt2").module()
         next_state = step(state, action)  # [B, N, 13] and [B, A], in the dtypes given here: float64 and float32
 
-    It is a snapshot. An extra file ``scene.json`` names nodes and actions and the control step.
-
-    Args:
-        predictor: forward model of the scene, specialised or not.
-        path: file to write, ``.pt2``.
-
-    Returns:
-        The written path.
+    It is a snapshot. An extra file ``scene.json`` names nodes and actions and the control step. Returns the path.
 
     Raises:
         TypeError: for a recurrent model.

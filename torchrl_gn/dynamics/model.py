@@ -38,8 +38,6 @@ class ForwardModel(nn.Module):
             an inference model instead.
         inferred: numbers of node, edge and global features of the inferred graph. With ``project`` nodes get six more:
             the estimated anchor offsets less the scene's.
-        layout: channels of the state.
-        features: what the network sees.
         canonicalizer: which invariances are built in.
         integrate: predict of position and orientation only what their rates do not explain (trapezoidal rule); the
             paper predicts the whole change.
@@ -68,8 +66,7 @@ class ForwardModel(nn.Module):
         **core_options,
     ) -> None:
         super().__init__()
-        if parameters not in get_args(ParameterSource):
-            choices = list(get_args(ParameterSource))
+        if parameters not in (choices := list(get_args(ParameterSource))):
             raise ValueError(f"parameters={parameters!r} is not known; use one of {choices}.")
         self.parameter_source, self.layout, self.features = parameters, layout, tuple(features)
         self.parameter_names = parameter_names if parameters == "scene" else ParameterNames()
@@ -106,12 +103,8 @@ class ForwardModel(nn.Module):
     ) -> ForwardModel:
         """A model with fresh weights for a scene, or for several that share it.
 
-        Layout, controls at each joint, names of the physical parameters and the graph's size are read from the scene.
-
-        Args:
-            scene: the scene, or scenes with the same physical parameters.
-            features: what the network sees; default: all that suits the scene.
-            **options: of :class:`ForwardModel` and its core.
+        Layout, controls at each joint, names of the physical parameters and the graph's size are read from the scene;
+        ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core.
         """
         first = cast(Scene, scene if isinstance(scene, (Scene, KinematicTree)) else scene[0])
         layout = joint_layout(first.extras) if isinstance(first, KinematicTree) else BODY_STATE
@@ -154,11 +147,7 @@ class ForwardModel(nn.Module):
         return {}
 
     def parameters_of(self, scene: Scene) -> PhysicalParameters:
-        """What the model reads of a scene; zeros of an inferred graph.
-
-        Raises:
-            ValueError: if the scene lacks parameters that the model reads.
-        """
+        """What the model reads of a scene, zeros of an inferred graph; ValueError if the scene lacks parameters."""
         values = self.parameter_names.select(scene)
         if self.parameter_source != "inferred":
             return values
@@ -180,16 +169,12 @@ class ForwardModel(nn.Module):
         """Join these weights to a scene.
 
         Args:
-            scene: any scene with the physical parameters that the model reads.
             strict: refuse, instead of warning, a scene that differs in a parameter that never varied in training.
             reference: evaluate the core by message passing, slowly: the reference of everything faster.
             parameters_key: where each sample has its own physical parameters (a variant's, or inferred); None: all
                 have the scene's.
             parameter_names: names of the parameters that samples bring there, a data set's ``features``. Default: all
                 that the scene has.
-
-        Returns:
-            TensorDict module ``state, action -> ("next", "state")`` that shares these weights.
 
         Raises:
             ValueError: if the scene, or what samples bring, lacks parameters that the model reads; or with ``strict``.
@@ -198,11 +183,7 @@ class ForwardModel(nn.Module):
         return Predictor(self, scene, strict=strict, reference=reference, **options)
 
     def description(self) -> dict:
-        """Plain, JSON-able values from which :meth:`from_description` builds this model again.
-
-        Raises:
-            ValueError: if a feature is not in :data:`~torchrl_gn.dynamics.features.FEATURES`.
-        """
+        """Plain, JSON-able values for :meth:`from_description`; ValueError if a feature is not in ``FEATURES``."""
         names = {kind: name for name, kind in FEATURES.items()}
         if unknown := [type(feature).__name__ for feature in self.features if type(feature) not in names]:
             raise ValueError(f"Features {unknown} have no name for a checkpoint: add them to FEATURES.")
@@ -217,16 +198,14 @@ class ForwardModel(nn.Module):
             "project": self.project,
             "core": self.core_name,
             "counts": None if self.core.counts is None else list(self.core.counts),
-            "core_options": _plain(self.core_options),
+            "core_options": {
+                name: list(value) if isinstance(value, tuple) else value for name, value in self.core_options.items()
+            },
         }
 
     @classmethod
     def from_description(cls, description: dict) -> ForwardModel:
-        """Build the model of a :meth:`description`, with fresh weights.
-
-        Raises:
-            ValueError: if it names a feature or a core that is not known.
-        """
+        """Build the model of a :meth:`description`, with fresh weights; ValueError if it has unknown names."""
         rest = dict(description)
         features = []
         for each in rest.pop("features"):
@@ -246,8 +225,3 @@ class ForwardModel(nn.Module):
             **rest.pop("core_options"),
             **rest,
         )
-
-
-def _plain(options: dict) -> dict:
-    """The same options with lists in place of tuples, as JSON has them."""
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in options.items()}

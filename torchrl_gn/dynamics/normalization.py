@@ -36,11 +36,7 @@ def static_graph(predictor: Predictor, parameters: PhysicalParameters, dtype: to
 
 
 def dynamic_graph(predictor: Predictor, state: Tensor, action: Tensor) -> Graph:
-    """Normalised dynamic graph ``[*B, ...]`` of states and actions, in the network's dtype.
-
-    Raises:
-        ValueError: if a shape does not fit the scene.
-    """
+    """Normalised dynamic graph ``[*B, ...]`` of states and actions, in the network's dtype."""
     check_shapes(predictor.scene, state, action)
     program = predictor.program(reference=True)
     return eager.dynamic_graph(program, program.canonicalizer(state, program.parameters), action)
@@ -64,7 +60,7 @@ def in_range(predictor: Predictor, states: Tensor, limit: float) -> Tensor:
     """Which states ``[*B, N, 13]`` are finite and in the range of the model's training, ``[*B]``.
 
     In range: every body's distance from its scene's centre, and its speeds, are below ``limit`` times the root mean
-    square of training. Lengths of vectors, so the yaw does not matter.
+    square of training.
     """
     normalizer, layout = predictor.model.node_normalizer, predictor.layout
     good = states.isfinite().flatten(-2).all(-1)
@@ -83,10 +79,7 @@ def in_range(predictor: Predictor, states: Tensor, limit: float) -> Tensor:
 def update_parameter_normalizers(predictor: Predictor, parameters: TensorDictBase | None = None) -> None:
     """Take physical parameters, by default the scene's, into the model's statistics: once, before training.
 
-    An inferred graph has no statistics.
-
-    Raises:
-        ValueError: if one is not finite; no statistic is changed.
+    An inferred graph has no statistics. ValueError, and no change, if one is not finite.
     """
     if parameters is not None:
         require_finite(parameters, "parameters")
@@ -102,15 +95,8 @@ def update_dynamic_normalizers(
 ) -> None:
     """Take transitions into the model's statistics (paper, "One step of the training algorithm").
 
-    Args:
-        predictor: of the scene.
-        state: ``[*B, N, 13]``, with the input noise that training adds.
-        action: ``[*B, A]``.
-        next_state: ``[*B, N, 13]``, clean.
-        parameters: physical parameters of each sample, by default the scene's.
-
-    Raises:
-        ValueError: if a shape does not fit or a number is not finite; no statistic is changed.
+    ``state`` ``[*B, N, 13]`` has the input noise that training adds, ``next_state`` none; ``parameters`` are by default
+    the scene's. ValueError, and no change, if a shape does not fit or a number is not finite.
     """
     check_shapes(predictor.scene, state, action, parameters)
     given = {"state": state, "action": action, "next state": next_state, "parameters": parameters}

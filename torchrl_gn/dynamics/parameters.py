@@ -23,15 +23,8 @@ _ANCHORS = ("parent_anchor", "child_anchor")
 class ParameterReader(Float64Buffers):
     """Physical parameters that a predictor reads: its scene's, its samples', or inferred ones.
 
-    Args:
-        model: what is read.
-        scene: the scene.
-        key: where samples bring their own; None: all have the scene's.
-        project: whether joint anchors are read, for the constraint projection.
-        brought: names of the parameters that samples bring; None: all that the scene has.
-
-    Raises:
-        ValueError: if samples do not bring what the model reads.
+    With ``project`` it also reads joint anchors, for the constraint projection. ``key`` and ``brought`` are the
+    ``parameters_key`` and ``parameter_names`` of the predictor. ValueError if samples lack what the model reads.
     """
 
     def __init__(
@@ -83,11 +76,7 @@ class ParameterReader(Float64Buffers):
         return self.brought.select(scene)
 
     def read(self, parameters: TensorDictBase | None) -> PhysicalParameters:
-        """Parameters that samples bring, or the scene's own.
-
-        Raises:
-            ValueError: if true parameters are given to a model of inferred ones, or joint anchors are missing.
-        """
+        """Parameters that samples bring, or the scene's own; ValueError if those given do not suit the model."""
         if parameters is None:
             return self.own
         if self.source == "inferred":
@@ -105,7 +94,6 @@ class ParameterReader(Float64Buffers):
         return PhysicalParameters.read(self._selected(parameters), self.own)
 
     def _selected(self, parameters: TensorDictBase) -> TensorDictBase:
-        """Columns that the model reads of the samples' static features."""
         if self.source != "scene":
             return parameters
         selected = parameters
@@ -125,14 +113,7 @@ class ParameterReader(Float64Buffers):
         return selected
 
     def find(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Physical parameters that samples bring; None where they are the scene's own.
-
-        None also if the model reads no true parameters.
-
-        Raises:
-            KeyError: if the model reads them and they are missing.
-            ValueError: if the model does not read them and they are not its scene's.
-        """
+        """Physical parameters that samples bring, see :meth:`Predictor.parameters_in`."""
         parameters = tensordict.get("parameters" if self.key is None else self.key, None)
         if self.key is not None:
             if self.source == "none":

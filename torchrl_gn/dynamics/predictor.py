@@ -12,16 +12,14 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
-from torchrl_gn.dynamics.checks import check_scene, check_shapes
+from torchrl_gn.dynamics.checks import check_scene, check_shapes, warn_of_unseen
 from torchrl_gn.dynamics.constraints import make_projection
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.eager import EagerExecutor
-from torchrl_gn.dynamics.executors.executor import Executor
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.normalization import in_range, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
-from torchrl_gn.dynamics.program import InputScaling, OutputScaling, StepProgram
-from torchrl_gn.dynamics.unseen_parameters import warn_of_unseen
+from torchrl_gn.dynamics.program import Executor, InputScaling, OutputScaling, StepProgram
 from torchrl_gn.networks.core import UnfoldedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
@@ -44,15 +42,7 @@ class Predictor(TensorDictModuleBase):
     parameters. A recurrent model also reads ``hidden_state``, a TensorDict ``[*B]`` of ``nodes``, ``edges`` and
     ``globals_``, by default the initial one, and writes ``("next", "hidden_state")``.
 
-    Args:
-        model: the shared weights.
-        scene: the scene to predict.
-        strict: raise, instead of warning, on parameters that never varied in training and differ here.
-        reference: evaluate the core by message passing, slowly.
-        state_key: where to read the state.
-        action_key: where to read the action.
-        parameters_key: where to read each sample's physical parameters; None: all have the scene's.
-        parameter_names: names of the parameters that samples bring there; None: all that the scene has.
+    Options are those of :meth:`ForwardModel.bind`.
 
     Raises:
         ValueError: if the scene lacks parameters that the model reads, its graph has another size than the core reads,
@@ -131,9 +121,7 @@ class Predictor(TensorDictModuleBase):
     def parameters_of(self, scene: Scene) -> TensorDict:
         """Physical parameters of a variant of this scene, for the ``parameters_key``; stack several for a batch.
 
-        Raises:
-            ValueError: if it is another scene (other bodies, joints, motors or control step); with ``strict`` as
-                :meth:`ForwardModel.bind`.
+        ValueError if it is another scene (other bodies, joints, motors or control step); ``strict`` holds here too.
         """
         here, there = topology(self.scene), topology(scene)
         differs = [what for what in here if here[what] != there[what]]
@@ -178,12 +166,7 @@ class Predictor(TensorDictModuleBase):
         return tensordict if hidden is None else tensordict.set(self.out_keys[1], hidden)
 
     def program(self, parameters: TensorDictBase | None = None, *, reference: bool = False) -> StepProgram:
-        """The step as it is now, differentiable in the weights.
-
-        Args:
-            parameters: physical parameters of each sample, or without batch; default: the scene's.
-            reference: do not fold the core.
-        """
+        """The step as it is now, differentiable in the weights; the ``reference`` does not fold the core."""
         model, values = self.model, self.parameter_reader.read(parameters)
         static, unfolded = static_graph(self, values), self.reference or reference
         return StepProgram(
@@ -228,12 +211,9 @@ class Predictor(TensorDictModuleBase):
 
         Args:
             state: ``[*B, N, 13]``.
-            action: ``[*B, A]``.
+            action: ``[*B, A]``; ValueError if a shape does not fit the scene.
             parameters: physical parameters of each sample, or without batch; default: the scene's.
             hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
-
-        Raises:
-            ValueError: if a shape does not fit the scene.
         """
         check_shapes(self.scene, state, action, parameters)
         after, hidden = self.executor(parameters).step(state, action, self._graph(hidden_state))
@@ -261,11 +241,7 @@ class Predictor(TensorDictModuleBase):
     def teacher_forced(
         self, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDict | None]:
-        """States ``[*B, T, N, 13]`` after each of the true ``states``, and the hidden state that ran through them.
-
-        Raises:
-            ValueError: if there is no state, or a shape does not fit the scene.
-        """
+        """States ``[*B, T, N, 13]`` after each of the true ``states``, and the hidden state that ran through them."""
         if states.shape[-3] == 0:
             raise ValueError("There is no state to predict from.")
         check_shapes(self.scene, states[..., 0, :, :], actions[..., 0, :], parameters)
@@ -281,11 +257,7 @@ class Predictor(TensorDictModuleBase):
         return torch.stack(predictions, dim=-3), hidden.tensordict()
 
     def delta(self, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> Tensor:
-        """Predicted change ``[*B, N, 12]``, zero in fixed components; from a recurrent model's initial hidden state.
-
-        Raises:
-            ValueError: if a shape does not fit the scene.
-        """
+        """Predicted change ``[*B, N, 12]``, zero in fixed components; from a recurrent model's initial hidden state."""
         check_shapes(self.scene, state, action, parameters)
         return eager.delta(self.executor(parameters).program, state, action)[0]
 

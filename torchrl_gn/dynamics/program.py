@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -45,18 +45,13 @@ class InputScaling(NamedTuple):
 
 
 class OutputScaling(NamedTuple):
-    """How the network's output becomes a residual change in SI units.
+    """How the network's output becomes a residual change in SI units."""
 
-    Attributes:
-        runs: columns of the change, in order: slices of the output, or of ``mean`` for components that never varied;
-            None: the output has all components, to be scaled.
-        mean: ``[12]`` float64.
-        std: ``[12]`` float64; None: folded into the core.
-    """
-
+    # Columns of the change, in order: slices of the output, or of the mean for components that never varied; None:
+    # the output has all components, to be scaled.
     runs: tuple[tuple[bool, slice], ...] | None
-    mean: Tensor
-    std: Tensor | None
+    mean: Tensor  # [12] float64
+    std: Tensor | None  # [12] float64; None: folded into the core
 
     @classmethod
     def of(cls, normalizer: Normalizer) -> OutputScaling:
@@ -104,6 +99,21 @@ class StepProgram:
     projection: MaximalProjection | None  # onto the joint constraints; None without
     change_std: Tensor  # [12] standard deviations of a change, weights of the projection
     dtype: torch.dtype  # of the network
+
+
+class Executor(Protocol):
+    """What runs a program; made from it, ``EXECUTORS[name](program)``."""
+
+    program: StepProgram
+    fixed_batch: bool  # whether another batch size costs a compilation
+
+    def update(self, program: StepProgram) -> None:
+        """Take another program of the same scene."""
+        ...
+
+    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        """Next state ``[*B, N, 13]`` and hidden state of a state and an action ``[*B, A]``."""
+        ...
 
 
 def _runs(rows: list[int], size: int) -> tuple[tuple[bool, slice], ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -12,11 +11,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from torchrl_gn.dynamics.executors import EXECUTORS, Executor
+from torchrl_gn.dynamics.checks import UnseenParameterWarning
+from torchrl_gn.dynamics.executors import EXECUTORS
 from torchrl_gn.dynamics.normalization import static_graph
 from torchrl_gn.dynamics.predictor import Predictor
-from torchrl_gn.dynamics.program import InputScaling, OutputScaling, StepProgram
-from torchrl_gn.dynamics.unseen_parameters import UnseenParameterWarning
+from torchrl_gn.dynamics.program import Executor, InputScaling, OutputScaling, StepProgram
 from torchrl_gn.networks.core import Columns, ReducibleCore
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
@@ -130,11 +129,10 @@ class SpecializedPredictor(Predictor):
             nodes, edges = InputScaling.folded(model.node_normalizer), InputScaling.folded(model.edge_normalizer)
             rows = (self.movable.any(0) & ~residual.constant).nonzero().flatten()
             output = OutputScaling.folded(residual, rows)
-            kept = (rows, residual.std[rows])
             folded = folded.reduced(
                 _scaled(nodes, model.node_normalizer.inverse_std),
                 _scaled(edges, model.edge_normalizer.inverse_std),
-                kept,
+                (rows, residual.std[rows]),
                 residual.mean[rows],
             )
         return StepProgram(
@@ -155,9 +153,7 @@ class SpecializedPredictor(Predictor):
         program, core, size = self.executor().program, self.model.core, self.model.dynamic_size
         nodes, edges = self.scene.num_nodes, self.scene.num_edges
         static = static_graph(self, self.scene_parameters, super().dtype)
-        kept_nodes, kept_edges = (
-            _width(part, count) for part, count in ((program.nodes, size.nodes), (program.edges, size.edges))
-        )
+        kept_nodes, kept_edges = _width(program.nodes, size.nodes), _width(program.edges, size.edges)
 
         def graph(nodes_: int, edges_: int, dtype: torch.dtype) -> Graph:
             def empty(*shape: int) -> Tensor:
@@ -203,15 +199,11 @@ def specialize(
     :meth:`~torchrl_gn.networks.Core.fold` is evaluated as it is.
 
     Args:
-        predictor: forward model of the scene.
         executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"compiled"`` compiles at the first call
             with every new shape: half a minute, minutes for a gradient, and much faster steps of small batches.
         dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster where the processor
             multiplies it (``torchrl-gn doctor`` tells) and many times slower elsewhere, which warns
             (:class:`~torchrl_gn.processor.SlowDtypeWarning`). States keep their dtype.
-
-    Returns:
-        A predictor with the same keys that shares the weights and folds them again when they change.
 
     Raises:
         FileNotFoundError: to compile for a CPU without a C++ compiler.
@@ -257,5 +249,4 @@ def _width(inputs: InputScaling, full: int) -> int:
 
 def _copied(scaling: Any) -> Any:
     """The same named tuple with copies of its tensors."""
-    parts: Iterable[Any] = scaling
-    return type(scaling)(*(part.detach().clone() if isinstance(part, Tensor) else part for part in parts))
+    return type(scaling)(*(part.detach().clone() if isinstance(part, Tensor) else part for part in scaling))

@@ -31,15 +31,12 @@ class Context(NamedTuple):
 class Estimate(NamedTuple):
     """Estimate from observations of a system.
 
-    Attributes:
-        parameters: TensorDict ``[*B]`` of the inferred static graph: ``nodes`` ``[*B, N, 10]``, ``edges``
-            ``[*B, E, 10]`` and ``globals_`` ``[*B, 10]``; with constraint projection also the anchor offsets
-            ``parent_anchor`` and ``child_anchor`` ``[*B, N, 3]``.
-        context: to continue from with more observations.
+    The inferred static graph has ``nodes`` ``[*B, N, 10]``, ``edges`` ``[*B, E, 10]`` and ``globals_`` ``[*B, 10]``;
+    with constraint projection also the anchor offsets ``parent_anchor`` and ``child_anchor`` ``[*B, N, 3]``.
     """
 
-    parameters: TensorDict
-    context: Context
+    parameters: TensorDict  # [*B], the inferred static graph
+    context: Context  # to continue from with more observations
 
 
 class InferenceModel(nn.Module):
@@ -50,14 +47,10 @@ class InferenceModel(nn.Module):
     so that it stays bounded for any number of observations.
 
     Args:
-        observed: features of a normalised observation.
         inferred: numbers of node, edge and global features of the inferred static graph.
         hidden_state: the same of the hidden graph.
         readout: estimate from several observations: the ``"mean"`` of the network's output after each, or its output
             after the ``"last"`` (paper).
-
-    Raises:
-        ValueError: if ``readout`` or the activation is not known.
     """
 
     def __init__(
@@ -77,18 +70,10 @@ class InferenceModel(nn.Module):
             raise ValueError(f"readout must be 'mean' or 'last', got {readout!r}.")
         self.readout = readout
         self.inferred_size, self.hidden_size = GraphSize(*inferred), GraphSize(*hidden_state)
-        sizes: dict[str, Any] = {
-            "edge_hidden": list(edge_hidden),
-            "node_hidden": list(node_hidden),
-            "global_hidden": list(global_hidden),
-        }
-        self.options = {
-            "inferred": list(inferred),
-            "hidden_state": list(hidden_state),
-            **sizes,
-            "activation": activation,
-            "readout": readout,
-        }
+        sizes: dict[str, Any] = {"edge_hidden": list(edge_hidden), "node_hidden": list(node_hidden)}
+        sizes["global_hidden"] = list(global_hidden)
+        self.options = {"inferred": list(inferred), "hidden_state": list(hidden_state), **sizes}
+        self.options |= {"activation": activation, "readout": readout}
         size = self.inferred_size + self.hidden_size
         self.block = GNBlock(observed + self.hidden_size, size, activation=activation, **sizes)
 
@@ -100,7 +85,7 @@ class InferenceModel(nn.Module):
         """Output of one observation, and the hidden graph for the next."""
         size = self.inferred_size
         output, rest = graph_split(self.block(graph_concat(observed, hidden)), (size.nodes, size.edges, size.globals_))
-        return output, Graph(rest.nodes.tanh(), rest.edges.tanh(), rest.globals_.tanh(), rest.edge_index)
+        return output, Graph(*[part.tanh() for part in rest.features], edge_index=rest.edge_index)
 
 
 class BoundInferenceModel(TensorDictModuleBase):
@@ -113,12 +98,6 @@ class BoundInferenceModel(TensorDictModuleBase):
 
     If the forward model projects onto joint constraints, the anchor offsets are estimated by least squares
     (:class:`~torchrl_gn.dynamics.constraints.AnchorEstimator`).
-
-    Args:
-        model: the weights.
-        predictor: forward model of the scene, whose features and normalisers it shares.
-        observed_key: where the observed sequence is.
-        parameters_key: where to write the inferred graph.
     """
 
     def __init__(
@@ -139,11 +118,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         self.out_keys: list[NestedKey] = [parameters_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the estimate from the observed sequence into ``tensordict`` and return it.
-
-        Raises:
-            KeyError: if there is no observed sequence.
-        """
+        """Write the estimate from the observed sequence into ``tensordict`` and return it; KeyError without one."""
         state, action, next_state = (tensordict.get(key, None) for key in self.in_keys)
         if state is None or action is None or next_state is None:
             raise KeyError(f"The inference model reads {self.in_keys}; there is {list(tensordict.keys(True))}.")
@@ -153,9 +128,8 @@ class BoundInferenceModel(TensorDictModuleBase):
         """Estimate after a sequence of transitions.
 
         Args:
-            state: ``[*B, T, N, 13]``.
+            state: ``[*B, T, N, 13]``, as ``next_state``.
             action: ``[*B, T, A]``, each applied in the state of its step.
-            next_state: ``[*B, T, N, 13]``.
             context: of earlier observations of the same systems; default: none.
 
         Raises:
@@ -190,16 +164,13 @@ class BoundInferenceModel(TensorDictModuleBase):
         nodes = torch.cat((dynamic.nodes, change * predictor.movable), dim=-1)
         anchors = self._anchor_sums(state, next_state, context)
         for step in range(state.shape[-3]):
-            now = Graph(
-                nodes[..., step, :, :],
-                dynamic.edges[..., step, :, :],
-                dynamic.globals_[..., step, :],
-                dynamic.edge_index,
-            )
+            edges, globals_ = dynamic.edges[..., step, :, :], dynamic.globals_[..., step, :]
+            now = Graph(nodes[..., step, :, :], edges, globals_, dynamic.edge_index)
             output, hidden = self.model(now, self.model.start(now) if context is None else context.hidden)
             count = 1 if context is None else context.count + 1
             if context is not None and self.model.readout == "mean":
-                output = _lerp(context.estimate, output, 1 / count)
+                parts = zip(context.estimate.features, output.features, strict=True)
+                output = Graph(*[torch.lerp(mean, new, 1 / count) for mean, new in parts], edge_index=output.edge_index)
             context = Context(hidden, output, count, None if anchors is None else anchors[..., step, :, :, :])
             yield context
 
@@ -212,7 +183,6 @@ class BoundInferenceModel(TensorDictModuleBase):
         return sums if context is None or context.anchors is None else sums + context.anchors.unsqueeze(-4)
 
     def _estimate(self, context: Context) -> Estimate:
-        """The estimate, as the forward model reads it."""
         parameters = context.estimate.tensordict()
         if self.anchors is not None and context.anchors is not None:
             parent_anchor, child_anchor = self.anchors.solve(context.anchors)
@@ -220,25 +190,10 @@ class BoundInferenceModel(TensorDictModuleBase):
         return Estimate(parameters, context)
 
 
-def _lerp(first: Graph, second: Graph, share: float) -> Graph:
-    """Features between those of two graphs of one topology."""
-    return Graph(
-        torch.lerp(first.nodes, second.nodes, share),
-        torch.lerp(first.edges, second.edges, share),
-        torch.lerp(first.globals_, second.globals_, share),
-        first.edge_index,
-    )
-
-
 class IdentifyingModel(nn.Module):
     """A forward model and the inference model that estimates its physical parameters, trained together.
 
-    Args:
-        forward_model: with ``parameters="inferred"``.
-        **options: of :class:`InferenceModel`.
-
-    Raises:
-        ValueError: if the forward model does not read an inferred graph.
+    The forward model must have ``parameters="inferred"``; ``options`` are those of :class:`InferenceModel`.
     """
 
     def __init__(self, forward_model: ForwardModel, **options) -> None:
@@ -252,11 +207,9 @@ class IdentifyingModel(nn.Module):
         self.inference = InferenceModel(observed, **options)
 
     def bind(self, scene: Scene, **options) -> tuple[Predictor, BoundInferenceModel]:
-        """Both models joined to a scene; the forward model reads at ``"parameters"`` what the other writes there.
+        """Both models joined to a scene, whose own physical parameters neither reads; see :meth:`ForwardModel.bind`.
 
-        Args:
-            scene: the scene, whose own physical parameters neither reads.
-            **options: of :meth:`ForwardModel.bind`.
+        The forward model reads at ``"parameters"`` what the other writes there.
         """
         predictor = self.forward_model.bind(scene, parameters_key="parameters", **options)
         return predictor, BoundInferenceModel(self.inference, predictor)

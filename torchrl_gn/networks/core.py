@@ -20,8 +20,7 @@ class FoldedCore(Protocol):
         ...
 
 
-Columns = tuple[Tensor, Tensor]
-"""Indices of columns to keep, and a factor for each."""
+Columns = tuple[Tensor, Tensor]  # indices of columns to keep, and a factor for each
 
 
 @runtime_checkable
@@ -29,14 +28,7 @@ class ReducibleCore(FoldedCore, Protocol):
     """A folded core that can drop and rescale features."""
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> ReducibleCore:
-        """The same core with fewer, rescaled features.
-
-        Args:
-            nodes: dynamic node features to keep.
-            edges: dynamic edge features to keep.
-            out: output features to keep.
-            shift: added to the scaled output.
-        """
+        """The same core with fewer, rescaled dynamic and output features; ``shift`` is added to the scaled output."""
         ...
 
 
@@ -46,21 +38,15 @@ class Core(nn.Module):
     A subclass implements :meth:`forward`, and :meth:`fold` if it can be evaluated faster for one topology and one
     static graph. A recurrent core sets ``hidden_size`` and implements :meth:`update`. Its constructor takes
     ``(dynamic, static, out_nodes, *, counts, **options)``.
-
-    Attributes:
-        dynamic: features of the dynamic graph.
-        hidden_size: features of the hidden state; zeros for a feed-forward core.
-        counts: ``(N, E)`` nodes and edges of the only graphs that it reads; None: any.
     """
 
-    fixed_size = False
-    """Whether the core reads graphs of one size only."""
+    fixed_size = False  # whether the core reads graphs of one size only
 
     def __init__(self, dynamic: GraphSize, *, hidden_size: GraphSize | None = None) -> None:
         super().__init__()
-        self.dynamic = dynamic
-        self.hidden_size = hidden_size or GraphSize(0, 0, 0)
-        self.counts: tuple[int, int] | None = None
+        self.dynamic = dynamic  # features of the dynamic graph
+        self.hidden_size = hidden_size or GraphSize(0, 0, 0)  # zeros for a feed-forward core
+        self.counts: tuple[int, int] | None = None  # (N, E), nodes and edges of the only graphs that it reads
 
     @property
     def recurrent(self) -> bool:
@@ -80,12 +66,7 @@ class Core(nn.Module):
         return hidden
 
     def fold(self, incidence: Incidence, static: Graph) -> FoldedCore:
-        """The core for one topology and one static graph, differentiable in the weights.
-
-        Args:
-            incidence: edges of the graph, and which nodes are predicted.
-            static: normalised static graph, with or without batch.
-        """
+        """The core for one topology and one normalised static graph, differentiable in the weights."""
         return UnfoldedCore(self, static)
 
 
@@ -98,9 +79,8 @@ def layer_sizes(hidden: int | Sequence[int], layers: int) -> list[int]:
 class UnfoldedCore:
     """A core evaluated by message passing, edge by edge: the reference for every folded core."""
 
-    core: Core  # the core
+    core: Core
     static: Graph  # normalised static graph
 
     def predict(self, dynamic: Graph) -> Tensor:
-        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``."""
         return self.core(graph_concat(dynamic, self.static)).nodes

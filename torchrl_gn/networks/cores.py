@@ -12,11 +12,7 @@ CORES: dict[str, type[Core]] = {"gn": GNCore, "mlp": MLPCore, "recurrent": Recur
 
 
 def core_class(name: str) -> type[Core]:
-    """The core of a name.
-
-    Raises:
-        ValueError: if it is none of :data:`CORES`.
-    """
+    """The core of a name; ValueError if it is none of :data:`CORES`."""
     if name not in CORES:
         raise ValueError(f"core={name!r} is not known; use one of {list(CORES)}, or add yours to CORES.")
     return CORES[name]

@@ -17,24 +17,17 @@ if TYPE_CHECKING:
 
 
 def fold_gn_core(core: GNCore, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedGNCore:
-    """Fold a core for graphs of one topology.
+    """Fold a core for graphs of one topology; differentiable in the core's weights and the static graph.
 
-    Args:
-        core: the two GN blocks.
-        size: features of the dynamic graphs; the rest of the core's input is static.
-        incidence: of the graphs, and which of their nodes are predicted.
-        static: normalised static graph; any part may have a leading batch, which is then that
-            of the dynamic graphs.
-
-    Returns:
-        The folded core: differentiable in the core's weights and the static graph.
+    Dynamic graphs have features of ``size``; the rest of the core's input is the normalised ``static`` graph, of which
+    any part may have the batch of the dynamic graphs.
     """
     n, e, g = size.nodes, size.edges, size.globals_
     sn, se, sg = static.nodes.shape[-1], static.edges.shape[-1], static.globals_.shape[-1]
     first, second = core.first, core.second
     num_nodes, num_edges = incidence.num_nodes, incidence.num_edges
     kept, rows = incidence.kept_rows, incidence.predicted_rows
-    dtype = _first_layer(first.edge_mlp)[0].dtype
+    dtype = _layer(first.edge_mlp, 0)[0].dtype
     degree = incidence.degree.to(dtype)
 
     static_nodes, static_globals = items_first(static.nodes), items_first(static.globals_.unsqueeze(-2))
@@ -42,43 +35,39 @@ def fold_gn_core(core: GNCore, size: GraphSize, incidence: Incidence, static: Gr
     static_edges = torch.cat(_broadcast(sides), dim=-1)
 
     # First block. Weight columns: globals, sender, receiver, edge; each dynamic then static.
-    weight, bias = _first_layer(first.edge_mlp)
+    weight, bias = _layer(first.edge_mlp, 0)
     wg, wsg, ws, wss, wr, wsr, we, wse = weight.split((g, sg, n, sn, n, sn, e, se), dim=1)
     table = bias + F.linear(static_edges, torch.cat((wss, wsr, wse), 1)) + F.linear(static_globals, wsg)
     first_edge = _factors(first.edge_mlp, (torch.cat((ws, wr, we), 1), wg), table)
-    edge_out, edge_bias = _last_layer(first.edge_mlp)
+    edge_out, edge_bias = _layer(first.edge_mlp, -1)
 
-    weight, bias = _first_layer(first.node_mlp)
+    weight, bias = _layer(first.node_mlp, 0)
     wg, wsg, wn, wsn, wa = weight.split((g, sg, n, sn, edge_out.shape[0]), dim=1)
     table = bias + F.linear(static_nodes, wsn) + F.linear(static_globals, wsg) + degree * (wa @ edge_bias)
     first_node = _factors(first.node_mlp, (wa @ edge_out, wn, wg), table)
-    node_out, node_bias = _last_layer(first.node_mlp)
+    node_out, node_bias = _layer(first.node_mlp, -1)
 
-    weight, bias = _first_layer(first.global_mlp)
+    weight, bias = _layer(first.global_mlp, 0)
     wg, wsg, wn, we = weight.split((g, sg, node_out.shape[0], edge_out.shape[0]), dim=1)
     if first.pool == "mean":
         wn, we = wn / num_nodes, we / max(num_edges, 1)
     table = bias + F.linear(static_globals, wsg) + num_nodes * (wn @ node_bias) + num_edges * (we @ edge_bias)
     first_global = _factors(first.global_mlp, (wn @ node_out, we @ edge_out, wg), table)
-    global_out, global_bias = _last_layer(first.global_mlp)
+    global_out, global_bias = _layer(first.global_mlp, -1)
 
     # Second block: its input is the first block's input and output side by side.
     latent_g, latent_n, latent_e = global_out.shape[0], node_out.shape[0], edge_out.shape[0]
-    weight, bias = _first_layer(second.edge_mlp)
+    weight, bias = _layer(second.edge_mlp, 0)
     wg, wsg, wlg, ws, wss, wls, wr, wsr, wlr, we, wse, wle = weight.split(
         (g, sg, latent_g, n, sn, latent_n, n, sn, latent_n, e, se, latent_e), dim=1
     )
     table = bias + F.linear(static_edges, torch.cat((wss, wsr, wse), 1)) + F.linear(static_globals, wsg)
     table = table + wlg @ global_bias + (wls + wlr) @ node_bias + wle @ edge_bias
-    second_edge = _factors(
-        second.edge_mlp,
-        (wle @ edge_out, torch.cat((ws, wr, we), 1)),
-        table[kept],
-    )
+    second_edge = _factors(second.edge_mlp, (wle @ edge_out, torch.cat((ws, wr, we), 1)), table[kept])
     second_ends, second_globals = (wls @ node_out, wlr @ node_out), (wlg @ global_out, wg)
-    edge_out, edge_bias = _last_layer(second.edge_mlp)
+    edge_out, edge_bias = _layer(second.edge_mlp, -1)
 
-    weight, bias = _first_layer(second.node_mlp)
+    weight, bias = _layer(second.node_mlp, 0)
     wg, wsg, wlg, wn, wsn, wln, wa = weight.split((g, sg, latent_g, n, sn, latent_n, edge_out.shape[0]), dim=1)
     table = bias + F.linear(static_nodes, wsn) + F.linear(static_globals, wsg) + degree * (wa @ edge_bias)
     table = (table + wlg @ global_bias + wln @ node_bias)[rows]
@@ -97,7 +86,7 @@ def fold_gn_core(core: GNCore, size: GraphSize, incidence: Incidence, static: Gr
         second_globals=second_globals,
         second_node=_factors(second.node_mlp, (wa @ edge_out, wn, wln @ node_out), table),
         last_globals=(wlg @ global_out, wg),
-        out=_last_layer(second.node_mlp),
+        out=_layer(second.node_mlp, -1),
         activation=core.activation,
     )
 
@@ -114,15 +103,8 @@ def _broadcast(parts) -> list[Tensor]:
     return [part.expand(-1, batch, -1) for part in parts]
 
 
-def _first_layer(mlp: nn.Sequential | None) -> tuple[Tensor, Tensor]:
+def _layer(mlp: nn.Sequential | None, index: int) -> tuple[Tensor, Tensor]:
     assert mlp is not None
-    layer = mlp[0]
-    assert isinstance(layer, nn.Linear)
-    return layer.weight, layer.bias
-
-
-def _last_layer(mlp: nn.Sequential | None) -> tuple[Tensor, Tensor]:
-    assert mlp is not None
-    layer = mlp[-1]
+    layer = mlp[index]
     assert isinstance(layer, nn.Linear)
     return layer.weight, layer.bias

@@ -94,8 +94,7 @@ class FoldedGNCore:
         pairs = tuple(zip(inputs, factors.weights, strict=True))
         hidden = linear(pairs, factors.table, matrix, items, self.activation)
         for weight, bias in factors.hidden:
-            table = bias.expand(hidden.shape[0], 1, -1)
-            hidden = linear(((hidden, weight),), table, activation=self.activation)
+            hidden = linear(((hidden, weight),), bias.expand(hidden.shape[0], 1, -1), activation=self.activation)
         return hidden
 
     def predict(self, dynamic: Graph) -> Tensor:
@@ -122,14 +121,7 @@ class FoldedGNCore:
         return list(zip(*(part.split(samples, dim=1) for part in inputs), strict=True))
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> FoldedGNCore:
-        """This core with fewer and rescaled features (with ``F_n`` and ``F_e`` those that are left).
-
-        Args:
-            nodes: columns of the nodes' dynamic features that are kept, and factors on them.
-            edges: the same for edges.
-            out: rows of the output that are kept, and factors on them.
-            shift: added to the scaled output.
-        """
+        """This core with fewer and rescaled features, see :class:`~torchrl_gn.networks.core.ReducibleCore`."""
         n = self.first_node.weights[1].shape[1]
         node, edge = nodes[0], edges[0]
         ends = torch.cat((node, n + node, 2 * n + edge)), torch.cat((nodes[1], nodes[1], edges[1]))

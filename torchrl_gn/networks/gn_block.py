@@ -32,12 +32,8 @@ class GNBlock(MessagePassing):
     with MLPs for the three functions, an activation between layers and none after the last.
 
     Args:
-        in_size: features of the input graph.
-        out_size: features of the output graph; where one is 0, that update is neither built nor
-            computed and the input's features pass through.
-        edge_hidden: hidden sizes of the edge MLP.
-        node_hidden: hidden sizes of the node MLP.
-        global_hidden: hidden sizes of the global MLP.
+        out_size: features of the output graph; where one is 0, that update is neither built nor computed and the
+            input's features pass through.
         activation: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
         pool: what the globals see of all nodes and edges: their ``"sum"`` (paper) or their ``"mean"``, which does not
             grow with the graph.

@@ -20,16 +20,11 @@ class GNCore(Core):
     nodes are predicted.
 
     Args:
-        dynamic: features of the dynamic graph.
-        static: features of the static graph.
-        out_nodes: features of every output node.
         hidden: width of the hidden layers of every MLP, or their sizes.
         layers: hidden layers of every MLP, if ``hidden`` is one width.
         latent: features of the graph between the blocks, and edge features inside the second; default: the width of
             the last hidden layer.
-        edge_hidden: hidden sizes of the edge MLPs; default ``hidden``.
-        node_hidden: hidden sizes of the node MLPs.
-        global_hidden: hidden sizes of the global MLP.
+        edge_hidden: hidden sizes of the edge MLPs; default ``hidden``, as for nodes and globals.
         activation: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
         pool: as of :class:`GNBlock`.
 
@@ -67,9 +62,7 @@ class GNCore(Core):
         self.second = GNBlock(graph + between, GraphSize(out_nodes, latent, 0), **sizes)
 
     def forward(self, graph: Graph) -> Graph:
-        """Graph with dynamic and static features in, graph with ``out_nodes`` node features out."""
         return self.second(graph_concat(graph, self.first(graph)))
 
     def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore:
-        """The same function for one scene with all constants folded, see :func:`fold_gn_core`."""
         return fold_gn_core(self, self.dynamic, incidence, static)

@@ -31,6 +31,11 @@ class Graph:
     globals_: Tensor  # [*B, F_g]
     edge_index: Tensor  # [2, E] int64, senders above receivers, as in PyG
 
+    @property
+    def features(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Features of nodes, edges and globals."""
+        return self.nodes, self.edges, self.globals_
+
     def tensordict(self) -> TensorDict:
         """Its features as entries of a TensorDict ``[*B]``."""
         features = {"nodes": self.nodes, "edges": self.edges, "globals_": self.globals_}
@@ -38,54 +43,25 @@ class Graph:
 
     def zeros(self, size: GraphSize) -> Graph:
         """Graph of the same topology and batch whose features are all 0."""
-        return Graph(
-            self.nodes.new_zeros(*self.nodes.shape[:-1], size.nodes),
-            self.edges.new_zeros(*self.edges.shape[:-1], size.edges),
-            self.globals_.new_zeros(*self.globals_.shape[:-1], size.globals_),
-            self.edge_index,
-        )
+        counts = size.nodes, size.edges, size.globals_
+        zeros = [part.new_zeros(*part.shape[:-1], n) for part, n in zip(self.features, counts, strict=True)]
+        return Graph(*zeros, edge_index=self.edge_index)
 
 
 def graph_concat(first: Graph, second: Graph) -> Graph:
-    """Concatenate edge, node and global features of two graphs of one topology.
-
-    The batch shapes are broadcast, so a graph without batch (a scene's static
-    graph) joins any batch. Paper: "graph-concatenation".
-    """
-    return Graph(
-        nodes=_concat(first.nodes, second.nodes, 2),
-        edges=_concat(first.edges, second.edges, 2),
-        globals_=_concat(first.globals_, second.globals_, 1),
-        edge_index=first.edge_index,
-    )
+    """Concatenate the features of two graphs of one topology, whose batches broadcast. Paper: "graph-concatenation"."""
+    parts = zip(first.features, second.features, (2, 2, 1), strict=True)
+    return Graph(*[_concat(a, b, trailing) for a, b, trailing in parts], edge_index=first.edge_index)
 
 
 def graph_split(graph: Graph, sizes: Sequence[int]) -> tuple[Graph, Graph]:
-    """Split edge, node and global features into two graphs. Paper: "graph-splitting".
-
-    Args:
-        graph: the graph to split.
-        sizes: ``(F_n, F_e, F_g)`` of the first graph; the second gets the rest.
-    """
-    nodes, edges, globals_ = sizes
-    return (
-        Graph(
-            graph.nodes[..., :nodes],
-            graph.edges[..., :edges],
-            graph.globals_[..., :globals_],
-            graph.edge_index,
-        ),
-        Graph(
-            graph.nodes[..., nodes:],
-            graph.edges[..., edges:],
-            graph.globals_[..., globals_:],
-            graph.edge_index,
-        ),
-    )
+    """Split features, the first graph's from the rest; ``sizes`` are ``(F_n, F_e, F_g)``. Paper: "graph-splitting"."""
+    n, e, g = sizes
+    nodes, edges, globals_ = graph.features
+    first = Graph(nodes[..., :n], edges[..., :e], globals_[..., :g], graph.edge_index)
+    return first, Graph(nodes[..., n:], edges[..., e:], globals_[..., g:], graph.edge_index)
 
 
 def _concat(first: Tensor, second: Tensor, trailing: int) -> Tensor:
     batch = torch.broadcast_shapes(first.shape[:-trailing], second.shape[:-trailing])
-    first = first.expand(*batch, *first.shape[-trailing:])
-    second = second.expand(*batch, *second.shape[-trailing:])
-    return torch.cat((first, second), dim=-1)
+    return torch.cat([part.expand(*batch, *part.shape[-trailing:]) for part in (first, second)], dim=-1)

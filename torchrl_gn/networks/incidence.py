@@ -20,24 +20,16 @@ class Incidence(Float64Buffers):
         edge_index: ``[2, E]`` senders above receivers.
         num_nodes: nodes of the graph.
         predicted: ``[P]`` indices of the nodes to predict, in any order; None: all.
-
-    Attributes:
-        ends: ``[2 E, N]`` picks every edge's sender, then every edge's receiver.
-        reduce: ``[N + 1, E]`` sums edges at their receivers, and all of them in its last row.
-        degree: ``[N, 1, 1]`` edges that a node receives.
-        gather: ``[E', 2 N + 1]`` adds, for every edge that leads to a predicted node, its sender's row of the first
-            ``N``, its receiver's row of the next ``N`` and the last row.
-        reduce_last: ``[P, E']`` sums those edges at the predicted nodes.
     """
 
     edge_index: Tensor
     predicted: Tensor
-    kept: Tensor
-    ends: Tensor
-    reduce: Tensor
-    degree: Tensor
-    gather: Tensor
-    reduce_last: Tensor
+    kept: Tensor  # [E'] edges that lead to a predicted node
+    ends: Tensor  # [2 E, N], picks every edge's sender, then every edge's receiver
+    reduce: Tensor  # [N + 1, E], sums edges at their receivers, and all of them in its last row
+    degree: Tensor  # [N, 1, 1] edges that a node receives
+    gather: Tensor  # [E', 2 N + 1], adds sender's row of the first N, receiver's of the next N and the last
+    reduce_last: Tensor  # [P, E'], sums the kept edges at the predicted nodes
 
     def __init__(self, edge_index: Tensor, num_nodes: int, predicted: Tensor | None = None) -> None:
         super().__init__()

@@ -13,15 +13,7 @@ class LayerNormMLP(nn.Module):
     """MLP whose first layer is normalised and bounded, as in D4PG and its successors (Barth-Maron et al. 2018).
 
     Observations of bodies have all sorts of scales, and an overestimated value drives a policy on them into the flat
-    ends of its squashing function, where nothing is learned any more.
-
-    Args:
-        in_features: length of all inputs together.
-        out_features: length of the output.
-        hidden: hidden sizes, at least one.
-
-    Raises:
-        ValueError: without a hidden size.
+    ends of its squashing function, where nothing is learned any more. ValueError without a hidden size.
     """
 
     def __init__(self, in_features: int, out_features: int, hidden: Sequence[int]) -> None:

@@ -1,8 +1,4 @@
-"""Layers with several inputs, items first and samples second, as one autograd function.
-
-On a CPU the passes over memory between the products of a layer would cost as much as
-the products: :class:`_Layer` accumulates them into one buffer.
-"""
+"""Layers with several inputs, items first and samples second, as one autograd function."""
 
 from __future__ import annotations
 
@@ -17,18 +13,14 @@ _FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {"silu": F.silu, "gelu": F.g
 
 
 def activation_class(name: str) -> type[nn.Module]:
-    """The activation of a name.
-
-    Raises:
-        ValueError: if it is none of :data:`ACTIVATIONS`.
-    """
+    """The activation of a name; ValueError if it is none of :data:`ACTIVATIONS`."""
     if name not in ACTIVATIONS:
         raise ValueError(f"activation={name!r} is not known; use one of {list(ACTIVATIONS)}.")
     return ACTIVATIONS[name]
 
 
 def linear(pairs, table=None, matrix=None, items=None, activation: str | None = None) -> Tensor:
-    """``activation(table + matrix @ items + sum_k x_k @ W_k.T)``; any part may be missing.
+    """``activation(table + matrix @ items + sum_k x_k @ W_k.T)``, ``[I, B, h]``; any part may be missing.
 
     Args:
         pairs: ``x_k`` ``[I, B, F_k]`` with ``W_k`` ``[h, F_k]``; those without features are left out.
@@ -36,9 +28,6 @@ def linear(pairs, table=None, matrix=None, items=None, activation: str | None = 
         matrix: ``[I, J]``.
         items: ``[J, B, h]``.
         activation: one of :data:`ACTIVATIONS`, or none.
-
-    Returns:
-        ``[I, B, h]``.
     """
     relu = activation == "relu"
     used = [tensor for pair in pairs if pair[0].shape[-1] for tensor in pair]
@@ -60,12 +49,7 @@ def product(matrix: Tensor, items: Tensor) -> Tensor:
 
 
 class _Layer(torch.autograd.Function):
-    """``relu(table + matrix @ items + sum_k x_k @ W_k.T)``, accumulated in one buffer.
-
-    Inputs: ``relu`` flag, ``table`` ``[I, 1 or B, h]`` or None, ``matrix`` ``[I, J]`` and ``items``
-    ``[J, B, h]`` or None, then pairs ``x_k`` ``[I, B, F_k]`` and ``W_k`` ``[h, F_k]``.
-    Output ``[I, B, h]``.
-    """
+    """:func:`linear` accumulated in one buffer: on a CPU, passes over memory cost as much as the products."""
 
     @classmethod
     def apply(cls, *inputs):  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -79,12 +63,8 @@ class _Layer(torch.autograd.Function):
         features, weights = pairs[::2], pairs[1::2]
         count, batch = features[0].shape[:2]
         flat = [x.reshape(count * batch, x.shape[-1]) for x in features]
-        start = 0
-        if items is None:
-            out = flat[0] @ weights[0].T
-            start = 1
-        else:
-            out = (matrix @ items.flatten(1)).view(count * batch, items.shape[-1])
+        start = int(items is None)
+        out = flat[0] @ weights[0].T if start else product(matrix, items).flatten(0, 1)
         for x, weight in zip(flat[start:], weights[start:], strict=True):
             torch.addmm(out, x, weight.T, out=out)  # in place, and counted by FlopCounterMode
         shaped = out.view(count, batch, out.shape[-1])

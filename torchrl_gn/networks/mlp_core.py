@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -23,13 +23,9 @@ class MLPCore(Core):
     to graphs of one size.
 
     Args:
-        dynamic: features of the dynamic graph.
-        static: features of the static graph.
-        out_nodes: features of every output node.
         counts: numbers of nodes and edges of the graphs.
         hidden: width of the hidden layers, or their sizes.
         layers: number of hidden layers, if ``hidden`` is one width.
-        activation: between the layers.
 
     Raises:
         ValueError: if ``counts`` is missing, there is no hidden layer, or the activation is not known.
@@ -61,7 +57,6 @@ class MLPCore(Core):
         self.mlp = MLP(inputs, nodes * out_nodes, num_cells=cells, activation_class=activation_class(activation))
 
     def forward(self, graph: Graph) -> Graph:
-        """Graph with dynamic and static features in, graph with ``out_nodes`` node features out."""
         out = self.mlp(torch.cat(_flat(graph), dim=-1))
         empty = out[..., :0]
         assert self.counts is not None
@@ -71,30 +66,23 @@ class MLPCore(Core):
         """The same function for one scene with all constants in a table."""
         assert self.counts is not None
         first, *hidden, last = (layer for layer in self.mlp if isinstance(layer, nn.Linear))
-        nodes, edges = self.counts
-        size, graph = self.dynamic, self.graph_size
-        here, every = (size.nodes, size.edges), (graph.nodes, graph.edges)
+        counts, sizes = (*self.counts, 1), (astuple(self.dynamic), astuple(self.graph_size))
         device = first.weight.device
         dynamic, constant, start = [], [], 0
-        for count, own, full in zip((nodes, edges), here, every, strict=True):
+        for count, own, full in zip(counts, *sizes, strict=True):
             columns = start + torch.arange(count * full, device=device).view(count, full)
             dynamic.append(columns[:, :own].flatten())
             constant.append(columns[:, own:].flatten())
             start += count * full
-        columns = torch.arange(start, start + graph.globals_, device=device)
-        dynamic.append(columns[: size.globals_])
-        constant.append(columns[size.globals_ :])
         table = F.linear(torch.cat(_broadcast(_flat(static)), -1), first.weight[:, torch.cat(constant)], first.bias)
         predicted = incidence.predicted
         rows = (predicted[:, None] * self.out_nodes + torch.arange(self.out_nodes, device=device)).flatten()
+        weight, bias = (each[rows].unflatten(0, (-1, self.out_nodes)) for each in (last.weight, last.bias))
         return FoldedMLP(
             weights=tuple(first.weight[:, index] for index in dynamic),
             table=table,
             hidden=tuple((layer.weight, layer.bias) for layer in hidden),
-            out=(
-                last.weight[rows].unflatten(0, (-1, self.out_nodes)),
-                last.bias[rows].unflatten(0, (-1, self.out_nodes)),
-            ),
+            out=(weight, bias),
             predicted=predicted,
             counts=self.counts,
             activation=self.activation,

@@ -18,14 +18,7 @@ class RecurrentCore(Core):
     """Three GRUs, over nodes, edges and globals, before the graph networks (paper, "Forward models").
 
     Their hidden state joins the input graph of a :class:`GNCore`. Paper: one GN block reads the hidden state alone,
-    20 features each.
-
-    Args:
-        dynamic: features of the dynamic graph.
-        static: features of the static graph.
-        out_nodes: features of every output node.
-        hidden_state: features of the hidden nodes, edges and globals.
-        **sizes: of :class:`GNCore`.
+    20 features each. ``sizes`` are those of :class:`GNCore`.
     """
 
     def __init__(
@@ -45,21 +38,14 @@ class RecurrentCore(Core):
         self.core = GNCore(dynamic + size, static, out_nodes, **sizes)
 
     def update(self, dynamic: Graph, static: Graph, hidden: Graph) -> Graph:
-        """Hidden state after one more dynamic graph."""
         graph = graph_concat(dynamic, static)
-        return Graph(
-            _each(self.nodes, graph.nodes, hidden.nodes),
-            _each(self.edges, graph.edges, hidden.edges),
-            _each(self.globals_, graph.globals_, hidden.globals_),
-            dynamic.edge_index,
-        )
+        cells = zip((self.nodes, self.edges, self.globals_), graph.features, hidden.features, strict=True)
+        return Graph(*[_each(*cell) for cell in cells], edge_index=dynamic.edge_index)
 
     def forward(self, graph: Graph) -> Graph:
-        """Dynamic, hidden and static features side by side in, ``out_nodes`` node features out."""
         return self.core(graph)
 
     def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore:
-        """The graph networks with all constants folded, of dynamic and hidden features."""
         return self.core.fold(incidence, static)
 
 

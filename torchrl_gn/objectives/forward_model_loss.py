@@ -36,7 +36,6 @@ class ForwardModelLoss(LossModule):
     Differentiated: the model's weights, through the whole window.
 
     Args:
-        model: forward model bound to the scene of the samples.
         noise: standard deviation of the input noise, in standard deviations of each movable state channel (radians for
             orientations).
         generator: source of the noise. Default: torch's global generator, with which a run cannot resume bit for bit.
@@ -138,12 +137,10 @@ class ForwardModelLoss(LossModule):
         return noisy
 
     def training_state(self) -> dict:
-        """State to resume training from."""
         generator = None if self.generator is None else self.generator.get_state()
         return {"noise_scale": self.noise_scale, "error_weight": self.error_weight, "generator": generator}
 
     def load_training_state(self, state: dict) -> None:
-        """Restore a :meth:`training_state`."""
         self.noise_scale.copy_(state["noise_scale"])
         weight = state["error_weight"]  # None in older files if not fitted
         self.error_weight.copy_(torch.tensor(-1.0) if weight is None else weight)
@@ -152,11 +149,9 @@ class ForwardModelLoss(LossModule):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the losses of a batch of transitions or windows.
+        """Losses of transitions or windows; ValueError for a wrong shape, NaN or Inf.
 
-        Raises:
-            ValueError: a shape is wrong, or a value is NaN or Inf.
-            RuntimeError: the model's normalisers have seen no data, or the noise has no scale.
+        RuntimeError if the model's normalisers have seen no data, or the noise has no scale.
         """
         require_fitted(self, self.trained, remedy=FIT_NORMALIZERS, also=self._require_noise_scale)
         state, action, next_state = self._read(tensordict)
@@ -175,8 +170,7 @@ class ForwardModelLoss(LossModule):
             if step + 1 < steps:
                 teacher_forced = step + 1 < self.teacher_forced_steps
                 current = self._perturb(state[:, step + 1]) if teacher_forced else layout.apply(current, delta)
-        errors = errors / steps
-        scale = self._scale(self.noise_scale)
+        errors, scale = errors / steps, self._scale(self.noise_scale)
         movable = torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
         loss = errors.sum() / movable.sum().clamp(min=1)
         out = {f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)}

@@ -19,7 +19,6 @@ class IdentificationLoss(LossModule):
     Paper, SM "End-to-end training algorithm for System ID". One loss trains both models.
 
     Args:
-        scene: the standard scene of the samples.
         context_length: steps to identify a system from.
         shortest: lower bound of the context length in training, which draws it per batch and keeps the last steps.
             Default: ``context_length``, always (paper).
@@ -79,7 +78,7 @@ class IdentificationLoss(LossModule):
         return self.prediction.out_keys
 
     def fit_normalizers(self, tensordict: TensorDictBase) -> None:
-        """Fit the loss's scales and the models' normalisers; see :meth:`ForwardModelLoss.fit_normalizers`."""
+        """As :meth:`ForwardModelLoss.fit_normalizers`."""
         self.prediction.fit_normalizers(tensordict.select(*self.in_keys))
 
     def fit_scales(self, tensordict: TensorDictBase) -> None:

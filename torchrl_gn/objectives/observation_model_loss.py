@@ -60,12 +60,7 @@ class ObservationModelLoss(LossModule):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the losses of a batch of transitions.
-
-        Raises:
-            ValueError: a value is NaN or Inf, or the rewards have a wrong shape.
-            RuntimeError: the model's normalisers have seen no data.
-        """
+        """Losses of transitions; ValueError for NaN, Inf or a wrong shape, RuntimeError if no normaliser is fitted."""
         require_fitted(self, self.model, remedy=UPDATE_NORMALIZERS)
         observation, action, next_observation, *rewards = read_entries(self, tensordict, self.in_keys)
         inverse = torch.where(self.model.change_std > 0, 1 / self.model.change_std, 0).to(observation.dtype)

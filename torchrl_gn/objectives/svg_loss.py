@@ -17,8 +17,7 @@ from torchrl_gn.networks.frozen_weights import frozen, with_weights
 from torchrl_gn.objectives.checks import require_fitted
 from torchrl_gn.objectives.observation_model_loss import UPDATE_NORMALIZERS
 
-ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Reward ``[*B, 1]`` of observations, actions and next observations."""
+ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]  # [*B, 1], of observations, actions, next observations
 
 
 class SVGLoss(DDPGLoss):
@@ -99,16 +98,12 @@ class SVGLoss(DDPGLoss):
         return self
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Return the loss of the value, and what to monitor."""
         self._require_fitted()
         with set_exploration_type(self.deterministic_sampling_mode):  # as in forward, for direct calls
             return super().loss_value(tensordict)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Return the loss of the policy, and nothing to monitor.
-
-        Raises RuntimeError if normalisers of policy, value or model have seen no data.
-        """
+        """Loss of the policy; RuntimeError if normalisers of policy, value or model have seen no data."""
         self._require_fitted()
         weights = self._maybe_get_priority_weight(tensordict)
         keys = [*self.actor_in_keys, *self.value_exclusive_keys]

@@ -1,4 +1,7 @@
-"""Backward pass of control-limited differential dynamic programming (Tassa, Mansard and Todorov 2014)."""
+"""Control-limited differential dynamic programming: backward pass and box-constrained quadratic program.
+
+Tassa, Mansard and Todorov 2014.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_gn.planners.box_qp import solve_box_qp
-
 _PRECISION = 1e-12
+_STEP_SIZES = 0.5 ** np.arange(1, 12)  # of the box-constrained program's line search, after the full step
 
 
 @dataclass(frozen=True)
@@ -36,12 +38,8 @@ def backward_pass(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Policies that minimise a quadratic model, for ``M`` dampings at once.
 
-    Args:
-        control_damping: ``[M]``, added to the diagonal of the controls' Hessian.
-        state_damping: ``[M]``, added to the diagonal of the next value's Hessian.
-
-    Returns:
-        Control changes ``[H, M, A]`` and feedback gains ``[H, M, A, X]``, zero for controls at bounds.
+    ``control_damping`` and ``state_damping`` ``[M]`` are added to the diagonals of the controls' and the next value's
+    Hessian. Returns control changes ``[H, M, A]`` and feedback gains ``[H, M, A, X]``, zero for controls at bounds.
     """
     steps, size = model.dynamics.shape[:2]
     num, count = model.lower.shape[1], len(control_damping)
@@ -73,3 +71,65 @@ def backward_pass(
         value_hessian = 0.5 * (value_hessian + value_hessian.swapaxes(1, 2))
         changes[t], gains[t], warm_start = change, gain, change
     return changes, gains
+
+
+def solve_box_qp(
+    hessian: np.ndarray,
+    gradient: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    start: np.ndarray | None = None,
+    *,
+    iterations: int = 30,
+    tolerance: float = 1e-10,
+) -> tuple[np.ndarray, np.ndarray]:
+    r"""Solve a batch of box-constrained quadratic programs by projected Newton (section III-B).
+
+    .. math:: \min_x \tfrac12 x^\top H x + g^\top x \quad \text{with} \quad l \le x \le u
+
+    Args:
+        hessian: ``[M, n, n]`` symmetric positive definite.
+        gradient: ``[M, n]``; the bounds broadcast to it.
+        start: warm start ``[M, n]``, clipped to the bounds. Default: 0.
+        tolerance: bound on the free gradient, relative to ``|g|``.
+
+    Returns:
+        Solutions ``[M, n]`` and the free dimensions ``[M, n]`` bool, those not held at a bound.
+    """
+    x = np.clip(np.zeros_like(gradient) if start is None else start, lower, upper)
+    identity = np.eye(gradient.shape[-1])
+    small = tolerance * np.abs(gradient).max(axis=-1) + np.finfo(np.float64).tiny
+    for _ in range(iterations):
+        slope = gradient + _times(hessian, x)
+        free = ~(((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0)))
+        slope = np.where(free, slope, 0.0)
+        unsolved = np.abs(slope).max(axis=-1) > small
+        if not unsolved.any():
+            return x, free
+        reduced = np.where(free[:, :, None] & free[:, None, :], hessian, identity)
+        newton = -np.linalg.solve(reduced, slope[..., None])[..., 0]
+        trial = np.clip(x + newton, lower, upper)
+        if not (better := _descends(hessian, slope, trial - x)).all():
+            for step in _STEP_SIZES:
+                shorter = np.clip(x + step * newton, lower, upper)
+                trial = np.where(better[:, None], trial, shorter)
+                better |= _descends(hessian, slope, trial - x)
+                if better.all():
+                    break
+        # Where no step size helps, floating-point precision is reached.
+        change = np.where((better & unsolved)[:, None], trial - x, 0.0)
+        if not change.any():
+            return x, free
+        x = x + change
+    slope = gradient + _times(hessian, x)
+    return x, ~(((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0)))
+
+
+def _descends(hessian: np.ndarray, slope: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Armijo condition with factor 0.1; the quadratic cost's change is exact."""
+    predicted = (slope * change).sum(axis=-1)
+    return predicted + 0.5 * (change * _times(hessian, change)).sum(axis=-1) <= 0.1 * predicted
+
+
+def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    return (matrix @ vector[..., None])[..., 0]

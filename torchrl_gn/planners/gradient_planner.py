@@ -113,7 +113,6 @@ class GradientPlanner(RecedingHorizonPlanner):
         return plan_primer(self.plan_shape, torch.float32, self.imagined.device, hidden_state, step_size=(1,))
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
-        """Return the next action ``[*B, A]``, and the remaining plan and the hidden state to write."""
         if torch.is_inference_mode_enabled():
             raise RuntimeError(
                 "GradientPlanner needs gradients: use torch.no_grad() instead of torch.inference_mode()."

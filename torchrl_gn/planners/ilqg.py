@@ -18,8 +18,8 @@ from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
+from torchrl_gn.planners.linearize import RewardExpansion
 from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
-from torchrl_gn.planners.reward_expansion import RewardExpansion
 
 _INITIAL_SAMPLES = 16  # random sequences; a first plan starts from the best
 
@@ -100,7 +100,6 @@ class ILQGPlanner(RecedingHorizonPlanner):
         return plan_primer(self._plan_shape, torch.float64, self._scene_env.device)
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
-        """Next actions ``[*B, A]`` and the remaining plan."""
         actions = self.plan(tensordict)
         return actions[..., 0, :].to(self.action_spec.dtype), {KEY: shift_plan(tensordict.shape, actions)}
 
@@ -128,7 +127,6 @@ class ILQGPlanner(RecedingHorizonPlanner):
         return torch.from_numpy(plans).reshape(actions.shape).to(actions.device)
 
     def _plan_row(self, simulator: Simulator, physics: np.ndarray, plan: np.ndarray | None, task: Any) -> np.ndarray:
-        """The improved plan ``[H, A]`` of one state."""
         env = self._scene_env
         reward = RewardExpansion(cast(Any, env.reward), task, env.device)
         solver = ILQGSolver(simulator, reward, control_cost=self.control_cost, central=self.central)

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.planners.ddp import QuadraticModel, backward_pass
-from torchrl_gn.planners.linearize import Tangent, linearize
-from torchrl_gn.planners.reward_expansion import RewardExpansion
+from torchrl_gn.planners.linearize import RewardExpansion, Tangent, linearize
 
 # Candidates of an iteration, simulated at once: every damping (as a multiple of the last successful one) and step size.
 _DAMPINGS = np.array([0.0, 0.01, 0.1, 1.0, 10.0])

@@ -31,7 +31,6 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         """The next action ``[*B, A]`` and the other entries to write."""
 
     def planning(self, td: TensorDictBase) -> Tensor:
-        """The next action ``[*B, A]``."""
         return self.decide(td)[0]
 
     def forward(

@@ -38,7 +38,6 @@ class ReturnToGo(TensorDictModuleBase):
         self.out_keys: list[NestedKey] = ["advantage"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``advantage`` into the TensorDict and return it."""
         reward = cast(Tensor, tensordict.get(("next", "reward")))
         returns = reward.flip(-2).cumsum(-2).flip(-2)
         best = returns.amax(-3, keepdim=True)

@@ -3,7 +3,9 @@
 from torchrl_gn.training.budget import Budget as Budget
 from torchrl_gn.training.checkpoint import Checkpoint as Checkpoint
 from torchrl_gn.training.checkpoint import CheckpointError as CheckpointError
+from torchrl_gn.training.checkpoint import load_pretrained as load_pretrained
 from torchrl_gn.training.checkpoint import package_versions as package_versions
+from torchrl_gn.training.checkpoint import pretrained_names as pretrained_names
 from torchrl_gn.training.checkpoint import save_checkpoint as save_checkpoint
 from torchrl_gn.training.fit import History as History
 from torchrl_gn.training.fit import fit as fit
@@ -12,8 +14,6 @@ from torchrl_gn.training.off_policy import mean_return as mean_return
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer
 from torchrl_gn.training.optimizers import make_agent_optimizer as make_agent_optimizer
 from torchrl_gn.training.optimizers import make_optimizer as make_optimizer
-from torchrl_gn.training.pretrained import load_pretrained as load_pretrained
-from torchrl_gn.training.pretrained import pretrained_names as pretrained_names
 from torchrl_gn.training.ray_cluster import RayCluster as RayCluster
 from torchrl_gn.training.run_folder import RunFolder as RunFolder
 from torchrl_gn.training.run_folder import plain_config as plain_config

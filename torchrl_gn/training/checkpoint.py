@@ -1,7 +1,8 @@
-"""Checkpoints: weights, normalisers and all that is needed to use or resume them, in one file."""
+"""Checkpoints: weights, normalisers and all that is needed to use or resume them, in one file; trained models."""
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import importlib.metadata
 import json
@@ -17,28 +18,20 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+import torchrl_gn
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import Scene, scene_from_description
 
-CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"
-"""Checkpoint of a run folder."""
-
-FORMAT = 4
-"""Version of the checkpoint format that this package writes and reads."""
-
+CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"  # of a run folder
+WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")  # the models that come with the package
+FORMAT = 4  # version of the checkpoint format that this package writes and reads
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
-
-Trained = ForwardModel | IdentifyingModel | Agent
-"""What a checkpoint can hold."""
-
+Trained = ForwardModel | IdentifyingModel | Agent  # what a checkpoint can hold
 KINDS: dict[str, type[Trained]] = {"forward_model": ForwardModel, "identifying_model": IdentifyingModel, "agent": Agent}
-"""What checkpoints hold, by the name that they call it."""
-
-
 _Kind = TypeVar("_Kind", bound=Trained)
 
 
@@ -142,8 +135,7 @@ def save_checkpoint(
 def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
     """Read a checkpoint file, or that of a run folder. Weights in half precision compute in single precision.
 
-    Raises:
-        CheckpointError: the file is missing, damaged, of another format or no checkpoint, or holds NaN or Inf.
+    CheckpointError if the file is missing, damaged, of another format or no checkpoint, or holds NaN or Inf.
     """
     path = Path(path)
     if path.is_dir():
@@ -183,6 +175,38 @@ def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
         ) from error
     plain = {name: description[name] for name in ("config", "versions", "metrics")}
     return Checkpoint(model, description["scenes"], **plain, training=_unflatten(description["training"], tensors))
+
+
+def pretrained_names() -> list[str]:
+    """Names of all models that come with the package."""
+    return sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
+
+
+def load_pretrained(source: str | os.PathLike) -> Checkpoint:
+    """Load a trained model: one of :func:`pretrained_names`, or the path of a run folder or checkpoint file.
+
+    ``"./cheetah"`` is a folder that has the name of a model. The checkpoint's ``metrics`` hold the model's errors.
+    CheckpointError if there is no such source, or the file cannot be used.
+
+    Example:
+        >>> from torchrl_gn.scenes import load_scene
+        >>> from torchrl_gn.training import load_pretrained
+        >>> checkpoint = load_pretrained("swimmer6")
+        >>> predictor = checkpoint.bind(load_scene("swimmer6"))
+        >>> checkpoint.metrics["swimmer6"]["rollout_error_100"] < 0.01
+        True
+    """
+    names = pretrained_names()
+    if source in names:
+        return read_checkpoint(WEIGHTS / f"{source}.safetensors")
+    if not Path(source).exists():
+        near = difflib.get_close_matches(str(source), names, 1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise CheckpointError(
+            f"There is no checkpoint at {source}, and no trained model of that name comes with the package; those that"
+            f" do are {names}.{hint}"
+        )
+    return read_checkpoint(source)
 
 
 def _digest(tensors: Mapping[str, Tensor], text: str) -> str:

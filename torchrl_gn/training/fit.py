@@ -25,26 +25,18 @@ _NORMALIZER_SAMPLES = 5000
 
 @dataclass
 class History:
-    """Course of a training.
+    """Course of a training."""
 
-    Attributes:
-        steps: number of each recorded step.
-        seconds: training time at each recorded step.
-        losses: mean loss since the last recorded step.
-        validations: ``(step, error)`` of every validation.
-    """
-
-    steps: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    losses: list[float] = field(default_factory=list)
-    validations: list[tuple[int, float]] = field(default_factory=list)
+    steps: list[int] = field(default_factory=list)  # number of each recorded step
+    seconds: list[float] = field(default_factory=list)  # training time at each recorded step
+    losses: list[float] = field(default_factory=list)  # mean loss since the last recorded step
+    validations: list[tuple[int, float]] = field(default_factory=list)  # step and error
 
     def __str__(self) -> str:
         if not self.steps:
             return "no step"
-        text = (
-            f"{self.steps[-1]:,} steps in {self.seconds[-1]:.0f} s, loss {self.losses[0]:.2e} to {self.losses[-1]:.2e}"
-        )
+        losses = f"loss {self.losses[0]:.2e} to {self.losses[-1]:.2e}"
+        text = f"{self.steps[-1]:,} steps in {self.seconds[-1]:.0f} s, {losses}"
         best = min((error for _, error in self.validations), default=None)
         return text if best is None else f"{text}, best validation error {best:.2e}"
 
@@ -79,31 +71,20 @@ def fit(
         optimizer: a preset (:func:`make_optimizer`), or a function from parameters to an optimiser of ``torch.optim``,
             for example ``lambda weights: torch.optim.AdamW(weights, lr=1e-3)``.
         lr: peak learning rate, instead of the preset's.
-        batch_size: transitions of a step.
         noise: standard deviation of the input noise, in standard deviations of each component.
         seed: seed of batches and noise. Weights are made before, with torch's global generator.
-        progress: whether to show a progress bar.
-
-    Returns:
-        Loss and time of the steps, and validation errors.
 
     Raises:
         FloatingPointError: if the loss or the gradient is not finite; no weight changes at that step.
         TypeError: for a specialised predictor, which passes no gradient to the weights.
         ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit.
     """
-    if minutes is None and steps is None:
-        minutes = 1.0
-    budget = Budget(steps=steps, minutes=minutes)
+    budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
     scheduled = _make_optimizer(model.model.core, optimizer, lr)
     loss = ForwardModelLoss(model, noise=noise, generator=torch.Generator().manual_seed(seed))
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
     transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()
-    transitions = transitions.to(model.movable.device)
-    if model.model.fitted:
-        loss.fit_scales(transitions)
-    else:
-        loss.fit_normalizers(transitions)
+    (loss.fit_scales if model.model.fitted else loss.fit_normalizers)(transitions.to(model.movable.device))
 
     def validate() -> float:
         assert validation is not None

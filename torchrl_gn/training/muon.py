@@ -34,10 +34,9 @@ class Muon(torch.optim.Optimizer):
         if not 0 <= momentum < 1:
             raise ValueError(f"momentum={momentum} must be from 0 to below 1.")
         super().__init__(params, {"lr": lr, "momentum": momentum})
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                if parameter.ndim != 2:
-                    raise ValueError(f"Muon trains matrices, not a parameter of shape {list(parameter.shape)}.")
+        for parameter in (parameter for group in self.param_groups for parameter in group["params"]):
+            if parameter.ndim != 2:
+                raise ValueError(f"Muon trains matrices, not a parameter of shape {list(parameter.shape)}.")
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # pyright: ignore

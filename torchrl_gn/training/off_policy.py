@@ -56,7 +56,6 @@ class OffPolicyTrainer:
         env: environments ``[num_envs]`` to collect in; or functions that make some, each for a collector on a Ray
             cluster (enter :class:`~torchrl_gn.training.RayCluster` first).
         evaluate: returns the mean return of the current policy.
-        optimizer: optimiser of all weights that the losses train.
         frames_per_batch: environment steps between updates; a multiple of ``num_envs``.
         updates_per_frame: gradient steps per environment step.
         random_frames: initial environment steps of random actions, without updates.

@@ -49,7 +49,6 @@ class ScheduledOptimizer:
         return cls([optimizer], None, max_norm=math.inf)
 
     def zero_grad(self) -> None:
-        """Set all gradients to None."""
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
 
@@ -69,11 +68,9 @@ class ScheduledOptimizer:
         return norm
 
     def state_dict(self) -> dict:
-        """State of all optimisers, for checkpoints."""
         return {str(index): optimizer.state_dict() for index, optimizer in enumerate(self.optimizers)}
 
     def load_state_dict(self, state: dict) -> None:
-        """Load what :meth:`state_dict` returned."""
         for index, optimizer in enumerate(self.optimizers):
             optimizer.load_state_dict(state[str(index)])
 

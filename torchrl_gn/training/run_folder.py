@@ -67,12 +67,10 @@ class RunFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """Path of the checkpoint."""
         return self.path / CHECKPOINT_FILE
 
     @property
     def data(self) -> Path:
-        """Folder of collected data."""
         return self.path / "data"
 
     def file(self, name: str) -> Path:

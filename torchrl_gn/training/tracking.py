@@ -116,7 +116,6 @@ class Tracker:
         self.close()
 
     def close(self) -> None:
-        """Close the logger."""
         if self.kind == "wandb":
             self._logger.experiment.finish()
         elif self.kind == "tensorboard":

@@ -25,9 +25,6 @@ class AnchorEstimator(Float64Buffers):
     An anchor has one position on both bodies, ``x + R a = x' + R' a'``, linear in the offsets ``a`` and ``a'``. What
     the observed states leave open (along a hinge's axis, or where a joint did not move) stays as in the standard scene.
     The prior's weight follows from the residual: noisy states count less. No gradient flows through the estimate.
-
-    Args:
-        scene: the standard scene, whose variants have the same joints.
     """
 
     parent: Tensor
@@ -46,30 +43,18 @@ class AnchorEstimator(Float64Buffers):
 
     @torch.no_grad()
     def sums(self, states: Tensor) -> Tensor:
-        """Normal equations of observed states; add them up over observations of one system.
-
-        Args:
-            states: ``[*B, T, N, 13]``.
-
-        Returns:
-            ``[*B, N, 7, 7]`` float64.
-        """
+        """Normal equations ``[*B, N, 7, 7]`` float64 of states ``[*B, T, N, 13]``; add them up over observations."""
         at = BODY_STATE.slices
         position = states[..., at["position"]].double()
         rotation = quaternion.to_matrix(states[..., at["orientation"]].double()).unflatten(-1, (3, 3))
         difference = position - position[..., self.parent, :]
-        rows = (rotation[..., self.parent, :, :], -rotation, difference.unsqueeze(-1))
-        rows = torch.cat(rows, dim=-1)  # [*B, T, N, 3, 7]
+        rows = torch.cat((rotation[..., self.parent, :, :], -rotation, difference.unsqueeze(-1)), dim=-1)
         rows = rows.transpose(-4, -3).flatten(-3, -2)  # [*B, N, 3 T, 7]
         return rows.mT @ rows
 
     @torch.no_grad()
     def solve(self, sums: Tensor) -> tuple[Tensor, Tensor]:
-        """Parent and child anchor offsets, ``[*B, N, 3]`` each, metres.
-
-        Args:
-            sums: ``[*B, N, 7, 7]``, from at least one state.
-        """
+        """Parent and child anchor offsets, ``[*B, N, 3]`` each, metres, by the sums of at least one state."""
         standard = self.standard.expand(*sums.shape[:-2], 6).unsqueeze(-1)
         count = sums[..., 0, 0, None, None]  # number of states: columns of a rotation have length 1
         # Equations of the difference from the standard offsets, per state.

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection, position_weight
 from torchrl_gn.maths import quaternion
@@ -31,9 +32,6 @@ class GeneralizedProjection(MaximalProjection):
     For bodies that rotate about fewer axes than space has (an arm of hinges): takes the change of the joint angles,
     then the joint rates, nearest to what the network predicts for the bodies. Motion that a hinge cannot make cannot
     build up. In planar scenes it equals the projection in maximal coordinates, which is faster there.
-
-    Args:
-        scene: whose joints these are.
     """
 
     dof_node: Tensor
@@ -83,7 +81,8 @@ class GeneralizedProjection(MaximalProjection):
 
         # Angles: from the relative rotation of each pair of bodies, then one Gauss-Newton step of all.
         predicted = quaternion.exp(delta[..., to["orientation"]])
-        against = torch.where(self.is_root, _identity(predicted), predicted[..., self.parent, :])
+        identity = pad(torch.ones_like(predicted[..., :1]), (0, 3))
+        against = torch.where(self.is_root, identity, predicted[..., self.parent, :])
         relative = quaternion.log(quaternion.product(quaternion.conjugate(against), predicted))
         angles = (axes * relative[..., self.dof_node, :]).sum(-1)
         rotation = self._compose(axes, angles)
@@ -146,11 +145,6 @@ class GeneralizedProjection(MaximalProjection):
         normal = normal + torch.diag_embed(damping.expand_as(diagonal))
         wanted = torch.cat((rotations.flatten(-2), residual[..., self.moved_rows]), dim=-1).unsqueeze(-1)
         return torch.linalg.solve_ex(normal, weighted @ wanted)[0].squeeze(-1)
-
-
-def _identity(rotation: Tensor) -> Tensor:
-    """Identity quaternions of the same shape."""
-    return torch.cat((torch.ones_like(rotation[..., :1]), torch.zeros_like(rotation[..., 1:])), dim=-1)
 
 
 def _dofs(scene: Scene) -> list[tuple[int, int, int, np.ndarray, int]]:

@@ -28,9 +28,6 @@ class MaximalProjection(Float64Buffers):
     (or stay the root's where it cannot move).
 
     Paper: bodies are predicted alone and drift relative.
-
-    Args:
-        scene: whose joints these are (:attr:`Scene.joint_anchors <torchrl_gn.scenes.Scene>`).
     """
 
     parent: Tensor
@@ -79,7 +76,7 @@ class MaximalProjection(Float64Buffers):
             matrices: ``[*B, N, 3, 3]`` of its orientations.
             delta: ``[*B, N, 12]`` predicted change.
             std: ``[12]`` standard deviation of each component of a change.
-            parameters: physical parameters; the anchor offsets are read.
+            parameters: the anchor offsets are read.
 
         Returns:
             ``[*B, N, 12]``, zero in fixed components; ``delta`` itself if it satisfies the constraints.
@@ -114,11 +111,7 @@ class MaximalProjection(Float64Buffers):
     def jacobian(self, offsets: Tensor) -> Tensor:
         """``[*B, R, L]``: body positions relative to their group, by the ``L`` movable rotations.
 
-        Args:
-            offsets: ``[*B, 2, N, 3]`` anchor offsets, in which it is linear.
-
-        Returns:
-            For the ``R`` of the ``3 N`` coordinates that rotations move.
+        Linear in the anchor offsets ``[*B, 2, N, 3]``; for the ``R`` of the ``3 N`` coordinates that rotations move.
         """
         used = offsets.flatten(-3)[..., self.used_offsets]
         return (used @ self.offset_jacobian.to(offsets.dtype)).unflatten(-1, (-1, len(self.rotating)))
@@ -126,16 +119,9 @@ class MaximalProjection(Float64Buffers):
     def forward_kinematics(
         self, state: Tensor, offsets: Tensor, rotation: Tensor, spin: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Body positions and velocities that the joints imply after a change of orientations and angular velocities.
+        """Anchor offsets after rotation vectors and changes of angular velocity (``spin``), both ``[*B, N, 3]``.
 
-        Args:
-            state: ``[*B, N, 13]``.
-            offsets: ``[*B, 2, N, 3]`` anchor offsets before the change.
-            rotation: ``[*B, N, 3]`` rotation vectors.
-            spin: ``[*B, N, 3]`` changes of angular velocity.
-
-        Returns:
-            Anchor offsets after it, and positions and velocities ``[*B, 2, 3 N]`` relative to each group's root.
+        Also the positions and velocities ``[*B, 2, 3 N]`` relative to each group's root that the joints then imply.
         """
         angular = state[..., BODY_STATE.slices["angular_velocity"]] + spin
         both = torch.cat((rotation, angular), dim=-1)

@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 from torchrl_gn.dynamics.executors.compiled import CompiledExecutor as CompiledExecutor
 from torchrl_gn.dynamics.executors.eager import EagerExecutor as EagerExecutor
-from torchrl_gn.dynamics.executors.executor import Executor as Executor
-from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.dynamics.program import Executor, StepProgram
 
 EXECUTORS: dict[str, Callable[[StepProgram], Executor]] = {"eager": EagerExecutor, "compiled": CompiledExecutor}
 """Executors by the names that :func:`~torchrl_gn.dynamics.specialize` takes."""

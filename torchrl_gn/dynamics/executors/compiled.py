@@ -25,9 +25,6 @@ class CompiledExecutor:
     never stored, so memory does not grow with the network over long rollouts. Differentiable once, in state, action and
     hidden state; never in weights.
 
-    Args:
-        program: the step.
-
     Raises:
         FileNotFoundError: without a C++ compiler on a CPU.
         RuntimeError: with a torch before 2.13.
@@ -35,7 +32,6 @@ class CompiledExecutor:
     """
 
     fixed_batch = True
-    """Whether another batch size costs a compilation."""
 
     def __init__(self, program: StepProgram) -> None:
         check_torch()
@@ -59,12 +55,10 @@ class CompiledExecutor:
             self._load(program)
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        """Next state ``[*B, N, 13]`` and hidden state of a state and an action ``[*B, A]``."""
         inputs = [state, action]
-        recurrent = self.program.recurrent
-        if recurrent is not None:
+        if self.program.recurrent is not None:
             hidden = self._start(state, action) if hidden is None else hidden
-            inputs += [hidden.nodes, hidden.edges, hidden.globals_]
+            inputs += hidden.features
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
             after, *rest = _Differentiable.apply(self, *inputs)
         else:
@@ -79,8 +73,6 @@ class CompiledExecutor:
 
 
 def _functions(program: StepProgram) -> tuple[Callable, Callable]:
-    """The step, and its gradient pulled back."""
-
     def run(state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
         return (eager.step(program, state, action, None)[0],)
 
@@ -91,12 +83,10 @@ def _functions(program: StepProgram) -> tuple[Callable, Callable]:
 
 
 def _recurrent_functions(program: StepProgram) -> tuple[Callable, Callable]:
-    """As :func:`_functions`, of state and hidden state."""
-
     def run(state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor) -> tuple[Tensor, ...]:
         after, hidden = eager.step(program, state, action, Graph(nodes, edges, globals_, program.edge_index))
         assert hidden is not None
-        return after, hidden.nodes, hidden.edges, hidden.globals_
+        return after, *hidden.features
 
     def pull(
         state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor, *gradients: Tensor
@@ -151,23 +141,14 @@ def _is_worth_showing(record: logging.LogRecord) -> bool:
 
 
 def check_torch() -> None:
-    """Refuse to compile with a torch that is too old.
-
-    Only inputs are guarded, so two programs of equal shapes must not share compiled code: ``isolate_recompiles``.
-
-    Raises:
-        RuntimeError: if it is too old.
-    """
+    """RuntimeError if torch is too old to compile."""
+    # Only inputs are guarded, so two programs of equal shapes must not share compiled code.
     if "isolate_recompiles" not in inspect.signature(torch.compile).parameters:
         raise RuntimeError(f"compiling needs torch 2.13 or newer, not {torch.__version__}: use executor='eager'.")
 
 
 def check_compiler() -> None:
-    """Refuse to compile for a CPU without a C++ compiler, before anything is computed.
-
-    Raises:
-        FileNotFoundError: if there is none.
-    """
+    """FileNotFoundError without a C++ compiler."""
     from torch._inductor.cpp_builder import get_cpp_compiler
     from torch._inductor.exc import InvalidCxxCompiler
 

@@ -12,24 +12,17 @@ from torchrl_gn.networks.graph import Graph, graph_concat
 
 
 class EagerExecutor:
-    """Interpret a program operation by operation; differentiable in all that the program is.
-
-    Args:
-        program: the step.
-    """
+    """Interpret a program operation by operation; differentiable in all that the program is."""
 
     fixed_batch = False
-    """Whether another batch size costs a compilation."""
 
     def __init__(self, program: StepProgram) -> None:
         self.program = program
 
     def update(self, program: StepProgram) -> None:
-        """Take another program."""
         self.program = program
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        """Next state ``[*B, N, 13]`` and hidden state of a state and an action ``[*B, A]``."""
         return step(self.program, state, action, hidden)
 
 
@@ -54,14 +47,7 @@ def dynamic_graph(program: StepProgram, canonical: CanonicalState, action: Tenso
 def delta(
     program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
 ) -> tuple[Tensor, Graph | None]:
-    """Predicted change ``[*B, N, 12]``, zero in fixed components, and the next hidden state.
-
-    Args:
-        program: the step.
-        state: ``[*B, N, 13]``.
-        action: ``[*B, A]``.
-        hidden: hidden state of a recurrent model; default: the initial one.
-    """
+    """Predicted change ``[*B, N, 12]``, zero in fixed components, and hidden state; default: from the initial one."""
     canonical = program.canonicalizer(state, program.parameters)
     graph = dynamic_graph(program, canonical, action)
     if program.recurrent is not None:

@@ -19,20 +19,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BodyState(Feature):
-    """Encoded canonical state of each body.
-
-    Attributes:
-        encoding: an orientation as its rotation ``"matrix"`` or (paper) as the ``"quaternion"``.
-        positions: show positions along axes of translation invariance. A network without them transfers to scenes
-            larger than those it was trained on.
-
-    Raises:
-        ValueError: if ``encoding`` is not known.
-    """
+    """Encoded canonical state of each body."""
 
     part: ClassVar[Literal["nodes", "edges"]] = "nodes"
 
-    encoding: Encoding = "matrix"
+    encoding: Encoding = "matrix"  # of an orientation; paper: "quaternion"
+    # Along axes of translation invariance. Without them a network transfers to scenes larger than those of training.
     positions: bool = True
 
     def __post_init__(self) -> None:
@@ -66,7 +58,6 @@ class _Bound(Float64Buffers):
             self.constants({"visible": visible})
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, N, F]``."""
         state, matrices, _ = inputs.canonical
         shown = state * self.visible.to(state.dtype) if self.hides else state
         return self.layout.encode(shown, self.encoding, matrices)

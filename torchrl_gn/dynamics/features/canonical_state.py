@@ -35,16 +35,11 @@ class CanonicalState(NamedTuple):
 
 @dataclass(frozen=True)
 class Canonicalizer:
-    """Make predictions independent of where an invariant scene is and how it is rotated.
+    """Make predictions independent of where an invariant scene is and how it is rotated."""
 
-    Attributes:
-        recenter: recentre along axes of translation invariance (paper, SM "System invariance": on for single systems,
-            off when several train together).
-        yaw: rotate to the yaw frame of a scene that has one. Paper: no.
-    """
-
+    # Along axes of translation invariance (paper, SM "System invariance": off when several systems train together).
     recenter: bool = True
-    yaw: bool = True
+    yaw: bool = True  # rotate to the yaw frame of a scene that has one; paper: no
 
     def bind(self, scene: Scene, layout: StateLayout) -> BoundCanonicalizer:
         """The canonicaliser of one scene."""
@@ -52,13 +47,7 @@ class Canonicalizer:
 
 
 class BoundCanonicalizer(Float64Buffers):
-    """Canonicaliser of one scene.
-
-    Args:
-        options: what to canonicalise.
-        scene: the scene.
-        layout: channels of its states.
-    """
+    """Canonicaliser of one scene."""
 
     predicted: Tensor
     shifted: Tensor

@@ -25,7 +25,6 @@ _NEAR = 0.02  # metres: up to this distance from the plane the fine feature vari
 class Contacts(Feature):
     """Distances and velocities of the points that can touch the scene's plane.
 
-    The points are :attr:`Scene.contact_points <torchrl_gn.scenes.Scene>`.
     A contact force sets in within millimetres of a body that moves metres; the network need not compute the distance.
     Paper: it sees positions and rotations alone.
     """
@@ -44,11 +43,7 @@ class Contacts(Feature):
 
 
 class BoundContacts(Float64Buffers):
-    """Contact features of one scene.
-
-    Args:
-        scene: the scene.
-    """
+    """Contact features of one scene."""
 
     mask: Tensor
     normal: Tensor
@@ -60,12 +55,8 @@ class BoundContacts(Float64Buffers):
         points = scene.contact_points
         self.any = points is not None
         _, _, mask = contact_slots(scene)
-        values = {
-            "mask": mask,
-            "normal": np.array([0.0, 0.0, 1.0]) if points is None else points.normal,
-            "origin": np.zeros(3) if points is None else points.origin,
-        }
-        self.constants(values)
+        normal, origin = ([0.0, 0.0, 1.0], np.zeros(3)) if points is None else (points.normal, points.origin)
+        self.constants({"mask": mask, "normal": np.asarray(normal), "origin": origin})
 
     def forward(self, inputs: StepInputs) -> Tensor:
         """Features ``[*B, N, 24]``; 0 where there is no point.

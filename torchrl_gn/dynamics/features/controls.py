@@ -43,7 +43,6 @@ class Controls(Feature):
 
 class _Bound(nn.Module):
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, E, C]``."""
         return inputs.controls
 
 
@@ -52,11 +51,7 @@ def _controls_per_joint(scene: Scene) -> int:
 
 
 class ControlInputs(Float64Buffers):
-    """Actions at the edges of the joints that they act on, for one scene.
-
-    Args:
-        scene: the scene.
-    """
+    """Actions at the edges of the joints that they act on, for one scene."""
 
     action_low: Tensor
     action_high: Tensor

@@ -47,7 +47,6 @@ class _Bound(Float64Buffers):
         self.constants({"joint_node": torch.as_tensor(joint_axes(scene)[0]).long().repeat_interleave(2)})
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, E, 6]``."""
         matrices = inputs.canonical.matrices
         assert matrices is not None
         axis = inputs.parameters.joint_axis.to(matrices.dtype).unsqueeze(-1)
