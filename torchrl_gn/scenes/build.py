@@ -8,14 +8,10 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.contact_points import find_contact_points
-from torchrl_gn.scenes.errors import SceneError, UnsupportedSceneError
-from torchrl_gn.scenes.invariance import translation_invariant
-from torchrl_gn.scenes.joint_anchors import find_joint_anchors
-from torchrl_gn.scenes.movable import movable_components
-from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
+from torchrl_gn.scenes.invariance import find_yaw_frame, movable_components, translation_invariant
+from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph, UnsupportedSceneError
 from torchrl_gn.scenes.static_features import static_graph
-from torchrl_gn.scenes.topology import Topology, offset, topology
-from torchrl_gn.scenes.yaw_frame import find_yaw_frame
+from torchrl_gn.scenes.topology import Topology, find_joint_anchors, offset, topology
 
 _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the state
     mujoco.mjtSensor.mjSENS_FRAMEPOS,

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from torchrl_gn.scenes.joint_anchors import JointAnchors
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import StaticGraph
+from torchrl_gn.scenes.topology import JointAnchors
 
 
 @dataclass(frozen=True, eq=False)

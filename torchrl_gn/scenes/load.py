@@ -12,10 +12,9 @@ from typing import Any, cast
 import mujoco
 
 from torchrl_gn.scenes.build import build_scene
-from torchrl_gn.scenes.errors import SceneChangedWarning
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.mjcf_source import is_mjcf_text, read_mjcf, rebuild_mjcf
-from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.scene import Scene, SceneChangedWarning
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
 from torchrl_gn.scenes.variants import make_variant
 

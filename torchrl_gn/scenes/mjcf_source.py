@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
-from torchrl_gn.scenes.errors import SceneError
+from torchrl_gn.scenes.scene import SceneError
 
 
 def read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:

@@ -9,10 +9,21 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.contact_points import ContactPoints
-from torchrl_gn.scenes.errors import SceneError
 from torchrl_gn.scenes.fingerprint import fingerprint
-from torchrl_gn.scenes.joint_anchors import JointAnchors
-from torchrl_gn.scenes.yaw_frame import YawFrame
+from torchrl_gn.scenes.invariance import YawFrame
+from torchrl_gn.scenes.topology import JointAnchors
+
+
+class SceneError(ValueError):
+    """A model cannot be read as a scene."""
+
+
+class UnsupportedSceneError(SceneError):
+    """The graph cannot represent an element of a valid MuJoCo model."""
+
+
+class SceneChangedWarning(UserWarning):
+    """A scene rebuilt from its description has other physics than the original."""
 
 
 @dataclass(frozen=True)
