@@ -228,7 +228,6 @@ def make_reward(task: str, scene: Scene) -> Reward:
 
     Paper: Walker2d's ``"inverse_verticality"`` is largest for a standing walker, as in the paper's text. For a walker
     on its head use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
-
     Raises ValueError for an unknown task (the message lists all), TypeError for a robot known by its joints alone.
     """
     require_bodies(scene)

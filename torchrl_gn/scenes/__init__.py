@@ -12,7 +12,7 @@ from torchrl_gn.scenes.kinematic_tree import tree_states as tree_states
 from torchrl_gn.scenes.load import load_scene as load_scene
 from torchrl_gn.scenes.load import scene_from_description as scene_from_description
 from torchrl_gn.scenes.observation_graph import ObservationGraph as ObservationGraph
-from torchrl_gn.scenes.parameter_names import ParameterNames as ParameterNames
+from torchrl_gn.scenes.physical_parameters import ParameterNames as ParameterNames
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters as PhysicalParameters
 from torchrl_gn.scenes.scene import Attachment as Attachment
 from torchrl_gn.scenes.scene import Scene as Scene

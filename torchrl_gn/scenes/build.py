@@ -28,16 +28,7 @@ def build_scene(
 
     Works on a copy of the model: adds the frame sensors of every node last, names their unnamed bodies, switches
     sensors on, and warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone.
-
-    Args:
-        spec: the MJCF model, left as it is.
-        timestep: control step, seconds, a multiple of the physics step; None: one physics step.
-        settle_steps: physics steps without control after a reset.
-        origin: source of the model, part of :meth:`Scene.description`.
-
-    Raises:
-        SceneError: if MuJoCo cannot compile the model, a number in it is not finite, or ``timestep`` does not fit.
-        UnsupportedSceneError: if the graph cannot represent an element, which the message names.
+    Without ``timestep`` [s] a control step is one physics step. Raises as :func:`~torchrl_gn.scenes.load_scene`.
     """
     model, graph = _compile(spec, name)
     actuator_of_joint = _actuator_of_joint(model)
@@ -177,9 +168,8 @@ def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
 
 def _attachments(model: mujoco.MjModel, graph: Topology) -> dict[str, Attachment]:
     attachments = {}
-    for body in range(1, model.nbody):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body)
+    for body in np.setdiff1d(range(1, model.nbody), graph.body).tolist():
         node = int(graph.node_of_body[body])
-        if name and body != graph.body[node]:
+        if name := mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body):
             attachments[name] = Attachment(node, *offset(model, body, int(graph.body[node])))
     return attachments

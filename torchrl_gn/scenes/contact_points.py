@@ -41,7 +41,7 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
     """
     of_geom = graph.node_of_body[model.geom_bodyid]
     for plane in np.flatnonzero((model.geom_type == _GEOM.mjGEOM_PLANE) & (of_geom == 0)):
-        nodes, offsets, radii = [], [], []
+        spheres = []
         for geom in np.flatnonzero(of_geom > 0):
             if not can_collide(model, int(plane), int(geom)):
                 continue
@@ -49,14 +49,10 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
             root = graph.body[node]
             rotation, frame = data.geom_xmat[geom].reshape(3, 3), data.xmat[root].reshape(3, 3)
             for point, radius in _spheres(int(model.geom_type[geom]), model.geom_size[geom]):
-                nodes.append(node)
-                offsets.append(frame.T @ (data.geom_xpos[geom] + rotation @ point - data.xpos[root]))
-                radii.append(radius)
-        if nodes:
-            normal = data.geom_xmat[plane].reshape(3, 3)[:, 2]
-            return ContactPoints(
-                np.array(nodes), np.array(offsets), np.array(radii), normal.copy(), data.geom_xpos[plane].copy()
-            )
+                spheres.append((node, frame.T @ (data.geom_xpos[geom] + rotation @ point - data.xpos[root]), radius))
+        if spheres:
+            columns = (np.array(column) for column in zip(*spheres, strict=True))
+            return ContactPoints(*columns, data.geom_xmat[plane, 2::3].copy(), data.geom_xpos[plane].copy())
     return None
 
 

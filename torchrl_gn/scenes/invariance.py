@@ -26,14 +26,11 @@ def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Top
 def _invariant_along(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
     if model.nplugin or model.nflex:
         return False
-    shifted: set[int] = set()  # joints whose displacement shifts the scene
-    for node in np.flatnonzero(graph.parent == 0):
-        joints = _joints_along(model, int(graph.body[node]), axis)
-        if joints is None:
-            return False
-        shifted.update(joints)
+    shifting = [_joints_along(model, int(root), axis) for root in graph.body[graph.parent == 0]]
+    shifted = {joint for joints in shifting for joint in joints or ()}  # joints whose displacement shifts the scene
     return (
-        not any(depends_on_position(model, joint) for joint in shifted)
+        None not in shifting
+        and not any(depends_on_position(model, joint) for joint in shifted)
         and not collides_with_world(model, data, graph, axis)
         and not acts_on_position(model, graph, shifted)
     )
@@ -41,8 +38,7 @@ def _invariant_along(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology
 
 def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[int] | None:
     """Joints that shift a root body along ``axis``; None if it cannot move along it."""
-    slides, directions = [], []
-    frame = reference_rotation(model, body)
+    slides, frame = [], reference_rotation(model, body)
     first = model.body_jntadr[body]
     for joint in range(first, first + model.body_jntnum[body]):
         kind = mujoco.mjtJoint(model.jnt_type[joint])
@@ -51,10 +47,9 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
         if kind != mujoco.mjtJoint.mjJNT_SLIDE:
             break  # this joint rotates the axes of later slides
         slides.append(joint)
-        directions.append(frame @ model.jnt_axis[joint])
     if not slides:
         return None
-    matrix = np.array(directions).T  # [3, slides]
+    matrix = np.array([frame @ model.jnt_axis[joint] for joint in slides]).T  # [3, slides]
     amounts = np.linalg.lstsq(matrix, axis, rcond=None)[0]
     if np.abs(matrix @ amounts - axis).max() > _TOLERANCE:
         return None
@@ -91,15 +86,12 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
 
 def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray | None) -> bool:
     """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis``."""
-    if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
-        return False
     fixed = graph.node_of_body[model.geom_bodyid] == 0
     for other in np.flatnonzero(fixed):
         normal = data.geom_xmat[other].reshape(3, 3)[:, 2]
         plane = model.geom_type[other] == mujoco.mjtGeom.mjGEOM_PLANE
-        if plane and axis is not None and abs(normal @ axis) < _TOLERANCE:
-            continue
-        if any(can_collide(model, int(other), int(moving)) for moving in np.flatnonzero(~fixed)):
+        parallel = plane and axis is not None and abs(normal @ axis) < _TOLERANCE
+        if not parallel and any(can_collide(model, int(other), int(moving)) for moving in np.flatnonzero(~fixed)):
             return True
     return False
 
@@ -172,8 +164,10 @@ def find_yaw_frame(
         return None
     node = int(roots[0])
     body = int(graph.body[node])
-    slides, hinge = _slides_then_hinge(model, body)
-    if hinge is None or depends_on_position(model, hinge):
+    first = int(model.body_jntadr[body])
+    *slides, hinge = range(first, first + int(model.body_jntnum[body]))
+    kinds = [*[mujoco.mjtJoint.mjJNT_SLIDE] * len(slides), mujoco.mjtJoint.mjJNT_HINGE]
+    if model.jnt_type[[*slides, hinge]].tolist() != list(map(int, kinds)) or depends_on_position(model, hinge):
         return None
     rest = reference_rotation(model, body)
     directions = np.abs(rest @ model.jnt_axis[hinge])
@@ -197,16 +191,6 @@ def find_yaw_frame(
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, rest.ravel())
     return YawFrame(not collides_with_world(model, data, graph, None), node, axis, pivot, quat)
-
-
-def _slides_then_hinge(model: mujoco.MjModel, body: int) -> tuple[list[int], int | None]:
-    """Slides that a body's joints begin with, and the hinge that must end them; else no slide and None."""
-    joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
-    kinds = [mujoco.mjtJoint(model.jnt_type[joint]) for joint in joints]
-    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
-    if not kinds or kinds[-1] != hinge or any(kind != slide for kind in kinds[:-1]):
-        return [], None
-    return list(joints)[:-1], joints[-1]
 
 
 def _isotropic(model: mujoco.MjModel, slides: list[int], rest: np.ndarray, across: list[int]) -> bool:

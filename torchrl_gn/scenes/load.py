@@ -38,8 +38,7 @@ def load_scene(
             others are the standard system's.
 
     Raises:
-        ValueError: if the name or a parameter is unknown.
-        FileNotFoundError: if the file does not exist.
+        ValueError: if the name or a parameter is unknown; FileNotFoundError if the file does not exist.
         SceneError: if the MJCF is invalid or ``timestep`` does not fit.
         UnsupportedSceneError: if the graph cannot represent an element, which the message names.
     """

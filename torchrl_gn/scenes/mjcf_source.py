@@ -20,10 +20,8 @@ def read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
     if path is not None and not path.is_file():
         raise FileNotFoundError(f"MJCF file not found: {path}")
     try:
-        if path is None:
-            spec = mujoco.MjSpec.from_string(str(source))
-        else:
-            spec = mujoco.MjSpec.from_file(str(path))
+        kind = mujoco.MjSpec
+        spec = kind.from_string(str(source)) if path is None else kind.from_file(str(path))
     except ValueError as error:
         label = "string" if path is None else f"file {path}"
         raise SceneError(f"MuJoCo cannot read the MJCF {label}: {error}") from error
@@ -54,16 +52,13 @@ def _inline(text: str, folder: Path) -> str:
 
 def _inline_children(element: ElementTree.Element, folder: Path) -> None:
     children = list(element)
+    element[:] = []
     for child in children:
-        element.remove(child)
-    for child in children:
-        if child.tag == "include":  # always relative to the main file
+        included = child.tag == "include"  # always relative to the main file
+        if included:
             child = ElementTree.parse(folder / child.attrib["file"]).getroot()
-            _inline_children(child, folder)
-            element.extend(list(child))
-        else:
-            _inline_children(child, folder)
-            element.append(child)
+        _inline_children(child, folder)
+        element.extend(list(child) if included else [child])
 
 
 def _assets(spec: mujoco.MjSpec, folder: Path) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.contact_points import ContactPoints
-from torchrl_gn.scenes.fingerprint import fingerprint
+from torchrl_gn.scenes.fingerprint import physics
 from torchrl_gn.scenes.invariance import YawFrame
 from torchrl_gn.scenes.topology import JointAnchors
 
@@ -85,12 +86,10 @@ class Scene:
 
     @property
     def num_edges(self) -> int:
-        """Number of directed edges ``E``."""
         return len(self.senders)
 
     @property
     def num_actions(self) -> int:
-        """Number of controls ``A``."""
         return len(self.actuator_names)
 
     @property
@@ -105,8 +104,7 @@ class Scene:
 
     @property
     def state_size(self) -> int:
-        """Numbers in a node's state: position 3, quaternion 4, linear velocity 3, angular velocity 3."""
-        return 13
+        return 13  # position 3, quaternion 4, linear velocity 3, angular velocity 3
 
     @property
     def sensor_slice(self) -> slice:
@@ -138,7 +136,7 @@ class Scene:
 
     def fingerprint(self) -> str:
         """Hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""
-        return fingerprint(self)
+        return hashlib.sha256("\n".join(physics(self)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
         rotations = "no axis" if self.yaw_frame is None else "xyz"[self.yaw_frame.axis]

@@ -20,24 +20,14 @@ class Topology:
 
 
 def topology(model: mujoco.MjModel) -> Topology:
-    """Graph structure of a compiled model.
-
-    A node is a group of bodies welded together (``body_weldid``). Bodies fixed to the world, mocap bodies too, belong
-    to node 0.
-    """
-    body = np.unique(model.body_weldid)
+    """Graph structure of a compiled model; bodies fixed to the world, mocap bodies too, belong to node 0."""
+    body = np.unique(model.body_weldid).astype(np.int64)
     node_of_body = np.searchsorted(body, model.body_weldid)
     parent = node_of_body[model.body_parentid[body]]
     parent[0] = -1
     child_of_joint = node_of_body[model.jnt_bodyid]
     pairs = np.stack([parent[child_of_joint], child_of_joint], axis=1)  # [J, 2] parent, child
-    return Topology(
-        body=body.astype(np.int64),
-        node_of_body=node_of_body.astype(np.int64),
-        parent=parent.astype(np.int64),
-        senders=pairs.reshape(-1).astype(np.int64),
-        receivers=pairs[:, ::-1].reshape(-1).astype(np.int64),
-    )
+    return Topology(body, node_of_body, parent, pairs.flatten(), pairs[:, ::-1].flatten())
 
 
 def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray, np.ndarray]:
@@ -54,10 +44,7 @@ def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray,
 
 @dataclass(frozen=True, eq=False)
 class JointAnchors:
-    """Anchors of hinges and balls, which connect nodes to their parents in subtrees.
-
-    A subtree's root has no anchor: it is the world, or a node on a slide or free joint.
-    """
+    """Anchors of hinges and balls, which connect nodes to their parents in subtrees; a subtree's root has none."""
 
     parent: np.ndarray  # [N] parent node; a root's is itself
     parent_anchor: np.ndarray  # [N, 3] anchor in the parent's frame, metres; 0 for a root
@@ -73,31 +60,22 @@ class JointAnchors:
 
 
 def find_joint_anchors(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> JointAnchors:
-    """Joint anchors of a model: bodies whose joints are all hinges and balls about one point have one.
-
-    ``data`` must be at its reference, kinematics done.
-    """
-    count = len(graph.body)
+    """Anchors of bodies whose joints are all hinges and balls about one point; ``data`` as :func:`find_yaw_frame`'s."""
+    count, rotational = len(graph.body), (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
     parent, root = np.arange(count), np.arange(count)
     parent_anchor, child_anchor, ancestors = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, count))
     for node in range(1, count):
         body = int(graph.body[node])
         first = model.body_jntadr[body]
         joints = np.arange(first, first + model.body_jntnum[body])
-        if not _has_anchor(model, joints):
+        apart = np.abs(model.jnt_pos[joints] - model.jnt_pos[first]).max()
+        if apart >= 1e-12 or not np.isin(model.jnt_type[joints], rotational).all():
             continue
         before = int(graph.parent[node])
-        anchor, frame = data.xanchor[joints[0]], data.xmat[graph.body[before]].reshape(3, 3)
+        anchor, frame = data.xanchor[first], data.xmat[graph.body[before]].reshape(3, 3)
         parent[node], root[node] = before, root[before]
         parent_anchor[node] = frame.T @ (anchor - data.xpos[graph.body[before]])
-        child_anchor[node] = model.jnt_pos[joints[0]]
+        child_anchor[node] = model.jnt_pos[first]
         ancestors[node] = ancestors[before]
         ancestors[node, node] = 1
     return JointAnchors(parent, parent_anchor, child_anchor, ancestors, root)
-
-
-def _has_anchor(model: mujoco.MjModel, joints: np.ndarray) -> bool:
-    rotational = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
-    if len(joints) == 0 or not np.isin(model.jnt_type[joints], rotational).all():
-        return False
-    return bool(np.abs(model.jnt_pos[joints] - model.jnt_pos[joints[0]]).max() < 1e-12)

@@ -28,7 +28,6 @@ class ParameterRange:
 
     @property
     def is_angle(self) -> bool:
-        """Whether the parameter is an angle and not a factor."""
         return self.standard == 0
 
 
@@ -45,10 +44,7 @@ class System:
 
 
 def model_file(path: str) -> str:
-    """Path of a model file inside the ``dm_control`` package, such as ``"suite/cheetah.xml"``.
-
-    Raises ModuleNotFoundError if dm_control is not installed.
-    """
+    """Path of a model file such as ``"suite/cheetah.xml"`` in dm_control; ModuleNotFoundError if not installed."""
     # Importing dm_control would choose an OpenGL backend and complain without a display.
     package = importlib.util.find_spec("dm_control")
     if package is None or not package.submodule_search_locations:
