@@ -49,10 +49,7 @@ class Component:
 
 @dataclass(frozen=True)
 class StateLayout:
-    """The components of a state, in the order of their channels.
-
-    Raises ValueError if two components share a name, or a ``rate`` names none that is added and has no rate itself.
-    """
+    """Components in the order of their channels; ValueError if two share a name, or a ``rate`` is no added one."""
 
     components: tuple[Component, ...]
 
@@ -166,11 +163,9 @@ class StateLayout:
         return (vectors @ self._transposed(rotation, matrix)).reshape(delta.shape)
 
     def _transposed(self, rotation: Tensor, matrix: Tensor | None) -> Tensor:
-        for component in self.components:
-            if component.kind == "circle" or component.delta_size != 3:
-                raise ValueError(
-                    f"Component {component.name!r} is no vector or rotation in space and cannot be rotated."
-                )
+        for c in self.components:
+            if c.kind == "circle" or c.delta_size != 3:
+                raise ValueError(f"Component {c.name!r} is no vector or rotation in space and cannot be rotated.")
         return (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
 
     def encode(self, state: Tensor, encoding: Encoding = "matrix", matrices: Tensor | None = None) -> Tensor:
@@ -190,7 +185,6 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def encoded_size(self, encoding: Encoding = "matrix") -> int:
-        """Number of features of :meth:`encode`."""
         return sum(where.stop - where.start for where in self.encoded_slices(encoding).values())
 
     def encoded_slices(self, encoding: Encoding = "matrix") -> dict[str, slice]:

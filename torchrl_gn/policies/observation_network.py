@@ -75,11 +75,7 @@ class ObservationNetwork(nn.Module):
         self.graph, self.places = graph, _Places(graph)
 
     def for_graph(self, graph: ObservationGraph) -> ObservationNetwork:
-        """The same weights and normalisers for another graph, such as a swimmer of another length.
-
-        Raises ValueError if its nodes, joints or globals have other numbers of features, or the weights are tied to one
-        graph: by identities, or an MLP.
-        """
+        """The same weights for another graph; ValueError if its features differ, or identities or an MLP tie them."""
         own, other = _widths(self.graph), _widths(graph)
         if own != other:
             raise ValueError(f"The network reads {own} features, graph {graph.name!r} has {other}.")

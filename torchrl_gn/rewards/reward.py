@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import cast
 
 from tensordict import TensorDictBase
@@ -21,6 +23,7 @@ class Reward(nn.Module):
     """
 
     target_shape: tuple[int, ...] | None = None  # of a target without batch; None if the reward needs none
+    shown: Mapping[str, object] = MappingProxyType({})  # arguments in its repr
 
     @abstractmethod
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
@@ -64,6 +67,9 @@ class Reward(nn.Module):
         if not fits or task.shape[split:] != shape:
             raise ValueError(f"the task of {name} must be {[*batch, *shape]}, got {list(task.shape)}")
         return task.to(next_state.dtype)
+
+    def extra_repr(self) -> str:
+        return ", ".join(f"{name}={value!r}" for name, value in self.shown.items())
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.extra_repr()})"

@@ -38,8 +38,8 @@ class Balance(Reward):
     def __init__(self, scene: Scene, bodies: Sequence[str], *, target: np.ndarray | Tensor | None = None):
         super().__init__()
         self.bodies = Bodies(scene, bodies)
-        identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-        wanted = identity if target is None else torch.as_tensor(target, dtype=torch.float64)
+        self.shown = {"scene": scene.name, "bodies": tuple(bodies)}
+        wanted = torch.as_tensor([1.0, 0.0, 0.0, 0.0] if target is None else target, dtype=torch.float64)
         if wanted.shape not in {(4,), (len(bodies), 4)}:
             raise ValueError(f"target must be [4] or [{len(bodies)}, 4], got {list(wanted.shape)}")
         norm = wanted.norm(dim=-1, keepdim=True)
@@ -51,9 +51,6 @@ class Balance(Reward):
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         angle = quaternion.angle(self.bodies.orientation(next_state), self.target.to(next_state.dtype))
         return -angle.sum(-1, keepdim=True)
-
-    def extra_repr(self) -> str:
-        return f"scene={self.bodies.scene_name!r}, bodies={self.bodies.names}"
 
 
 class Reach(Reward):
@@ -74,6 +71,7 @@ class Reach(Reward):
         if not 0 <= shaping < math.inf:
             raise ValueError(f"shaping must be a finite number from 0, got {shaping}")
         self.bodies, self.shaping = Bodies(scene, [body]), float(shaping)
+        self.shown = {"scene": scene.name, "body": body, "shaping": self.shaping}
 
     def task_of(self, state: Tensor, target: Tensor) -> Tensor:
         """Direction ``[*B, 3]`` from the body in ``state`` to the target ``[*B, 3]``."""
@@ -91,9 +89,6 @@ class Reach(Reward):
         dx, dy, _ = displacement.split(1, dim=-1)
         return dx * x + dy * y - self.shaping * (dy * x - dx * y).square()
 
-    def extra_repr(self) -> str:
-        return f"{_one(self.bodies)}, shaping={self.shaping:g}"
-
 
 class Velocity(Reward):
     """Velocity of a body's frame along a world axis after the step, m/s, to a power of at least 1.
@@ -106,13 +101,11 @@ class Velocity(Reward):
         if isinstance(power, bool) or not isinstance(power, int) or power < 1:
             raise ValueError(f"power must be a whole number from 1, got {power!r}")
         self.bodies, self.axis, self.power = Bodies(scene, [body]), axis, power
+        self.shown = {"scene": scene.name, "body": body, "axis": axis, "power": power}
         self.component = _component(axis)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         return self.bodies.linear_velocity(next_state)[..., self.component] ** self.power
-
-    def extra_repr(self) -> str:
-        return f"{_one(self.bodies)}, axis={self.axis!r}, power={self.power}"
 
 
 class Position(Reward):
@@ -121,13 +114,11 @@ class Position(Reward):
     def __init__(self, scene: Scene, body: str, axis: Axis):
         super().__init__()
         self.bodies, self.axis = Bodies(scene, [body]), axis
+        self.shown = {"scene": scene.name, "body": body, "axis": axis}
         self.component = _component(axis)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         return self.bodies.position(next_state)[..., self.component]
-
-    def extra_repr(self) -> str:
-        return f"{_one(self.bodies)}, axis={self.axis!r}"
 
 
 class AngularSpeed(Reward):
@@ -136,12 +127,10 @@ class AngularSpeed(Reward):
     def __init__(self, scene: Scene, body: str):
         super().__init__()
         self.bodies = Bodies(scene, [body])
+        self.shown = {"scene": scene.name, "body": body}
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         return self.bodies.angular_velocity(next_state).square().sum(-1)
-
-    def extra_repr(self) -> str:
-        return _one(self.bodies)
 
 
 class VerticalDistance(Reward):
@@ -150,13 +139,11 @@ class VerticalDistance(Reward):
     def __init__(self, scene: Scene, bodies: Sequence[str], reference: str):
         super().__init__()
         self.bodies, self.reference = Bodies(scene, bodies), Bodies(scene, [reference])
+        self.shown = {"scene": scene.name, "bodies": tuple(bodies), "reference": reference}
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         height = self.bodies.position(next_state)[..., 2]
         return (height - self.reference.position(next_state)[..., 2]).square().sum(-1, keepdim=True)
-
-    def extra_repr(self) -> str:
-        return f"scene={self.bodies.scene_name!r}, bodies={self.bodies.names}, reference={self.reference.names[0]!r}"
 
 
 class TargetDistance(nn.Module):
@@ -189,10 +176,6 @@ def _component(axis: str) -> int:
     if axis not in get_args(Axis):
         raise ValueError(f"axis must be one of {', '.join(get_args(Axis))}, got {axis!r}")
     return get_args(Axis).index(axis)
-
-
-def _one(bodies: Bodies) -> str:
-    return f"scene={bodies.scene_name!r}, body={bodies.names[0]!r}"
 
 
 _WALKER_UPRIGHT = ("torso", "right_thigh", "left_thigh", "right_leg", "left_leg")

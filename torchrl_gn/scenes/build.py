@@ -136,13 +136,11 @@ def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
     return actuators
 
 
-def _refuse_non_finite(
-    static: StaticGraph, name: str, node_names: tuple[str, ...], joint_names: tuple[str, ...]
-) -> None:
+def _refuse_non_finite(static: StaticGraph, name: str, nodes: tuple[str, ...], joints: tuple[str, ...]) -> None:
     """Raise for NaN and infinity (damping="nan"), which MuJoCo compiles with only a warning."""
     parts = (
-        (static.nodes, static.node_names, [f"body {node!r}" for node in node_names]),
-        (static.edges, static.edge_names, [f"joint {joint!r}" for joint in joint_names for _ in range(2)]),
+        (static.nodes, static.node_names, [f"body {node!r}" for node in nodes]),
+        (static.edges, static.edge_names, [f"joint {joint!r}" for joint in joints for _ in range(2)]),
         (static.globals_[None], static.global_names, ["the options"]),
     )
     for values, features, owners in parts:

@@ -215,8 +215,15 @@ def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndar
     rng = np.random.default_rng(0)
     largest = np.zeros((len(body), 6))  # largest entry of every Jacobian row
     jacobian = np.zeros((6, model.nv))
+    free, ball = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+    joints = zip(model.jnt_type, model.jnt_qposadr, strict=True)
+    orientations = [start + 3 * (kind == free) for kind, start in joints if kind in (free, ball)]
     for _ in range(samples):
-        data.qpos[:] = _random_configuration(model, rng)
+        # Also beyond limits, which do not change the rows that vanish.
+        data.qpos[:] = rng.uniform(-np.pi, np.pi, model.nq)
+        for start in orientations:
+            quat = rng.normal(size=4)
+            data.qpos[start : start + 4] = quat / np.linalg.norm(quat)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         for node, body_id in enumerate(body):
@@ -224,16 +231,3 @@ def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndar
             largest[node] = np.maximum(largest[node], np.abs(jacobian).max(axis=1, initial=0.0))
     moves = largest > _TOLERANCE
     return np.concatenate([moves, moves], axis=1)
-
-
-def _random_configuration(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
-    """Draw a configuration, also beyond limits, which do not change the rows that vanish."""
-    qpos = rng.uniform(-np.pi, np.pi, model.nq)
-    for joint in range(model.njnt):
-        kind, start = mujoco.mjtJoint(model.jnt_type[joint]), model.jnt_qposadr[joint]
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
-            start += 3
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            quat = rng.normal(size=4)
-            qpos[start : start + 4] = quat / np.linalg.norm(quat)
-    return qpos

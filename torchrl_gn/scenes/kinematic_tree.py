@@ -91,7 +91,6 @@ class KinematicTree:
 
     @property
     def node_names(self) -> tuple[str, ...]:
-        """Names of base and bodies, the latter after their joints."""
         return ("base", *self.joint_names)
 
     @property
@@ -123,7 +122,6 @@ class KinematicTree:
 
     @property
     def predicted(self) -> np.ndarray:
-        """``[N]`` bool: all nodes but the base."""
         return np.any(self.movable, axis=1)
 
     @property
@@ -188,8 +186,7 @@ class KinematicTree:
 def tree_states(angle: np.ndarray, velocity: np.ndarray, extras: Sequence[np.ndarray] = ()) -> np.ndarray:
     """Node states ``[..., J + 1, 3 + extras]``, float64, from angles and velocities ``[..., J]`` (radians, rad/s).
 
-    Cosine and sine of the angle, velocity, and ``extras`` ``[..., J]``, in the order of :attr:`KinematicTree.extras`;
-    the base's are 1, 0, 0, ...
+    Cosine and sine of the angle, velocity, and ``extras`` ``[..., J]`` in the tree's order; the base's are 1, 0, 0, ...
     """
     bodies = np.stack((np.cos(angle), np.sin(angle), velocity, *extras), axis=-1).astype(np.float64)
     base = np.zeros((*bodies.shape[:-2], 1, bodies.shape[-1]))

@@ -129,10 +129,8 @@ class ObservationGraph:
     def node_entries(self) -> np.ndarray:
         """``[N, F_n + F_j]`` observation index of each node's features, then of its joint's; -1 is padding."""
         own = [self._find(entries) for entries in self.nodes.values()]
-        joints: list[list[int]] = [[] for _ in own]
-        for node, entries in zip(self.moved, self.joints.values(), strict=True):
-            joints[node] = self._find(entries)
-        return np.concatenate((_padded(own), _padded(joints)), axis=1)
+        joints = self._at_children([self._find(entries) for entries in self.joints.values()])
+        return np.concatenate((_padded(own), joints), axis=1)
 
     @cached_property
     def num_node_features(self) -> int:
@@ -152,10 +150,11 @@ class ObservationGraph:
     @cached_property
     def node_actions(self) -> np.ndarray:
         """``[N, C]`` actions at the joint whose child each node is; -1 is padding."""
-        acting: list[list[int]] = [[] for _ in self.nodes]
-        for node, joint in zip(self.moved, self.joints, strict=True):
-            acting[node] = list(self.actions.get(joint, ()))
-        return _padded(acting)
+        return self._at_children([list(self.actions.get(joint, ())) for joint in self.joints])
+
+    def _at_children(self, rows: list[list[int]]) -> np.ndarray:
+        row_of_node = dict(zip(self.moved.tolist(), rows, strict=True))
+        return _padded([row_of_node.get(node, []) for node in range(self.num_nodes)])
 
     @cached_property
     def observation_at(self) -> np.ndarray:
@@ -199,10 +198,7 @@ class ObservationGraph:
 
     @classmethod
     def from_description(cls, description: dict) -> ObservationGraph:
-        """Rebuild from :meth:`description`; ``globals``, ``actions`` and ``identity`` are optional.
-
-        Raises ValueError if a key is missing, unknown or declared twice, or the values make no graph.
-        """
+        """Rebuild from :meth:`description`; ValueError if a key is missing or unknown, or the values make no graph."""
         needed, optional = ["name", "observation", "nodes", "joints"], ["globals", "actions", "identity"]
         for wrong, what in (
             ([key for key in needed if key not in description], "lacks"),

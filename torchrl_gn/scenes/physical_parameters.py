@@ -40,20 +40,12 @@ class PhysicalParameters(NamedTuple):
         """Parameters of a scene."""
         if not isinstance(scene, Scene):
             return scene.values()
-        yaw_frame, (offset, radius, _) = scene.yaw_frame, contact_slots(scene)
-        values = {
-            "nodes": scene.static.nodes,
-            "edges": scene.static.edges,
-            "globals_": scene.static.globals_,
-            "joint_axis": joint_axes(scene)[1].repeat(2, axis=0),
-            "rest": np.array([1.0, 0.0, 0.0, 0.0]) if yaw_frame is None else yaw_frame.rest,
-            "pivot": np.zeros(3) if yaw_frame is None else yaw_frame.pivot,
-            "parent_anchor": scene.joint_anchors.parent_anchor,
-            "child_anchor": scene.joint_anchors.child_anchor,
-            "contact_offset": offset,
-            "contact_radius": radius,
-        }
-        return cls(**{name: torch.as_tensor(value, dtype=torch.float64) for name, value in values.items()})
+        static, anchors, yaw_frame = scene.static, scene.joint_anchors, scene.yaw_frame
+        identity = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+        rest, pivot = identity if yaw_frame is None else (yaw_frame.rest, yaw_frame.pivot)
+        arrays = (static.nodes, static.edges, static.globals_, joint_axes(scene)[1].repeat(2, axis=0), rest, pivot)
+        arrays += (anchors.parent_anchor, anchors.child_anchor, *contact_slots(scene)[:2])
+        return cls(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     @classmethod
     def read(cls, static: TensorDictBase, own: PhysicalParameters) -> PhysicalParameters:
@@ -154,10 +146,7 @@ class ParameterNames:
         return {part: [columns[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
 
     def select(self, scene: Scene) -> PhysicalParameters:
-        """A scene's physical parameters with these columns alone; ValueError if it lacks one.
-
-        Types and flags that this MuJoCo version does not know are 0.
-        """
+        """Physical parameters with these columns alone, unknown types and flags 0; ValueError if one is missing."""
         values, available = PhysicalParameters.of(scene), ParameterNames.of(scene)
         if missing := self.missing_in(available):
             raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")

@@ -117,22 +117,14 @@ class Scene:
         return np.any(self.movable, axis=1)
 
     def description(self) -> dict:
-        """JSON-able values from which :func:`scene_from_description` rebuilds the scene.
-
-        Raises SceneError if it was made from an ``MjSpec``, whose XML would round its numbers.
-        """
+        """JSON-able values that rebuild the scene; SceneError if it is of an ``MjSpec``, whose XML rounds numbers."""
         if not self.origin:
             raise SceneError(
                 f"Scene {self.name!r} was made from an MjSpec, which has no exact description;"
                 " load the model from an MJCF file."
             )
-        return {
-            "name": self.name,
-            "timestep": self.timestep,
-            "settle_steps": self.settle_steps,
-            **self.origin,
-            "fingerprint": self.fingerprint(),
-        }
+        own = {"name": self.name, "timestep": self.timestep, "settle_steps": self.settle_steps}
+        return {**own, **self.origin, "fingerprint": self.fingerprint()}
 
     def fingerprint(self) -> str:
         """Hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""

@@ -60,7 +60,7 @@ class JointAnchors:
 
 
 def find_joint_anchors(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> JointAnchors:
-    """Anchors of bodies whose joints are all hinges and balls about one point; ``data`` as :func:`find_yaw_frame`'s."""
+    """Anchors of bodies whose joints are all hinges and balls about one point; ``data`` is at its reference."""
     count, rotational = len(graph.body), (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
     parent, root = np.arange(count), np.arange(count)
     parent_anchor, child_anchor, ancestors = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, count))
