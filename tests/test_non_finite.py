@@ -27,7 +27,7 @@ from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, guarded_rollout, rollout, rollout_video
 from torchrl_gn.maths import Normalizer
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.rewards.balance import Balance
+from torchrl_gn.rewards import Balance
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, load_pretrained, make_optimizer, save_checkpoint
 from torchrl_gn.training.optimizers import ScheduledOptimizer

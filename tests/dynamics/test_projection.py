@@ -11,7 +11,7 @@ from torchrl_gn.dynamics.constraints.generalized_coordinates import GeneralizedP
 from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.scenes.joint_axes import joint_axes
+from torchrl_gn.scenes.physical_parameters import joint_axes
 
 from .. import zoo
 

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.rewards import Balance, Velocity, VerticalDistance, available_rewards, make_reward
-from torchrl_gn.rewards.motion import AngularSpeed, Position
+from torchrl_gn.rewards import (
+    AngularSpeed,
+    Balance,
+    Position,
+    Velocity,
+    VerticalDistance,
+    available_rewards,
+    make_reward,
+)
 from torchrl_gn.scenes import load_scene, sample_variants
 
 WALKER = ("torso", "right_thigh", "left_thigh", "right_leg", "left_leg")

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from torchrl_gn.scenes.joint_axes import joint_axes
+from torchrl_gn.scenes.physical_parameters import joint_axes
 
 from .. import zoo
 

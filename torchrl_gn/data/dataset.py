@@ -19,7 +19,7 @@ from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versi
 from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.load import scene_from_description
-from torchrl_gn.scenes.parameter_names import ParameterNames, take_columns
+from torchrl_gn.scenes.physical_parameters import ParameterNames, take_columns
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters
 

@@ -9,8 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_gn.maths.float64_buffers import Float64Buffers
-from torchrl_gn.scenes.parameter_names import ParameterNames, take_columns
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+from torchrl_gn.scenes.physical_parameters import ParameterNames, PhysicalParameters, take_columns
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.model import ForwardModel

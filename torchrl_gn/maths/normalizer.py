@@ -36,11 +36,10 @@ class Normalizer(Float64Buffers):
         if not limit > 0:
             raise ValueError(f"limit={limit} must be above 0.")
         self.size, self.floor, self.limit = size, floor, limit
-        for name in ("count", "mean", "m2"):
-            self.register_buffer(name, torch.zeros(size, dtype=torch.float64))
-        for name in ("std", "inverse_std"):
-            self.register_buffer(name, torch.zeros(size, dtype=torch.float64), persistent=False)
-        self.register_load_state_dict_post_hook(_refresh_derived)
+        for name in ("count", "mean", "m2", "std", "inverse_std"):
+            derived = name.endswith("std")
+            self.register_buffer(name, torch.zeros(size, dtype=torch.float64), persistent=not derived)
+        self.register_load_state_dict_post_hook(Normalizer._refresh)
 
     @property
     def fitted(self) -> bool:
@@ -54,10 +53,7 @@ class Normalizer(Float64Buffers):
 
     @torch.no_grad()
     def update(self, features: Tensor, mask: Tensor | None = None) -> None:
-        """Add a batch ``[..., F]`` to the statistics, but for entries where the bool ``mask``, broadcast, is False.
-
-        Raises ValueError if the size is wrong or a counted entry is not finite.
-        """
+        """Add a batch ``[..., F]`` where the bool ``mask`` is True; ValueError if misshapen or not finite there."""
         if features.shape[-1] != self.size:
             raise ValueError(f"Normalizer of {self.size} features got {features.shape[-1]} in {tuple(features.shape)}.")
         if features.shape[:-1].numel() == 0 or self.size == 0:
@@ -92,7 +88,7 @@ class Normalizer(Float64Buffers):
         self._refresh()
 
     @torch.no_grad()
-    def _refresh(self) -> None:
+    def _refresh(self, *_) -> None:
         std = (self.m2 / self.count.clamp(min=1)).sqrt()
         constant = (std <= self.floor) | (std <= 1e-7 * self.mean.abs())
         # In place: TorchRL's losses hold on to a module's buffers.
@@ -112,7 +108,3 @@ class Normalizer(Float64Buffers):
 
     def extra_repr(self) -> str:
         return f"{self.size}, floor={self.floor}"
-
-
-def _refresh_derived(module: Normalizer, _) -> None:
-    module._refresh()

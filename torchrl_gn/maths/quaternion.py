@@ -134,20 +134,10 @@ def to_matrix(q: Tensor) -> Tensor:
     scale = 2 / torch.where(square > 0, square, 1)
     w, x, y, z = q.unbind(-1)
     _, sx, sy, sz = (scale.unsqueeze(-1) * q).unbind(-1)
-    return torch.stack(
-        (
-            1 - (y * sy + z * sz),
-            x * sy - w * sz,
-            x * sz + w * sy,
-            x * sy + w * sz,
-            1 - (x * sx + z * sz),
-            y * sz - w * sx,
-            x * sz - w * sy,
-            y * sz + w * sx,
-            1 - (x * sx + y * sy),
-        ),
-        dim=-1,
-    )
+    first = 1 - (y * sy + z * sz), x * sy - w * sz, x * sz + w * sy
+    second = x * sy + w * sz, 1 - (x * sx + z * sz), y * sz - w * sx
+    third = x * sz - w * sy, y * sz + w * sx, 1 - (x * sx + y * sy)
+    return torch.stack((*first, *second, *third), dim=-1)
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:

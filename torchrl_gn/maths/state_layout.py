@@ -49,11 +49,7 @@ class Component:
 
 @dataclass(frozen=True)
 class StateLayout:
-    """The components of a state, in the order of their channels.
-
-    Raises:
-        ValueError: if two components share a name, or a ``rate`` names none that is added and has no rate itself.
-    """
+    """Components in the order of their channels; ValueError if two share a name, or a ``rate`` is no added one."""
 
     components: tuple[Component, ...]
 
@@ -76,7 +72,6 @@ class StateLayout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the components."""
         return tuple(component.name for component in self.components)
 
     @cached_property
@@ -140,58 +135,44 @@ class StateLayout:
         return delta - self._rate_term(state, delta, timestep)
 
     def _rate_term(self, state: Tensor, delta: Tensor, timestep: float) -> Tensor:
-        parts = []
-        for component in self.components:
-            if component.rate is None:
-                parts.append(torch.zeros_like(delta[..., self.delta_slices[component.name]]))
-            else:
-                rate, change = state[..., self.slices[component.rate]], delta[..., self.delta_slices[component.rate]]
-                parts.append(timestep * (rate + 0.5 * change))
+        parts = [
+            torch.zeros_like(delta[..., self.delta_slices[c.name]])
+            if c.rate is None
+            else timestep * (state[..., self.slices[c.rate]] + 0.5 * delta[..., self.delta_slices[c.rate]])
+            for c in self.components
+        ]
         return torch.cat(parts, dim=-1)
 
     def rotate(self, state: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
-        """Rotate states about the origin.
+        """Rotate states ``[*B, N, size]`` about the origin by unit quaternions ``[*B, 4]``, one for all ``N`` items.
 
-        Args:
-            state: ``[*B, N, size]``.
-            rotation: ``[*B, 4]`` unit quaternions, one for all ``N`` items.
-            matrix: ``[*B, 3, 3]`` of that rotation, if known.
-
-        Raises:
-            ValueError: if a component is no vector or rotation in space.
+        ``matrix`` ``[*B, 3, 3]`` is that rotation, if known. ValueError if a component cannot be rotated.
         """
-        self._check_spatial()
-        matrix = (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
-        parts = []
-        for component in self.components:
-            part = state[..., self.slices[component.name]]
-            if component.kind == "rotation":
-                parts.append(quaternion.product(rotation.unsqueeze(-2), part))
-            else:
-                parts.append(part @ matrix)
+        transposed = self._transposed(rotation, matrix)
+        parts = [
+            quaternion.product(rotation.unsqueeze(-2), state[..., self.slices[c.name]])
+            if c.kind == "rotation"
+            else state[..., self.slices[c.name]] @ transposed
+            for c in self.components
+        ]
         return torch.cat(parts, dim=-1)
 
     def rotate_delta(self, delta: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
         """Rotate state changes ``[*B, N, delta_size]`` as :meth:`rotate` does states."""
-        self._check_spatial()
-        matrix = (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
         vectors = delta.reshape(*delta.shape[:-2], delta.shape[-2] * len(self.components), 3)
-        return (vectors @ matrix).reshape(delta.shape)
+        return (vectors @ self._transposed(rotation, matrix)).reshape(delta.shape)
 
-    def _check_spatial(self) -> None:
-        for component in self.components:
-            if component.kind == "circle" or component.delta_size != 3:
-                raise ValueError(
-                    f"Component {component.name!r} is no vector or rotation in space and cannot be rotated."
-                )
+    def _transposed(self, rotation: Tensor, matrix: Tensor | None) -> Tensor:
+        for c in self.components:
+            if c.kind == "circle" or c.delta_size != 3:
+                raise ValueError(f"Component {c.name!r} is no vector or rotation in space and cannot be rotated.")
+        return (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
 
     def encode(self, state: Tensor, encoding: Encoding = "matrix", matrices: Tensor | None = None) -> Tensor:
         """Features ``[..., encoded_size(encoding)]`` of states ``[..., size]`` for a network.
 
-        Args:
-            state: ``[..., size]``.
-            encoding: a rotation as its ``"quaternion"`` (paper) or its ``"matrix"`` (9), the same for ``q`` and ``-q``.
-            matrices: ``[..., 3, 3]`` of the state's only rotation, if known.
+        A rotation enters as its ``"quaternion"`` (paper) or its ``"matrix"`` (9), the same for ``q`` and ``-q``;
+        ``matrices`` ``[..., 3, 3]`` is the state's only rotation, if known.
         """
         if encoding == "quaternion":
             return state
@@ -204,7 +185,6 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def encoded_size(self, encoding: Encoding = "matrix") -> int:
-        """Number of features of :meth:`encode`."""
         return sum(where.stop - where.start for where in self.encoded_slices(encoding).values())
 
     def encoded_slices(self, encoding: Encoding = "matrix") -> dict[str, slice]:

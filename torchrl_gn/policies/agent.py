@@ -1,4 +1,4 @@
-"""The networks of an agent that learns a policy."""
+"""The networks of an agent that learns a policy, policies that are graph networks among them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torchrl.modules import MLP, ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
 
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
-from torchrl_gn.policies.graph_policy import GraphPolicy
 from torchrl_gn.policies.observation_model import ObservationModel
+from torchrl_gn.policies.observation_network import ObservationNetwork, sharing_weights
 from torchrl_gn.scenes import ObservationGraph
 
 
@@ -36,6 +36,41 @@ class OutputNormalization(nn.Module):
 
     def forward(self, location: Tensor) -> Tensor:
         return location * (1 + location.square().mean(-1, keepdim=True)).rsqrt()
+
+
+class GraphPolicy(nn.Module):
+    """Location and scale of a Gaussian policy from a graph network: each joint's actions are read at the node it moves.
+
+    For TorchRL's ``ProbabilisticActor``. Without identities in the graph the same weights serve bodies of any number of
+    joints (:meth:`for_graph`), which the paper does not try. ``options`` are those of :class:`ObservationNetwork`.
+    Raises ValueError if the graph has no actions.
+    """
+
+    take: Tensor
+
+    def __init__(self, graph: ObservationGraph, *, min_scale: float = 0.01, **options: Any) -> None:
+        super().__init__()
+        if not graph.num_actions:
+            raise ValueError(f"Graph {graph.name!r} has no actions for a policy to choose.")
+        self.network = ObservationNetwork(graph, 2 * graph.node_actions.shape[1], actions=False, **options)
+        self.extract = NormalParamExtractor(scale_lb=cast(Any, min_scale))
+        self.register_buffer("take", torch.as_tensor(graph.action_at), persistent=False)
+
+    def for_graph(self, graph: ObservationGraph) -> GraphPolicy:
+        """The same weights for another graph, see :meth:`ObservationNetwork.for_graph`."""
+        policy = sharing_weights(self)
+        policy.network = self.network.for_graph(graph)
+        policy.take = torch.as_tensor(graph.action_at).to(self.take.device)
+        return policy
+
+    def update_normalizers(self, observation: Tensor) -> None:
+        """Add observations ``[*B, O]`` to the statistics."""
+        self.network.update_normalizers(observation)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Location and scale ``[*B, A]`` of the actions, before they are squashed, for observations ``[*B, O]``."""
+        loc, scale = self.network(observation).chunk(2, dim=-1)
+        return self.extract(torch.cat([part.flatten(-2)[..., self.take] for part in (loc, scale)], dim=-1))
 
 
 class Agent(nn.Module):
@@ -91,16 +126,10 @@ class Agent(nn.Module):
                 parameters = nn.Sequential(mlp, NormalParamExtractor(scale_lb=cast(Any, min_scale)))
             self.policy = _actor(parameters)
         else:
-            mlp = LayerNormMLP(observations, actions, hidden)
-            self.policy = TensorDictSequential(
-                [
-                    TensorDictModule(mlp, ["observation"], ["action"]),
-                    TensorDictModule(OutputNormalization(), ["action"], ["action"]),
-                    TanhModule(in_keys=["action"]),
-                ]
-            )
-        value = LayerNormMLP(observations + actions, 1, hidden)
-        self.value = ValueOperator(value, in_keys=["observation", "action"])
+            act = TensorDictModule(LayerNormMLP(observations, actions, hidden), ["observation"], ["action"])
+            normalize = TensorDictModule(OutputNormalization(), ["action"], ["action"])
+            self.policy = TensorDictSequential([act, normalize, TanhModule(in_keys=["action"])])
+        self.value = ValueOperator(LayerNormMLP(observations + actions, 1, hidden), in_keys=["observation", "action"])
         self.model = None if model is None else ObservationModel(graph, core=model, **(model_options or {}))
         self.reward = LearnedReward(observations, actions, hidden) if learned_reward else None
 
@@ -110,10 +139,7 @@ class Agent(nn.Module):
         return next((module for module in self.policy.modules() if isinstance(module, GraphPolicy)), None)
 
     def policy_for(self, graph: ObservationGraph) -> ProbabilisticActor:
-        """The policy for another body, such as a swimmer of another length, sharing the weights.
-
-        Raises ValueError if the policy is no graph network, or has identities of this body's nodes.
-        """
+        """The policy for another body, sharing the weights; ValueError if no graph network, or tied to this body."""
         if self.graph_policy is None:
             raise ValueError("Only a graph network drives other bodies; build the agent with policy='graph'.")
         return _actor(self.graph_policy.for_graph(graph))
@@ -138,14 +164,6 @@ class Agent(nn.Module):
 
 def _actor(parameters: nn.Module) -> ProbabilisticActor:
     """Gaussian policy, bounded and then squashed, whose location and scale a module gives."""
-    return ProbabilisticActor(
-        TensorDictSequential(
-            [
-                TensorDictModule(parameters, ["observation"], ["loc", "scale"]),
-                TensorDictModule(OutputNormalization(), ["loc"], ["loc"]),
-            ]
-        ),
-        in_keys=["loc", "scale"],
-        out_keys=["action"],
-        distribution_class=TanhNormal,
-    )
+    act = TensorDictModule(parameters, ["observation"], ["loc", "scale"])
+    module = TensorDictSequential([act, TensorDictModule(OutputNormalization(), ["loc"], ["loc"])])
+    return ProbabilisticActor(module, in_keys=["loc", "scale"], out_keys=["action"], distribution_class=TanhNormal)

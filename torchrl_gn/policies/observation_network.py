@@ -6,6 +6,7 @@ import copy
 from collections.abc import Sequence
 from typing import Literal, TypeVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -68,18 +69,13 @@ class ObservationNetwork(nn.Module):
             self.core = GNCore(self.size, static, out_nodes, latent=latent, activation=activation, hidden=hidden)
         elif core == "mlp":
             counts = graph.num_nodes, graph.num_edges
-            sizes = {"counts": counts, "hidden": mlp_hidden, "activation": activation}
-            self.core = MLPCore(self.size, static, out_nodes, **sizes)
+            self.core = MLPCore(self.size, static, out_nodes, counts=counts, hidden=mlp_hidden, activation=activation)
         else:
             raise ValueError(f"core={core!r} is not known; use 'gn' or 'mlp'.")
         self.graph, self.places = graph, _Places(graph)
 
     def for_graph(self, graph: ObservationGraph) -> ObservationNetwork:
-        """The same weights and normalisers for another graph, such as a swimmer of another length.
-
-        Raises ValueError if its nodes, joints or globals have other numbers of features, or the weights are tied to one
-        graph: by identities, or an MLP.
-        """
+        """The same weights for another graph; ValueError if its features differ, or identities or an MLP tie them."""
         own, other = _widths(self.graph), _widths(graph)
         if own != other:
             raise ValueError(f"The network reads {own} features, graph {graph.name!r} has {other}.")
@@ -102,14 +98,10 @@ class ObservationNetwork(nn.Module):
 
     @torch.no_grad()
     def update_normalizers(self, observation: Tensor, action: Tensor | None = None) -> None:
-        """Add observations ``[*B, O]`` and actions ``[*B, A]`` to the statistics.
-
-        Raises ValueError if a shape does not fit the graph or a number is not finite.
-        """
+        """Add observations ``[*B, O]`` and actions ``[*B, A]``; ValueError if misshapen or not finite."""
         nodes, edges, globals_ = self._arrange(observation, action)
-        mask_nodes, mask_edges = self._masks()
-        self.node_normalizer.update(nodes, mask_nodes)
-        self.edge_normalizer.update(edges, mask_edges)
+        self.node_normalizer.update(nodes, self.places.node_mask)
+        self.edge_normalizer.update(edges, self.places.edge_mask[:, : edges.shape[-1]])
         self.global_normalizer.update(globals_)
 
     def _arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,11 +118,6 @@ class ObservationNetwork(nn.Module):
             )
         return self.places.arrange(observation, action if self.actions else None)
 
-    def _masks(self) -> tuple[Tensor, Tensor]:
-        places = self.places
-        edges = places.edge_mask if self.actions else places.edge_mask[:, : self.graph.num_joint_features]
-        return places.node_mask, edges
-
     @property
     def _weight(self) -> Tensor:
         # Not one of parameters(): under TorchRL's losses weights may be plain tensors.
@@ -142,13 +129,9 @@ class ObservationNetwork(nn.Module):
         """Normalised graph ``[*B, ...]`` of observations ``[*B, O]`` and actions ``[*B, A]`` that fit the graph."""
         dtype = self._weight.dtype
         nodes, edges, globals_ = self._arrange(observation, action)
-        mask_nodes, mask_edges = self._masks()
-        return Graph(
-            self.node_normalizer(nodes, dtype) * mask_nodes,
-            self.edge_normalizer(edges, dtype) * mask_edges,
-            self.global_normalizer(globals_, dtype),
-            self.places.incidence.edge_index,
-        )
+        nodes = self.node_normalizer(nodes, dtype) * self.places.node_mask
+        edges = self.edge_normalizer(edges, dtype) * self.places.edge_mask[:, : edges.shape[-1]]
+        return Graph(nodes, edges, self.global_normalizer(globals_, dtype), self.places.incidence.edge_index)
 
     def static_graph(self) -> Graph:
         """Directions of edges and identities of nodes, equal for every sample."""
@@ -202,9 +185,7 @@ class _Places(Float64Buffers):
                 "globals_": graph.global_entries,
                 "moved": moved,
                 "node_mask": filled[:, : self.split],
-                "edge_mask": torch.cat(
-                    [torch.as_tensor(part) for part in (filled[moved, self.split :], actions[moved] >= 0)], dim=1
-                ),
+                "edge_mask": np.concatenate((filled[moved, self.split :], actions[moved] >= 0), axis=1),
             }
         )
 

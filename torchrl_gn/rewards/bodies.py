@@ -39,9 +39,7 @@ class Bodies(Float64Buffers):
     A body welded at offset :math:`(p, q)` into a node with pose and velocity :math:`(x, R, v, \omega)` has position
     :math:`x + R p`, orientation :math:`R q`, velocity :math:`v + \omega \times R p` and angular velocity
     :math:`\omega`: world frame, of the body's frame (MuJoCo's ``xpos`` and ``xquat``), not of its centre of mass.
-
-    Raises:
-        ValueError: a name is unknown or repeated; when reading, states have a wrong shape.
+    Raises ValueError if a name is unknown or repeated; when reading, if states have a wrong shape.
     """
 
     node: Tensor

@@ -52,6 +52,7 @@ class ImitatePose(Reward):
     def __init__(self, scene: Scene, bodies: Sequence[str]):
         super().__init__()
         self.bodies = Bodies(scene, bodies)
+        self.shown = {"scene": scene.name, "bodies": tuple(bodies)}
         self.target_shape = (scene.num_nodes, 13)
         base, reach = zip(*(arm_reach(scene, name) for name in bodies), strict=True)
         spans = [arm_reach(scene, name)[1] for name in scene.node_names]
@@ -62,17 +63,16 @@ class ImitatePose(Reward):
     def task_of(self, state: Tensor, target: Tensor) -> Tensor:
         """The target ``[*B, N, 13]`` itself; ValueError also for quaternions of norm zero or positions out of reach."""
         task = super().task_of(state, target)
+        names = self.bodies.names
         if not bool((self.bodies.orientation(task).norm(dim=-1) > 0).all()):
-            raise ValueError(
-                f"the target of ImitatePose must hold quaternions of non-zero norm for {self.bodies.names}"
-            )
+            raise ValueError(f"the target of ImitatePose must hold quaternions of non-zero norm for {names}")
         distance = (self.bodies.position(task) - self.base).norm(dim=-1)
         beyond = (distance > self.reach + self.slack).nonzero()
         if len(beyond):
             *batch, k = beyond[0].tolist()
             where = f" at index {tuple(batch)}" if batch else ""
             raise ValueError(
-                f"the target of ImitatePose{where} puts {self.bodies.names[k]!r} {distance[(*batch, k)]:.4g} m from the"
+                f"the target of ImitatePose{where} puts {names[k]!r} {distance[(*batch, k)]:.4g} m from the"
                 f" base of scene {self.bodies.scene_name!r}, whose links reach {self.reach[k]:.4g} m; take a"
                 " target from a state of this scene, in metres"
             )
@@ -84,6 +84,3 @@ class ImitatePose(Reward):
         wanted = quaternion.normalize(self.bodies.orientation(target))
         rotated = quaternion.product(quaternion.conjugate(self.bodies.orientation(next_state)), wanted)[..., 1:]
         return -torch.cat((away, rotated), dim=-1).square().sum(-1).sum(-1, keepdim=True)
-
-    def extra_repr(self) -> str:
-        return f"scene={self.bodies.scene_name!r}, bodies={self.bodies.names}"

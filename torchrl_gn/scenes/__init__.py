@@ -7,19 +7,19 @@ Example:
     (7, 16, 5)
 """
 
-from torchrl_gn.scenes.errors import SceneChangedWarning as SceneChangedWarning
-from torchrl_gn.scenes.errors import SceneError as SceneError
-from torchrl_gn.scenes.errors import UnsupportedSceneError as UnsupportedSceneError
 from torchrl_gn.scenes.kinematic_tree import KinematicTree as KinematicTree
 from torchrl_gn.scenes.kinematic_tree import tree_states as tree_states
 from torchrl_gn.scenes.load import load_scene as load_scene
 from torchrl_gn.scenes.load import scene_from_description as scene_from_description
 from torchrl_gn.scenes.observation_graph import ObservationGraph as ObservationGraph
-from torchrl_gn.scenes.parameter_names import ParameterNames as ParameterNames
+from torchrl_gn.scenes.physical_parameters import ParameterNames as ParameterNames
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters as PhysicalParameters
 from torchrl_gn.scenes.scene import Attachment as Attachment
 from torchrl_gn.scenes.scene import Scene as Scene
+from torchrl_gn.scenes.scene import SceneChangedWarning as SceneChangedWarning
+from torchrl_gn.scenes.scene import SceneError as SceneError
 from torchrl_gn.scenes.scene import StaticGraph as StaticGraph
+from torchrl_gn.scenes.scene import UnsupportedSceneError as UnsupportedSceneError
 from torchrl_gn.scenes.systems import SYSTEMS as SYSTEMS
 from torchrl_gn.scenes.systems import ParameterRange as ParameterRange
 from torchrl_gn.scenes.variants import has_variants as has_variants

@@ -8,14 +8,10 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.contact_points import find_contact_points
-from torchrl_gn.scenes.errors import SceneError, UnsupportedSceneError
-from torchrl_gn.scenes.invariance import translation_invariant
-from torchrl_gn.scenes.joint_anchors import find_joint_anchors
-from torchrl_gn.scenes.movable import movable_components
-from torchrl_gn.scenes.scene import Attachment, Scene, StaticGraph
+from torchrl_gn.scenes.invariance import find_yaw_frame, movable_components, translation_invariant
+from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph, UnsupportedSceneError
 from torchrl_gn.scenes.static_features import static_graph
-from torchrl_gn.scenes.topology import Topology, offset, topology
-from torchrl_gn.scenes.yaw_frame import find_yaw_frame
+from torchrl_gn.scenes.topology import Topology, find_joint_anchors, offset, topology
 
 _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the state
     mujoco.mjtSensor.mjSENS_FRAMEPOS,
@@ -32,16 +28,7 @@ def build_scene(
 
     Works on a copy of the model: adds the frame sensors of every node last, names their unnamed bodies, switches
     sensors on, and warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone.
-
-    Args:
-        spec: the MJCF model, left as it is.
-        timestep: control step, seconds, a multiple of the physics step; None: one physics step.
-        settle_steps: physics steps without control after a reset.
-        origin: source of the model, part of :meth:`Scene.description`.
-
-    Raises:
-        SceneError: if MuJoCo cannot compile the model, a number in it is not finite, or ``timestep`` does not fit.
-        UnsupportedSceneError: if the graph cannot represent an element, which the message names.
+    Without ``timestep`` [s] a control step is one physics step. Raises as :func:`~torchrl_gn.scenes.load_scene`.
     """
     model, graph = _compile(spec, name)
     actuator_of_joint = _actuator_of_joint(model)
@@ -149,13 +136,11 @@ def _actuator_of_joint(model: mujoco.MjModel) -> np.ndarray:
     return actuators
 
 
-def _refuse_non_finite(
-    static: StaticGraph, name: str, node_names: tuple[str, ...], joint_names: tuple[str, ...]
-) -> None:
+def _refuse_non_finite(static: StaticGraph, name: str, nodes: tuple[str, ...], joints: tuple[str, ...]) -> None:
     """Raise for NaN and infinity (damping="nan"), which MuJoCo compiles with only a warning."""
     parts = (
-        (static.nodes, static.node_names, [f"body {node!r}" for node in node_names]),
-        (static.edges, static.edge_names, [f"joint {joint!r}" for joint in joint_names for _ in range(2)]),
+        (static.nodes, static.node_names, [f"body {node!r}" for node in nodes]),
+        (static.edges, static.edge_names, [f"joint {joint!r}" for joint in joints for _ in range(2)]),
         (static.globals_[None], static.global_names, ["the options"]),
     )
     for values, features, owners in parts:
@@ -181,9 +166,8 @@ def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
 
 def _attachments(model: mujoco.MjModel, graph: Topology) -> dict[str, Attachment]:
     attachments = {}
-    for body in range(1, model.nbody):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body)
+    for body in np.setdiff1d(range(1, model.nbody), graph.body).tolist():
         node = int(graph.node_of_body[body])
-        if name and body != graph.body[node]:
+        if name := mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body):
             attachments[name] = Attachment(node, *offset(model, body, int(graph.body[node])))
     return attachments

@@ -41,7 +41,7 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
     """
     of_geom = graph.node_of_body[model.geom_bodyid]
     for plane in np.flatnonzero((model.geom_type == _GEOM.mjGEOM_PLANE) & (of_geom == 0)):
-        nodes, offsets, radii = [], [], []
+        spheres = []
         for geom in np.flatnonzero(of_geom > 0):
             if not can_collide(model, int(plane), int(geom)):
                 continue
@@ -49,14 +49,11 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
             root = graph.body[node]
             rotation, frame = data.geom_xmat[geom].reshape(3, 3), data.xmat[root].reshape(3, 3)
             for point, radius in _spheres(int(model.geom_type[geom]), model.geom_size[geom]):
-                nodes.append(node)
-                offsets.append(frame.T @ (data.geom_xpos[geom] + rotation @ point - data.xpos[root]))
-                radii.append(radius)
-        if nodes:
-            normal = data.geom_xmat[plane].reshape(3, 3)[:, 2]
-            return ContactPoints(
-                np.array(nodes), np.array(offsets), np.array(radii), normal.copy(), data.geom_xpos[plane].copy()
-            )
+                spheres.append((node, frame.T @ (data.geom_xpos[geom] + rotation @ point - data.xpos[root]), radius))
+        if spheres:
+            nodes, offsets, radii = (np.array(column) for column in zip(*spheres, strict=True))
+            normal, origin = data.geom_xmat[plane, 2::3].copy(), data.geom_xpos[plane].copy()
+            return ContactPoints(nodes, offsets, radii, normal, origin)
     return None
 
 
@@ -77,8 +74,8 @@ def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
 
 def contact_slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Offsets ``[N, 4, 3]``, radii ``[N, 4]`` and mask ``[N, 4]`` of the kept points."""
-    offset, radius = np.zeros((scene.num_nodes, SLOTS, 3)), np.zeros((scene.num_nodes, SLOTS))
-    mask, points = np.zeros((scene.num_nodes, SLOTS), dtype=bool), scene.contact_points
+    shape, points = (scene.num_nodes, SLOTS), scene.contact_points
+    offset, radius, mask = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape, dtype=bool)
     if points is None:
         return offset, radius, mask
     for node in np.unique(points.node):
@@ -86,7 +83,6 @@ def contact_slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         reach = np.linalg.norm(points.offset[here], axis=1) + points.radius[here]
         # Rounded, so that equally far points keep their order in every variant of a scene.
         chosen = here[np.argsort(-reach.round(9), kind="stable")[:SLOTS]]
-        offset[node, : len(chosen)] = points.offset[chosen]
-        radius[node, : len(chosen)] = points.radius[chosen]
-        mask[node, : len(chosen)] = True
+        slots = node, slice(len(chosen))
+        offset[slots], radius[slots], mask[slots] = points.offset[chosen], points.radius[chosen], True
     return offset, radius, mask

@@ -43,11 +43,6 @@ _FLEXES = (
 )
 
 
-def fingerprint(scene: Scene) -> str:
-    """Hash of :func:`physics`."""
-    return hashlib.sha256("\n".join(physics(scene)).encode()).hexdigest()[:16]
-
-
 def physics(scene: Scene) -> list[str]:
     """List every element and quantity, one a line, numbers to six significant digits."""
     model, graph = scene.model, topology(scene.model)

@@ -1,6 +1,8 @@
-"""Translation invariance: world axes along which a scene can shift without changing its dynamics."""
+"""Invariances: shifts and rotations of a scene that leave its dynamics unchanged, and what can move at all."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -24,14 +26,11 @@ def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Top
 def _invariant_along(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
     if model.nplugin or model.nflex:
         return False
-    shifted: set[int] = set()  # joints whose displacement shifts the scene
-    for node in np.flatnonzero(graph.parent == 0):
-        joints = _joints_along(model, int(graph.body[node]), axis)
-        if joints is None:
-            return False
-        shifted.update(joints)
+    shifting = [_joints_along(model, int(root), axis) for root in graph.body[graph.parent == 0]]
+    shifted = {joint for joints in shifting for joint in joints or ()}  # joints whose displacement shifts the scene
     return (
-        not any(depends_on_position(model, joint) for joint in shifted)
+        None not in shifting
+        and not any(depends_on_position(model, joint) for joint in shifted)
         and not collides_with_world(model, data, graph, axis)
         and not acts_on_position(model, graph, shifted)
     )
@@ -39,8 +38,7 @@ def _invariant_along(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology
 
 def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[int] | None:
     """Joints that shift a root body along ``axis``; None if it cannot move along it."""
-    slides, directions = [], []
-    frame = reference_rotation(model, body)
+    slides, frame = [], reference_rotation(model, body)
     first = model.body_jntadr[body]
     for joint in range(first, first + model.body_jntnum[body]):
         kind = mujoco.mjtJoint(model.jnt_type[joint])
@@ -49,10 +47,9 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
         if kind != mujoco.mjtJoint.mjJNT_SLIDE:
             break  # this joint rotates the axes of later slides
         slides.append(joint)
-        directions.append(frame @ model.jnt_axis[joint])
     if not slides:
         return None
-    matrix = np.array(directions).T  # [3, slides]
+    matrix = np.array([frame @ model.jnt_axis[joint] for joint in slides]).T  # [3, slides]
     amounts = np.linalg.lstsq(matrix, axis, rcond=None)[0]
     if np.abs(matrix @ amounts - axis).max() > _TOLERANCE:
         return None
@@ -89,15 +86,12 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
 
 def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray | None) -> bool:
     """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis``."""
-    if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
-        return False
     fixed = graph.node_of_body[model.geom_bodyid] == 0
     for other in np.flatnonzero(fixed):
         normal = data.geom_xmat[other].reshape(3, 3)[:, 2]
         plane = model.geom_type[other] == mujoco.mjtGeom.mjGEOM_PLANE
-        if plane and axis is not None and abs(normal @ axis) < _TOLERANCE:
-            continue
-        if any(can_collide(model, int(other), int(moving)) for moving in np.flatnonzero(~fixed)):
+        parallel = plane and axis is not None and abs(normal @ axis) < _TOLERANCE
+        if not parallel and any(can_collide(model, int(other), int(moving)) for moving in np.flatnonzero(~fixed)):
             return True
     return False
 
@@ -143,3 +137,97 @@ def _equality_acts(model: mujoco.MjModel, graph: Topology, equality: int, joints
         bodies = [int(model.site_bodyid[end]) if sites else end for end in ends]
         return any(graph.node_of_body[body] == 0 for body in bodies)
     return kind != mujoco.mjtEq.mjEQ_TENDON  # a tendon's ends are checked with the tendon
+
+
+@dataclass(frozen=True, eq=False)
+class YawFrame:
+    """Yaw of a rotation-invariant scene: the rotation of its root about a world axis."""
+
+    exact: bool  # False if moving geoms can touch fixed ones, so that contacts depend on the yaw
+    node: int  # root node
+    axis: int  # 0, 1 or 2 for the world's x, y or z
+    pivot: np.ndarray  # [3] a point on the axis, metres; 0 if the scene is translation-invariant across it
+    rest: np.ndarray  # [4] the root's orientation at yaw 0
+
+
+def find_yaw_frame(
+    model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, movable: np.ndarray, translation_invariant: np.ndarray
+) -> YawFrame | None:
+    """Yaw frame of a scene, or None if its dynamics depend on the yaw other than by contacts.
+
+    The scene must be one tree whose root has slides, if any, then a hinge about a world axis. Gravity and wind must be
+    parallel to that axis. No limit, spring, tendon, equality constraint or position actuator may depend on the hinge,
+    and slides across the axis must be alike and without motors. ``data`` must be at its reference, kinematics done.
+    """
+    roots = np.flatnonzero(graph.parent == 0)
+    if len(roots) != 1 or model.nplugin or model.nflex:
+        return None
+    node = int(roots[0])
+    body = int(graph.body[node])
+    first = int(model.body_jntadr[body])
+    *slides, hinge = range(first, first + int(model.body_jntnum[body]))
+    kinds = [*[mujoco.mjtJoint.mjJNT_SLIDE] * len(slides), mujoco.mjtJoint.mjJNT_HINGE]
+    if model.jnt_type[[*slides, hinge]].tolist() != list(map(int, kinds)) or depends_on_position(model, hinge):
+        return None
+    rest = reference_rotation(model, body)
+    directions = np.abs(rest @ model.jnt_axis[hinge])
+    axis = int(directions.argmax())
+    if abs(directions[axis] - 1) > _TOLERANCE:
+        return None
+    across = [index for index in range(3) if index != axis]
+    flow = model.opt.wind if model.opt.density or model.opt.viscosity else np.zeros(3)
+    weight = np.zeros(3) if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY else model.opt.gravity
+    if np.abs(flow[across]).max() > _TOLERANCE or np.abs(weight[across]).max() > _TOLERANCE:
+        return None
+    lateral = [slide for slide in slides if abs((rest @ model.jnt_axis[slide])[axis]) < 1 - _TOLERANCE]
+    if lateral and not (_isotropic(model, lateral, rest, across) and translation_invariant[across].all()):
+        return None
+    if acts_on_position(model, graph, {hinge, *lateral}):
+        return None
+    vectors = movable.reshape(len(movable), 4, 3)
+    if not np.array_equal(vectors[..., across[0]], vectors[..., across[1]]):
+        return None
+    pivot = np.zeros(3) if lateral else data.xanchor[hinge].copy()
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, rest.ravel())
+    return YawFrame(not collides_with_world(model, data, graph, None), node, axis, pivot, quat)
+
+
+def _isotropic(model: mujoco.MjModel, slides: list[int], rest: np.ndarray, across: list[int]) -> bool:
+    """Whether slides span the plane across the axis orthogonally, with equal passive forces and no motors."""
+    directions = np.array([(rest @ model.jnt_axis[slide])[across] for slide in slides])
+    if directions.shape != (2, 2) or np.abs(directions @ directions.T - np.eye(2)).max() > _TOLERANCE:
+        return False
+    if np.isin(model.actuator_trnid[:, 0], slides).any():
+        return False
+    dofs = model.jnt_dofadr[slides]
+    names = ("dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss")
+    table = [getattr(model, name) for name in names if hasattr(model, name)]  # MuJoCo before 3.7 has no dampingpoly
+    return all(np.array_equal(values[dofs[0]], values[dofs[1]]) for values in table)
+
+
+def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray, *, samples: int = 8) -> np.ndarray:
+    """Mask ``[N, 12]`` of movable components for root bodies ``[N]``; ``data`` is overwritten.
+
+    Components, world frame: position 3, rotation vector 3, linear velocity 3, angular velocity 3. A row of the body
+    Jacobian that vanishes at random configurations vanishes everywhere. Constraints are ignored.
+    """
+    rng = np.random.default_rng(0)
+    largest = np.zeros((len(body), 6))  # largest entry of every Jacobian row
+    jacobian = np.zeros((6, model.nv))
+    free, ball = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+    joints = zip(model.jnt_type, model.jnt_qposadr, strict=True)
+    orientations = [start + 3 * (kind == free) for kind, start in joints if kind in (free, ball)]
+    for _ in range(samples):
+        # Also beyond limits, which do not change the rows that vanish.
+        data.qpos[:] = rng.uniform(-np.pi, np.pi, model.nq)
+        for start in orientations:
+            quat = rng.normal(size=4)
+            data.qpos[start : start + 4] = quat / np.linalg.norm(quat)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        for node, body_id in enumerate(body):
+            mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], int(body_id))
+            largest[node] = np.maximum(largest[node], np.abs(jacobian).max(axis=1, initial=0.0))
+    moves = largest > _TOLERANCE
+    return np.concatenate([moves, moves], axis=1)

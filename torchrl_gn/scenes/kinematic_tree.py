@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
 
-from torchrl_gn.scenes.joint_anchors import JointAnchors
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import StaticGraph
+from torchrl_gn.scenes.topology import JointAnchors
+
+_BOUNDS = (("action_low", -np.inf), ("action_high", np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,10 +22,8 @@ class KinematicTree:
     """Kinematic tree of a robot known by its joint encoders (paper, SM "Real JACO").
 
     Node 0 is the base, the others the joints' bodies; node states follow :func:`~torchrl_gn.maths.joint_layout`. Takes
-    the place of a :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors.
-
-    Raises:
-        ValueError: if there is no joint, or an argument does not fit.
+    the place of a :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors. ValueError if there is no
+    joint, or an argument does not fit.
     """
 
     name: str
@@ -38,10 +39,11 @@ class KinematicTree:
     contact_points = None
 
     def __post_init__(self) -> None:
+        settle = partial(object.__setattr__, self)
         # JSON takes no NumPy numbers.
-        object.__setattr__(self, "timestep", float(self.timestep))
-        object.__setattr__(self, "commands", tuple(tuple(map(int, indices)) for indices in self.commands))
-        object.__setattr__(self, "joint_parents", tuple(map(int, self.joint_parents)))
+        settle("timestep", float(self.timestep))
+        settle("commands", tuple(tuple(map(int, indices)) for indices in self.commands))
+        settle("joint_parents", tuple(map(int, self.joint_parents)) or tuple(range(-1, self.num_joints - 1)))
         if not self.joint_names or len(self.commands) != len(self.joint_names):
             raise ValueError(
                 f"Robot {self.name!r} needs at least one joint, and commands for each; got"
@@ -51,41 +53,35 @@ class KinematicTree:
             raise ValueError(f"commands={self.commands} of {self.name!r} must be indices from 0.")
         if not 0 < self.timestep < np.inf:
             raise ValueError(f"timestep={self.timestep} of {self.name!r} must be positive.")
-        if not self.joint_parents:
-            object.__setattr__(self, "joint_parents", tuple(range(-1, self.num_joints - 1)))
         if len(self.joint_parents) != self.num_joints or any(
             not -1 <= before < joint for joint, before in enumerate(self.joint_parents)
         ):
             raise ValueError(
                 f"joint_parents={self.joint_parents} of {self.name!r} must be an earlier joint, or -1, for each joint."
             )
-        for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
+        for which, infinite in _BOUNDS:
             count = len(getattr(self, which))
-            if count == 0:
-                object.__setattr__(self, which, np.full(self.num_actions, infinite))
-            elif count != self.num_actions:
+            if count not in (0, self.num_actions):
                 raise ValueError(
                     f"{which} of {self.name!r} must be [{self.num_actions}], one a command, got [{count}]."
                 )
+            if count == 0:
+                settle(which, np.full(self.num_actions, infinite))
 
     @property
     def num_joints(self) -> int:
-        """Number of joints ``J``."""
         return len(self.joint_names)
 
     @property
     def num_nodes(self) -> int:
-        """Number of nodes ``N``: base and bodies."""
         return self.num_joints + 1
 
     @property
     def num_edges(self) -> int:
-        """Number of directed edges ``E``, two for each joint."""
         return 2 * self.num_joints
 
     @property
     def num_actions(self) -> int:
-        """Number of commands ``A``."""
         return 1 + max((index for indices in self.commands for index in indices), default=-1)
 
     @property
@@ -95,7 +91,6 @@ class KinematicTree:
 
     @property
     def node_names(self) -> tuple[str, ...]:
-        """Names of base and bodies, the latter after their joints."""
         return ("base", *self.joint_names)
 
     @property
@@ -127,7 +122,6 @@ class KinematicTree:
 
     @property
     def predicted(self) -> np.ndarray:
-        """``[N]`` bool: all nodes but the base."""
         return np.any(self.movable, axis=1)
 
     @property
@@ -144,46 +138,31 @@ class KinematicTree:
     @property
     def static(self) -> StaticGraph:
         """Static graph: one-hot node and joint, and direction of edges."""
-        one_hot = np.eye(self.num_nodes)
-        edges = np.repeat(np.eye(self.num_joints), 2, axis=0)
         direction = np.tile([1.0, -1.0], self.num_joints)[:, None]
-        return StaticGraph(
-            nodes=one_hot,
-            edges=np.concatenate((direction, edges), 1),
-            globals_=np.zeros(0),
-            node_names=tuple(f"is_{name}" for name in self.node_names),
-            edge_names=("direction", *(f"is_{name}" for name in self.joint_names)),
-            global_names=(),
-        )
+        edges = np.concatenate((direction, np.repeat(np.eye(self.num_joints), 2, axis=0)), 1)
+        names = tuple(f"is_{name}" for name in self.node_names)
+        return StaticGraph(np.eye(self.num_nodes), edges, np.zeros(0), names, ("direction", *names[1:]), ())
 
     def values(self) -> PhysicalParameters:
         """Physical parameters: static features, and zeros for those of bodies in space."""
-        n, e = self.num_nodes, self.num_edges
-        static = self.static
+        n, e, static = self.num_nodes, self.num_edges, self.static
         arrays = (static.nodes, static.edges, static.globals_, np.zeros((e, 3)), np.array([1.0, 0, 0, 0]), np.zeros(3))
         arrays += (np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 3)), np.zeros((n, 0)))
         return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     def description(self) -> dict:
         """JSON-able values from which :func:`~torchrl_gn.scenes.scene_from_description` rebuilds it."""
-        tree = {
-            "name": self.name,
-            "joint_names": list(self.joint_names),
-            "timestep": self.timestep,
-            "commands": [list(indices) for indices in self.commands],
-            "extras": list(self.extras),
-            "joint_parents": list(self.joint_parents),
-            # JSON has no infinity.
-            "action_low": [None if np.isinf(value) else float(value) for value in self.action_low],
-            "action_high": [None if np.isinf(value) else float(value) for value in self.action_high],
-        }
+        tree = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        tree["commands"] = [list(indices) for indices in self.commands]
+        for which, _ in _BOUNDS:  # JSON has no infinity
+            tree[which] = [None if np.isinf(value) else float(value) for value in tree[which]]
         return {"kinematic_tree": tree, "fingerprint": self.fingerprint()}
 
     @classmethod
     def from_description(cls, description: dict) -> KinematicTree:
         """Rebuild from :meth:`description`."""
         tree = dict(description["kinematic_tree"])
-        for which, infinite in (("action_low", -np.inf), ("action_high", np.inf)):
+        for which, infinite in _BOUNDS:
             tree[which] = np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
         for which in ("joint_names", "extras"):
             tree[which] = tuple(tree[which])
@@ -196,9 +175,8 @@ class KinematicTree:
         return hashlib.sha256("\n".join((*text, *self.extras, *bounds)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
-        lines = [
-            f"Robot {self.name}: {self.num_joints} joints, {self.num_actions} commands, step {1e3 * self.timestep:g} ms"
-        ]
+        joints, commands, step = self.num_joints, self.num_actions, 1e3 * self.timestep
+        lines = [f"Robot {self.name}: {joints} joints, {commands} commands, step {step:g} ms"]
         for name, indices, before in zip(self.joint_names, self.commands, self.joint_parents, strict=True):
             acting = ", ".join(map(str, indices)) or "none"
             lines.append(f"  {name}, parent {self.node_names[before + 1]}: commands {acting}")
@@ -208,8 +186,7 @@ class KinematicTree:
 def tree_states(angle: np.ndarray, velocity: np.ndarray, extras: Sequence[np.ndarray] = ()) -> np.ndarray:
     """Node states ``[..., J + 1, 3 + extras]``, float64, from angles and velocities ``[..., J]`` (radians, rad/s).
 
-    Cosine and sine of the angle, velocity, and ``extras`` ``[..., J]``, in the order of :attr:`KinematicTree.extras`;
-    the base's are 1, 0, 0, ...
+    Cosine and sine of the angle, velocity, and ``extras`` ``[..., J]`` in the tree's order; the base's are 1, 0, 0, ...
     """
     bodies = np.stack((np.cos(angle), np.sin(angle), velocity, *extras), axis=-1).astype(np.float64)
     base = np.zeros((*bodies.shape[:-2], 1, bodies.shape[-1]))

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import base64
 import difflib
 import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
+from xml.etree import ElementTree
 
 import mujoco
 
 from torchrl_gn.scenes.build import build_scene
-from torchrl_gn.scenes.errors import SceneChangedWarning
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
-from torchrl_gn.scenes.mjcf_source import is_mjcf_text, read_mjcf, rebuild_mjcf
-from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
-from torchrl_gn.scenes.variants import make_variant
+from torchrl_gn.scenes.variants import build_system, make_variant
 
 
 def load_scene(
@@ -39,8 +39,7 @@ def load_scene(
             others are the standard system's.
 
     Raises:
-        ValueError: if the name or a parameter is unknown.
-        FileNotFoundError: if the file does not exist.
+        ValueError: if the name or a parameter is unknown; FileNotFoundError if the file does not exist.
         SceneError: if the MJCF is invalid or ``timestep`` does not fit.
         UnsupportedSceneError: if the graph cannot represent an element, which the message names.
     """
@@ -53,28 +52,19 @@ def load_scene(
         raise TypeError("load_scene needs MJCF, not a compiled MjModel; give its file, text or MjSpec.")
     if not isinstance(source, (str, os.PathLike)):
         raise TypeError(f"load_scene takes a name, a path, MJCF text or an MjSpec, got {type(source).__name__}.")
-    if isinstance(source, str) and not is_mjcf_text(source):
+    if isinstance(source, str) and not _is_mjcf(source):
         system = find_system(source)
         if system is not None:
-            return build_scene(
-                system.build(),
-                name=name or system.name,
-                timestep=system.timestep if timestep is None else timestep,
-                settle_steps=system.settle_steps,
-                origin={"system": system.name},
-            )
+            return build_system(system, system.build(), name, timestep)
         if not (source.endswith((".xml", ".mjcf")) or set("/\\") & set(source) or Path(source).is_file()):
             raise ValueError(_unknown(source))
-    spec, origin = read_mjcf(source if isinstance(source, str) else Path(source))
-    own_name = spec.modelname if isinstance(source, str) and is_mjcf_text(source) else Path(source).stem
+    spec, origin = _read_mjcf(source if isinstance(source, str) else Path(source))
+    own_name = spec.modelname if isinstance(source, str) and _is_mjcf(source) else Path(source).stem
     return build_scene(spec, name=name or own_name, timestep=timestep, origin=origin)
 
 
 def scene_from_description(description: dict) -> Scene:
-    """Rebuild the scene of a :meth:`Scene.description`.
-
-    Warns SceneChangedWarning if its physics differ, as with another version of MuJoCo or of the model files.
-    """
+    """Rebuild the scene of a :meth:`Scene.description`; SceneChangedWarning if its physics differ here."""
     if "kinematic_tree" in description:
         # It has every attribute of a scene that models and errors read.
         return cast(Scene, KinematicTree.from_description(description))
@@ -87,7 +77,7 @@ def scene_from_description(description: dict) -> Scene:
     else:
         keys = ("system",) if system else ("mjcf", "assets")
         scene = build_scene(
-            system.build() if system else rebuild_mjcf(description),
+            system.build() if system else _rebuild_mjcf(description),
             name=name,
             timestep=timestep,
             settle_steps=description["settle_steps"],
@@ -111,3 +101,63 @@ def _unknown(name: str) -> str:
         f"Unknown scene {name!r}.{hint} Known systems: {', '.join(names)} (N of at least 3); "
         "or give the path of an MJCF file."
     )
+
+
+def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
+    """Parse an MJCF file or text; also return ``{"mjcf": text, "assets": {path: base64}}``, which rebuilds it."""
+    path = None if isinstance(source, str) and _is_mjcf(source) else Path(source)
+    if path is not None and not path.is_file():
+        raise FileNotFoundError(f"MJCF file not found: {path}")
+    try:
+        kind = mujoco.MjSpec
+        spec = kind.from_string(str(source)) if path is None else kind.from_file(str(path))
+    except ValueError as error:
+        label = "string" if path is None else f"file {path}"
+        raise SceneError(f"MuJoCo cannot read the MJCF {label}: {error}") from error
+    text, folder = (str(source), Path()) if path is None else (path.read_text(), path.parent)
+    return spec, {"mjcf": _inline(text, folder), "assets": _assets(spec, folder)}
+
+
+def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
+    """Parse what :func:`_read_mjcf` stored."""
+    assets = {name: base64.b64decode(content) for name, content in origin["assets"].items()}
+    return mujoco.MjSpec.from_string(origin["mjcf"], assets=assets)
+
+
+def _is_mjcf(source: str) -> bool:
+    """Whether a string is MJCF text rather than a name or a path."""
+    return source.lstrip().startswith("<")
+
+
+def _inline(text: str, folder: Path) -> str:
+    """Replace every ``<include file=.../>`` by the content of its file."""
+    if "<include" not in text:
+        return text
+    root = ElementTree.fromstring(text)
+    _inline_children(root, folder)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _inline_children(element: ElementTree.Element, folder: Path) -> None:
+    children = list(element)
+    element[:] = []
+    for child in children:
+        included = child.tag == "include"  # always relative to the main file
+        if included:
+            child = ElementTree.parse(folder / child.attrib["file"]).getroot()
+        _inline_children(child, folder)
+        element.extend(list(child) if included else [child])
+
+
+def _assets(spec: mujoco.MjSpec, folder: Path) -> dict[str, str]:
+    """Encode the files that a model reads, by the path under which MuJoCo asks for them."""
+    textures = [texture.file for texture in spec.textures]
+    textures += [file for texture in spec.textures for file in texture.cubefiles]
+    wanted = [(spec.meshdir, mesh.file) for mesh in [*spec.meshes, *spec.hfields, *spec.skins]]
+    wanted += [(spec.texturedir, file) for file in textures]
+    assets = {}
+    for directory, file in wanted:
+        path = folder / directory / file
+        if file and path.is_file():
+            assets[str(Path(directory, file))] = base64.b64encode(path.read_bytes()).decode("ascii")
+    return assets

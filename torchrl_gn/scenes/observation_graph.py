@@ -22,9 +22,8 @@ class ObservationGraph:
     observation, ``"joints[0]"`` one number of it, ``"body_velocities[3:6]"`` several. Every number has exactly one
     place; nodes and joints with fewer numbers than others are padded with zeros.
 
-    Raises:
-        ValueError: if an entry is unknown or used other than once, a joint names an unknown node, the joints do not
-            form trees, or an action has no place.
+    Raises ValueError if an entry is unknown or used other than once, a joint names an unknown node, the joints do not
+    form trees, or an action has no place.
     """
 
     name: str  # of the task, for messages
@@ -36,22 +35,22 @@ class ObservationGraph:
     identity: bool = False  # show networks each node's index, one-hot; not for graphs of several sizes
 
     def __post_init__(self) -> None:
-        for index, node in enumerate(self.node_names):
-            ancestor = index
-            for _ in self.nodes:
-                ancestor = self.parent[ancestor] if ancestor >= 0 else -1
-            if ancestor >= 0:
-                raise ValueError(f"Joints of {self.name!r} form a cycle at {node!r}; they must form trees.")
-        used = np.bincount([*self.node_entries[self.node_entries >= 0], *self.global_entries], minlength=1)
-        used = np.pad(used, (0, max(0, self.num_observations - len(used))))
+        ancestor = np.arange(self.num_nodes)
+        for _ in self.nodes:
+            ancestor = np.append(self.parent, -1)[ancestor]
+        for node in np.flatnonzero(ancestor >= 0):
+            raise ValueError(
+                f"Joints of {self.name!r} form a cycle at {self.node_names[node]!r}; they must form trees."
+            )
+        names = [f"{name}[{index}]" for name, size in self.observation.items() for index in range(size)]
+        used = np.bincount([*self.node_entries[self.node_entries >= 0], *self.global_entries], minlength=len(names))
         for wrong, what in ((used == 0, "has no place in"), (used > 1, "is used twice in")):
-            if wrong[: self.num_observations].any():
-                raise ValueError(f"{self._entry_name(int(wrong.argmax()))!r} {what} the graph of {self.name!r}.")
+            if wrong.any():
+                raise ValueError(f"{names[wrong.argmax()]!r} {what} the graph of {self.name!r}.")
         acting = sorted(index for indices in self.actions.values() for index in indices)
         if acting != list(range(len(acting))):
             raise ValueError(f"Actions of {self.name!r} must be 0, 1, ... and each at one joint, got {acting}.")
-        unknown = [joint for joint in self.actions if joint not in self.joints]
-        if unknown:
+        if unknown := [joint for joint in self.actions if joint not in self.joints]:
             raise ValueError(f"Actions of {self.name!r} are at {unknown}, which are none of its joints.")
 
     @classmethod
@@ -80,22 +79,18 @@ class ObservationGraph:
 
     @property
     def node_names(self) -> tuple[str, ...]:
-        """Names of the ``N`` nodes."""
         return tuple(self.nodes)
 
     @property
     def num_nodes(self) -> int:
-        """Number of nodes ``N``."""
         return len(self.nodes)
 
     @property
     def num_edges(self) -> int:
-        """Number of directed edges ``E``, two a joint."""
         return 2 * len(self.joints)
 
     @property
     def num_actions(self) -> int:
-        """Number of actions ``A``."""
         return sum(map(len, self.actions.values()))
 
     @cached_property
@@ -134,10 +129,8 @@ class ObservationGraph:
     def node_entries(self) -> np.ndarray:
         """``[N, F_n + F_j]`` observation index of each node's features, then of its joint's; -1 is padding."""
         own = [self._find(entries) for entries in self.nodes.values()]
-        joints: list[list[int]] = [[] for _ in own]
-        for node, entries in zip(self.moved, self.joints.values(), strict=True):
-            joints[node] = self._find(entries)
-        return np.concatenate((_padded(own), _padded(joints)), axis=1)
+        joints = self._at_children([self._find(entries) for entries in self.joints.values()])
+        return np.concatenate((_padded(own), joints), axis=1)
 
     @cached_property
     def num_node_features(self) -> int:
@@ -157,10 +150,11 @@ class ObservationGraph:
     @cached_property
     def node_actions(self) -> np.ndarray:
         """``[N, C]`` actions at the joint whose child each node is; -1 is padding."""
-        acting: list[list[int]] = [[] for _ in self.nodes]
-        for node, joint in zip(self.moved, self.joints, strict=True):
-            acting[node] = list(self.actions.get(joint, ()))
-        return _padded(acting)
+        return self._at_children([list(self.actions.get(joint, ())) for joint in self.joints])
+
+    def _at_children(self, rows: list[list[int]]) -> np.ndarray:
+        row_of_node = dict(zip(self.moved.tolist(), rows, strict=True))
+        return _padded([row_of_node.get(node, []) for node in range(self.num_nodes)])
 
     @cached_property
     def observation_at(self) -> np.ndarray:
@@ -190,13 +184,6 @@ class ObservationGraph:
             found += range(starts[match[1]] + first, starts[match[1]] + last)
         return found
 
-    def _entry_name(self, index: int) -> str:
-        for name, size in self.observation.items():
-            if index < size:
-                return f"{name}[{index}]"
-            index -= size
-        raise IndexError(index)
-
     def description(self) -> dict:
         """JSON-able values from which :meth:`from_description` rebuilds the graph."""
         return {
@@ -211,10 +198,7 @@ class ObservationGraph:
 
     @classmethod
     def from_description(cls, description: dict) -> ObservationGraph:
-        """Rebuild from :meth:`description`; ``globals``, ``actions`` and ``identity`` are optional.
-
-        Raises ValueError if a key is missing, unknown or declared twice, or the values make no graph.
-        """
+        """Rebuild from :meth:`description`; ValueError if a key is missing or unknown, or the values make no graph."""
         needed, optional = ["name", "observation", "nodes", "joints"], ["globals", "actions", "identity"]
         for wrong, what in (
             ([key for key in needed if key not in description], "lacks"),

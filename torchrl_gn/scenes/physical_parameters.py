@@ -1,17 +1,21 @@
-"""Physical parameters, which differ between the variants of a scene, and the topology they share."""
+"""Physical parameters, which differ between the variants of a scene; their names, and the topology they share."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchrl_gn.scenes.contact_points import contact_slots
-from torchrl_gn.scenes.joint_axes import joint_axes
 from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.static_features import is_member
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes.kinematic_tree import KinematicTree
@@ -36,20 +40,12 @@ class PhysicalParameters(NamedTuple):
         """Parameters of a scene."""
         if not isinstance(scene, Scene):
             return scene.values()
-        yaw_frame, (offset, radius, _) = scene.yaw_frame, contact_slots(scene)
-        values = {
-            "nodes": scene.static.nodes,
-            "edges": scene.static.edges,
-            "globals_": scene.static.globals_,
-            "joint_axis": joint_axes(scene)[1].repeat(2, axis=0),
-            "rest": np.array([1.0, 0.0, 0.0, 0.0]) if yaw_frame is None else yaw_frame.rest,
-            "pivot": np.zeros(3) if yaw_frame is None else yaw_frame.pivot,
-            "parent_anchor": scene.joint_anchors.parent_anchor,
-            "child_anchor": scene.joint_anchors.child_anchor,
-            "contact_offset": offset,
-            "contact_radius": radius,
-        }
-        return cls(**{name: torch.as_tensor(value, dtype=torch.float64) for name, value in values.items()})
+        static, anchors, yaw_frame = scene.static, scene.joint_anchors, scene.yaw_frame
+        identity = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+        rest, pivot = identity if yaw_frame is None else (yaw_frame.rest, yaw_frame.pivot)
+        arrays = (static.nodes, static.edges, static.globals_, joint_axes(scene)[1].repeat(2, axis=0), rest, pivot)
+        arrays += (anchors.parent_anchor, anchors.child_anchor, *contact_slots(scene)[:2])
+        return cls(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     @classmethod
     def read(cls, static: TensorDictBase, own: PhysicalParameters) -> PhysicalParameters:
@@ -67,7 +63,6 @@ class PhysicalParameters(NamedTuple):
         return cls(**values)
 
     def tensordict(self) -> TensorDict:
-        """A TensorDict without batch."""
         return TensorDict(self._asdict())
 
 
@@ -86,3 +81,79 @@ def topology(scene: Scene) -> dict[str, object]:
         "joint axes": joint_axes(scene)[0].tolist(),
         "contact points": contact_slots(scene)[2].tolist(),
     }
+
+
+def joint_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Node ``[J]`` that each joint's axis is fixed to, and the unit axis ``[J, 3]`` in its frame.
+
+    The node is the parent if no rotation precedes the joint on its body, else the child (approximate for the middle one
+    of three hinges). Axes of balls and free joints are 0.
+    """
+    model, kind = scene.model, mujoco.mjtJoint
+    nodes, axes = scene.receivers[::2].copy(), np.zeros((model.njnt, 3))
+    rotated: set[int] = set()
+    for joint in range(model.njnt):
+        body = int(model.jnt_bodyid[joint])
+        if model.jnt_type[joint] not in (int(kind.mjJNT_HINGE), int(kind.mjJNT_SLIDE)):
+            rotated.add(body)
+            continue
+        axes[joint] = model.jnt_axis[joint]
+        if body not in rotated:
+            child = nodes[joint]
+            nodes[joint] = scene.senders[2 * joint]
+            rest = scene.static.nodes[child, [scene.static.node_names.index(f"quat[{index}]") for index in range(4)]]
+            mujoco.mju_rotVecQuat(axes[joint], model.jnt_axis[joint], rest)
+        if model.jnt_type[joint] == int(kind.mjJNT_HINGE):
+            rotated.add(body)
+    return nodes, axes
+
+
+@dataclass(frozen=True)
+class ParameterNames:
+    """Names of the physical-parameter columns of a scene, a data set or a model, which outlive changes of columns."""
+
+    nodes: tuple[str, ...] = ()
+    edges: tuple[str, ...] = ()
+    globals_: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, scene: Scene) -> ParameterNames:
+        """Names of a scene."""
+        static = scene.static
+        return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
+
+    @classmethod
+    def from_names(cls, names: Mapping[str, Sequence[str]]) -> ParameterNames:
+        """Restore from ``dataclasses.asdict``, also after JSON."""
+        return cls(**{part: tuple(columns) for part, columns in names.items()})
+
+    def common(self, other: ParameterNames) -> ParameterNames:
+        """Names that ``other`` has too, in the order of this set."""
+        others = asdict(other)
+        return ParameterNames(
+            **{part: tuple(name for name in names if name in others[part]) for part, names in asdict(self).items()}
+        )
+
+    def missing_in(self, other: ParameterNames) -> list[str]:
+        """List the names that ``other`` lacks, ignoring types and flags of another MuJoCo version."""
+        others = asdict(other)
+        own = asdict(self).items()
+        return [name for part, names in own for name in names if name not in others[part] and not is_member(name)]
+
+    def columns_in(self, other: ParameterNames) -> dict[str, list[int]]:
+        """Each name's column in ``other``, by part, for :func:`take_columns`; -1 where missing."""
+        columns = {part: {name: column for column, name in enumerate(names)} for part, names in asdict(other).items()}
+        return {part: [columns[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
+
+    def select(self, scene: Scene) -> PhysicalParameters:
+        """Physical parameters with these columns alone, unknown types and flags 0; ValueError if one is missing."""
+        values, available = PhysicalParameters.of(scene), ParameterNames.of(scene)
+        if missing := self.missing_in(available):
+            raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")
+        columns = self.columns_in(available)
+        return values._replace(**{part: take_columns(getattr(values, part), columns[part]) for part in columns})
+
+
+def take_columns(values: Tensor, columns: Sequence[int] | Tensor) -> Tensor:
+    """Select columns of ``[..., F]``; column -1 gives zeros."""
+    return pad(values, (0, 1))[..., torch.as_tensor(columns, dtype=torch.long)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -9,10 +10,21 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.contact_points import ContactPoints
-from torchrl_gn.scenes.errors import SceneError
-from torchrl_gn.scenes.fingerprint import fingerprint
-from torchrl_gn.scenes.joint_anchors import JointAnchors
-from torchrl_gn.scenes.yaw_frame import YawFrame
+from torchrl_gn.scenes.fingerprint import physics
+from torchrl_gn.scenes.invariance import YawFrame
+from torchrl_gn.scenes.topology import JointAnchors
+
+
+class SceneError(ValueError):
+    """A model cannot be read as a scene."""
+
+
+class UnsupportedSceneError(SceneError):
+    """The graph cannot represent an element of a valid MuJoCo model."""
+
+
+class SceneChangedWarning(UserWarning):
+    """A scene rebuilt from its description has other physics than the original."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +86,10 @@ class Scene:
 
     @property
     def num_edges(self) -> int:
-        """Number of directed edges ``E``."""
         return len(self.senders)
 
     @property
     def num_actions(self) -> int:
-        """Number of controls ``A``."""
         return len(self.actuator_names)
 
     @property
@@ -94,8 +104,7 @@ class Scene:
 
     @property
     def state_size(self) -> int:
-        """Numbers in a node's state: position 3, quaternion 4, linear velocity 3, angular velocity 3."""
-        return 13
+        return 13  # position 3, quaternion 4, linear velocity 3, angular velocity 3
 
     @property
     def sensor_slice(self) -> slice:
@@ -108,26 +117,18 @@ class Scene:
         return np.any(self.movable, axis=1)
 
     def description(self) -> dict:
-        """JSON-able values from which :func:`scene_from_description` rebuilds the scene.
-
-        Raises SceneError if it was made from an ``MjSpec``, whose XML would round its numbers.
-        """
+        """JSON-able values that rebuild the scene; SceneError if it is of an ``MjSpec``, whose XML rounds numbers."""
         if not self.origin:
             raise SceneError(
                 f"Scene {self.name!r} was made from an MjSpec, which has no exact description;"
                 " load the model from an MJCF file."
             )
-        return {
-            "name": self.name,
-            "timestep": self.timestep,
-            "settle_steps": self.settle_steps,
-            **self.origin,
-            "fingerprint": self.fingerprint(),
-        }
+        own = {"name": self.name, "timestep": self.timestep, "settle_steps": self.settle_steps}
+        return {**own, **self.origin, "fingerprint": self.fingerprint()}
 
     def fingerprint(self) -> str:
         """Hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""
-        return fingerprint(self)
+        return hashlib.sha256("\n".join(physics(self)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
         rotations = "no axis" if self.yaw_frame is None else "xyz"[self.yaw_frame.axis]

@@ -2,8 +2,7 @@
 
 Every scene has the same columns. Paper: differences from its list are
 
-* no ``opt.collision``, which MuJoCo dropped;
-* ``actuator_acc0`` for ``actuator_invweight0``, which MuJoCo dropped;
+* no ``opt.collision``, and ``actuator_acc0`` for ``actuator_invweight0``: MuJoCo dropped both;
 * ``timestep`` is the control step;
 * ``dof_damping``, ``dof_armature`` and ``dof_frictionloss`` of the joint's first degree of freedom are added;
 * a node's mass, inertia, ipos and iquat are composites of its bodies, in the root body's frame; pos and quat are
@@ -25,22 +24,13 @@ Columns = list[tuple[str, np.ndarray]]
 
 
 def static_graph(model: mujoco.MjModel, graph: Topology, actuator_of_joint: np.ndarray, timestep: float) -> StaticGraph:
-    """Static features of every node and edge and of the scene.
-
-    ``actuator_of_joint`` ``[J]`` is -1 without motor, ``timestep`` the control step in seconds.
-    """
+    """Static features; ``actuator_of_joint`` ``[J]`` is -1 without motor, ``timestep`` the control step in seconds."""
     nodes, node_names = _join(_node_columns(model, graph), len(graph.body))
     joints, joint_names = _join(_joint_columns(model, actuator_of_joint), model.njnt)
     globals_, global_names = _join(_global_columns(model, timestep), 1)
     direction = np.tile([1.0, -1.0], model.njnt)
-    return StaticGraph(
-        nodes=nodes,
-        edges=np.concatenate([direction[:, None], np.repeat(joints, 2, axis=0)], axis=1),
-        globals_=globals_[0],
-        node_names=node_names,
-        edge_names=("direction", *joint_names),
-        global_names=global_names,
-    )
+    edges = np.concatenate([direction[:, None], np.repeat(joints, 2, axis=0)], axis=1)
+    return StaticGraph(nodes, edges, globals_[0], node_names, ("direction", *joint_names), global_names)
 
 
 def _join(columns: Columns, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -134,9 +124,7 @@ def _joint_columns(model: mujoco.MjModel, actuator_of_joint: np.ndarray) -> Colu
         ("motorized", motorized.astype(float)),
         *_one_hot("jnt_type", model.jnt_type, mujoco.mjtJoint, "mjJNT_"),
         *[(f"jnt_{name}", getattr(model, f"jnt_{name}")) for name in vectors],
-        ("dof_damping", model.dof_damping[dof]),
-        ("dof_armature", model.dof_armature[dof]),
-        ("dof_frictionloss", model.dof_frictionloss[dof]),
+        *[(f"dof_{name}", getattr(model, f"dof_{name}")[dof]) for name in ("damping", "armature", "frictionloss")],
     ]
     for name, values in _actuator_columns(model):
         per_joint = np.zeros((model.njnt, *values.shape[1:]))

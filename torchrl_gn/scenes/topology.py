@@ -1,4 +1,4 @@
-"""Nodes and edges of a MuJoCo model: groups of welded bodies, joints between them."""
+"""Nodes and edges of a MuJoCo model: groups of welded bodies, joints between them, and where these connect them."""
 
 from __future__ import annotations
 
@@ -20,24 +20,14 @@ class Topology:
 
 
 def topology(model: mujoco.MjModel) -> Topology:
-    """Graph structure of a compiled model.
-
-    A node is a group of bodies welded together (``body_weldid``). Bodies fixed to the world, mocap bodies too, belong
-    to node 0.
-    """
-    body = np.unique(model.body_weldid)
+    """Graph structure of a compiled model; bodies fixed to the world, mocap bodies too, belong to node 0."""
+    body = np.unique(model.body_weldid).astype(np.int64)
     node_of_body = np.searchsorted(body, model.body_weldid)
     parent = node_of_body[model.body_parentid[body]]
     parent[0] = -1
     child_of_joint = node_of_body[model.jnt_bodyid]
     pairs = np.stack([parent[child_of_joint], child_of_joint], axis=1)  # [J, 2] parent, child
-    return Topology(
-        body=body.astype(np.int64),
-        node_of_body=node_of_body.astype(np.int64),
-        parent=parent.astype(np.int64),
-        senders=pairs.reshape(-1).astype(np.int64),
-        receivers=pairs[:, ::-1].reshape(-1).astype(np.int64),
-    )
+    return Topology(body, node_of_body, parent, pairs.flatten(), pairs[:, ::-1].flatten())
 
 
 def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray, np.ndarray]:
@@ -50,3 +40,42 @@ def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray,
         pos, quat = model.body_pos[body] + rotated, product
         body = int(model.body_parentid[body])
     return pos, quat
+
+
+@dataclass(frozen=True, eq=False)
+class JointAnchors:
+    """Anchors of hinges and balls, which connect nodes to their parents in subtrees; a subtree's root has none."""
+
+    parent: np.ndarray  # [N] parent node; a root's is itself
+    parent_anchor: np.ndarray  # [N, 3] anchor in the parent's frame, metres; 0 for a root
+    child_anchor: np.ndarray  # [N, 3] anchor in the node's own frame, metres; 0 for a root
+    ancestors: np.ndarray  # [N, N] 1 where the column's node is the row's or its ancestor, roots excluded
+    root: np.ndarray  # [N] root of each node's subtree
+
+    @property
+    def anchor_scale(self) -> float:
+        """Root mean square of the non-zero coordinates of the anchor offsets, metres; 1 without any."""
+        offsets = np.concatenate((self.parent_anchor, self.child_anchor))
+        return float(np.sqrt(np.mean(offsets[offsets != 0] ** 2))) if offsets.any() else 1.0
+
+
+def find_joint_anchors(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> JointAnchors:
+    """Anchors of bodies whose joints are all hinges and balls about one point; ``data`` is at its reference."""
+    count, rotational = len(graph.body), (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
+    parent, root = np.arange(count), np.arange(count)
+    parent_anchor, child_anchor, ancestors = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, count))
+    for node in range(1, count):
+        body = int(graph.body[node])
+        first = model.body_jntadr[body]
+        joints = np.arange(first, first + model.body_jntnum[body])
+        apart = np.abs(model.jnt_pos[joints] - model.jnt_pos[first]).max()
+        if apart >= 1e-12 or not np.isin(model.jnt_type[joints], rotational).all():
+            continue
+        before = int(graph.parent[node])
+        anchor, frame = data.xanchor[first], data.xmat[graph.body[before]].reshape(3, 3)
+        parent[node], root[node] = before, root[before]
+        parent_anchor[node] = frame.T @ (anchor - data.xpos[graph.body[before]])
+        child_anchor[node] = model.jnt_pos[first]
+        ancestors[node] = ancestors[before]
+        ancestors[node, node] = 1
+    return JointAnchors(parent, parent_anchor, child_anchor, ancestors, root)

@@ -12,15 +12,9 @@ from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange, System, find_system
 
-_TEXTURE = 16  # pixels
-
 
 def parameter_ranges(system: str) -> dict[str, ParameterRange]:
-    """Parameters in which random variants of a system differ, and their ranges (the SM's table).
-
-    Lengths, thicknesses, masses and gears are factors of the standard system's; angles are radians. Raises ValueError
-    if the system has no parameters.
-    """
+    """Parameters of a system's random variants, and their ranges (the SM's table); ValueError if there are none."""
     return dict(_system_with_variants(system).ranges)
 
 
@@ -33,8 +27,7 @@ def has_variants(scene: Scene) -> bool:
 def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -> np.ndarray:
     """Draw independent uniform parameters ``[count, P]``, float64, columns in the order of :func:`parameter_ranges`.
 
-    ``rng`` is a generator or a seed, whose first draws are equal for every ``count``. Raises ValueError if the system
-    has no parameters or ``count`` is negative.
+    ``rng`` is a generator or a seed, whose first draws are equal for every ``count``; ValueError if that is negative.
     """
     ranges = parameter_ranges(system).values()
     if count < 0:
@@ -53,11 +46,7 @@ def sample_variants(
 def make_variants(
     system: str, parameters: np.ndarray, *, timestep: float | None = None, name: str | None = None
 ) -> list[Scene]:
-    """Build variants of a system from parameters ``[count, P]``, which may lie outside of their ranges.
-
-    Name and control step (seconds) are the system's by default. Raises ValueError if the system has no parameters, or
-    the given ones do not fit.
-    """
+    """Build variants from parameters ``[count, P]``, also beyond their ranges; ValueError if these do not fit."""
     ranges = parameter_ranges(system)
     parameters = np.asarray(parameters, dtype=np.float64)
     if parameters.ndim != 2 or parameters.shape[1] != len(ranges):
@@ -86,7 +75,7 @@ def _build(
     standard.compiler.usethread = False  # threads would take longer to start than the model to compile
     for texture in standard.textures:
         # Every model would render and keep full textures: 12 MB and most of the time.
-        texture.width = texture.height = _TEXTURE
+        texture.width = texture.height = 16  # pixels
     for values in rows:
         for key, value in values.items():
             if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
@@ -94,13 +83,14 @@ def _build(
                 raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
         spec: mujoco.MjSpec = standard.copy()
         system.vary(spec, values)
-        yield build_scene(
-            spec,
-            name=name or system.name,
-            timestep=system.timestep if timestep is None else timestep,
-            settle_steps=system.settle_steps,
-            origin={"system": system.name, "parameters": dict(values)},
-        )
+        yield build_system(system, spec, name, timestep, parameters=dict(values))
+
+
+def build_system(system: System, spec: mujoco.MjSpec, name: str | None, timestep: float | None, **origin) -> Scene:
+    """Build a scene from a model of a system, whose name and control step are the default."""
+    name, timestep = name or system.name, system.timestep if timestep is None else timestep
+    origin = {"system": system.name, **origin}
+    return build_scene(spec, name=name, timestep=timestep, settle_steps=system.settle_steps, origin=origin)
 
 
 def _system_with_variants(source: object) -> System:

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection, position_weight
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
-from torchrl_gn.scenes.joint_axes import joint_axes
+from torchrl_gn.scenes.physical_parameters import joint_axes
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene

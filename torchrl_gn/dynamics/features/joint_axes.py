@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes.joint_axes import joint_axes
+from torchrl_gn.scenes.physical_parameters import joint_axes
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer

@@ -15,8 +15,7 @@ from functools import cache
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.systems.resize import resize_capsule
-from torchrl_gn.scenes.systems.system import ParameterRange, System, suite_model
+from torchrl_gn.scenes.systems.system import ParameterRange, System, resize_capsule, suite_model
 
 _LIMBS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 _RANGES = {

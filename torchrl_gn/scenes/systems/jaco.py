@@ -47,15 +47,9 @@ def _build() -> mujoco.MjSpec:
 
 def _add_velocity_actuator(spec: mujoco.MjSpec, joint: str, *, gain: float, velocity: float, force: float) -> None:
     """Add a servo that follows a velocity target [rad/s] with limited torque [N m]."""
-    actuator = spec.add_actuator(
-        name=joint,
-        target=joint,
-        trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        ctrllimited=True,
-        ctrlrange=[-velocity, velocity],
-        forcelimited=True,
-        forcerange=[-force, force],
-    )
+    actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.ctrllimited, actuator.ctrlrange = True, [-velocity, velocity]
+    actuator.forcelimited, actuator.forcerange = True, [-force, force]
     actuator.set_to_velocity(gain)
 
 

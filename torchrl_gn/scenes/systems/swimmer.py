@@ -13,8 +13,7 @@ from functools import partial
 
 import mujoco
 
-from torchrl_gn.scenes.systems.resize import resize_along_y, resize_capsule
-from torchrl_gn.scenes.systems.system import ParameterRange, System, suite_model
+from torchrl_gn.scenes.systems.system import ParameterRange, System, resize_along_y, resize_capsule, suite_model
 
 
 def swimmer(links: int) -> System:

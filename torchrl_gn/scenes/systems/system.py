@@ -1,14 +1,16 @@
-"""Definition of the library's own systems, and their model files."""
+"""Definition of the library's own systems, their model files, and geoms resized at constant density."""
 
 from __future__ import annotations
 
 import importlib.util
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 # dm-control requires labmaze, unused here, which has no wheels for Python 3.13 and newer.
 INSTALL_SUITE = 'pip install "torchrl_gn[suite]"'
@@ -26,7 +28,6 @@ class ParameterRange:
 
     @property
     def is_angle(self) -> bool:
-        """Whether the parameter is an angle and not a factor."""
         return self.standard == 0
 
 
@@ -43,10 +44,7 @@ class System:
 
 
 def model_file(path: str) -> str:
-    """Path of a model file inside the ``dm_control`` package, such as ``"suite/cheetah.xml"``.
-
-    Raises ModuleNotFoundError if dm_control is not installed.
-    """
+    """Path of a model file such as ``"suite/cheetah.xml"`` in dm_control; ModuleNotFoundError if not installed."""
     # Importing dm_control would choose an OpenGL backend and complain without a display.
     package = importlib.util.find_spec("dm_control")
     if package is None or not package.submodule_search_locations:
@@ -57,3 +55,32 @@ def model_file(path: str) -> str:
 def suite_model(domain: str) -> mujoco.MjSpec:
     """MJCF model of a Control Suite domain."""
     return mujoco.MjSpec.from_file(model_file(f"suite/{domain}.xml"))
+
+
+def resize_capsule(geom: mujoco.MjsGeom, length: float, thickness: float) -> None:
+    """Scale a capsule's length (between cap centres) and position by ``length``, its radius by ``thickness``."""
+    before = _capsule_volume(geom)
+    if np.isfinite(geom.fromto).all():
+        geom.fromto = length * np.asarray(geom.fromto)
+    else:
+        geom.pos = length * np.asarray(geom.pos)
+        geom.size = [geom.size[0], length * geom.size[1], geom.size[2]]
+    geom.size = [thickness * geom.size[0], *geom.size[1:]]
+    if np.isfinite(geom.mass):  # else MuJoCo computes it from the density
+        geom.mass *= _capsule_volume(geom) / before
+
+
+def resize_along_y(geom: mujoco.MjsGeom, length: float, thickness: float) -> None:
+    """Scale a box's or ellipsoid's size and position by ``length`` along y, ``thickness`` across, and its mass."""
+    scale = np.array([thickness, length, thickness])
+    geom.pos, geom.size = scale * geom.pos, scale * geom.size
+    geom.mass *= float(scale.prod())
+
+
+def _capsule_volume(geom: mujoco.MjsGeom) -> float:
+    if geom.type != mujoco.mjtGeom.mjGEOM_CAPSULE:
+        raise ValueError(f"Geom {geom.name!r} is not a capsule.")
+    radius, length = float(geom.size[0]), 2 * float(geom.size[1])
+    if np.isfinite(geom.fromto).all():
+        length = float(np.linalg.norm(geom.fromto[3:] - geom.fromto[:3]))
+    return math.pi * radius**2 * (length + 4 / 3 * radius)

@@ -1,0 +1,222 @@
+"""Rewards of the paper's tasks, also by name, and of the control suite's reaching tasks."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from torchrl_gn.maths import quaternion
+from torchrl_gn.rewards.bodies import Bodies, require_bodies
+from torchrl_gn.rewards.imitate_pose import ImitatePose
+from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.scenes.scene import Scene
+
+Axis = Literal["x", "y", "z"]
+_REACHED = 1e-9  # metres
+
+
+class Balance(Reward):
+    """Negative angle between bodies and their balanced orientation, radians: ``-sum_i angle(q_i', target_i)``.
+
+    Paper, SM "Planning configuration", Pendulum Balance. The gradient is finite everywhere and zero at both ends.
+
+    Args:
+        target: ``[4]`` or ``[len(bodies), 4]``, w-first, world frame, any non-zero norm; default: the identity, upright
+            for the suite's poles, acrobot and walker (upside down: ``[0, 0, 1, 0]``).
+    """
+
+    target: Tensor
+
+    def __init__(self, scene: Scene, bodies: Sequence[str], *, target: np.ndarray | Tensor | None = None):
+        super().__init__()
+        self.bodies = Bodies(scene, bodies)
+        self.shown = {"scene": scene.name, "bodies": tuple(bodies)}
+        wanted = torch.as_tensor([1.0, 0.0, 0.0, 0.0] if target is None else target, dtype=torch.float64)
+        if wanted.shape not in {(4,), (len(bodies), 4)}:
+            raise ValueError(f"target must be [4] or [{len(bodies)}, 4], got {list(wanted.shape)}")
+        norm = wanted.norm(dim=-1, keepdim=True)
+        if not bool((norm > 0).all() and wanted.isfinite().all()):
+            raise ValueError(f"target must hold finite quaternions of non-zero norm, got {wanted.tolist()}")
+        # `forward` casts the float64 buffer to the states' dtype.
+        self.register_buffer("target", (wanted / norm).expand(len(bodies), 4).clone())
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        angle = quaternion.angle(self.bodies.orientation(next_state), self.target.to(next_state.dtype))
+        return -angle.sum(-1, keepdim=True)
+
+
+class Reach(Reward):
+    r"""Progress of a body towards a target in the horizontal plane, metres.
+
+    .. math:: r = d \cdot u - c\, (d \cdot u_\perp)^2
+
+    with :math:`d` the body's displacement in this step, :math:`u` the horizontal unit vector to the target when
+    planning started, and :math:`c` the ``shaping``, 1/m (paper, SM "Planning configuration", Swimmer "Move towards
+    target"). The target is a location ``[3]``, metres, world frame, height ignored; the task is :math:`u`, ``[3]``,
+    zero within a nanometre of the target.
+    """
+
+    target_shape = (3,)
+
+    def __init__(self, scene: Scene, body: str, *, shaping: float = 0.01):
+        super().__init__()
+        if not 0 <= shaping < math.inf:
+            raise ValueError(f"shaping must be a finite number from 0, got {shaping}")
+        self.bodies, self.shaping = Bodies(scene, [body]), float(shaping)
+        self.shown = {"scene": scene.name, "body": body, "shaping": self.shaping}
+
+    def task_of(self, state: Tensor, target: Tensor) -> Tensor:
+        """Direction ``[*B, 3]`` from the body in ``state`` to the target ``[*B, 3]``."""
+        location = super().task_of(state, target).to(state.dtype)
+        to_target = (location - self.bodies.position(state).squeeze(-2))[..., :2]
+        # Divide by the largest entry first, so that squares neither overflow nor vanish.
+        largest = to_target.abs().amax(-1, keepdim=True)
+        reached = largest < _REACHED
+        scaled = torch.where(reached, 1.0, to_target) / torch.where(reached, 1.0, largest)
+        return pad(torch.where(reached, 0.0, scaled / scaled.norm(dim=-1, keepdim=True)), (0, 1))
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        x, y, _ = self.require_task(task, next_state).split(1, dim=-1)
+        displacement = (self.bodies.position(next_state) - self.bodies.position(state)).squeeze(-2)
+        dx, dy, _ = displacement.split(1, dim=-1)
+        return dx * x + dy * y - self.shaping * (dy * x - dx * y).square()
+
+
+class Velocity(Reward):
+    """Velocity of a body's frame along a world axis after the step, m/s, to a power of at least 1.
+
+    Paper, SM "Planning configuration": Cheetah and Walker2d "forward", Cheetah "vertical speed" (``power=2``).
+    """
+
+    def __init__(self, scene: Scene, body: str, axis: Axis, *, power: int = 1):
+        super().__init__()
+        if isinstance(power, bool) or not isinstance(power, int) or power < 1:
+            raise ValueError(f"power must be a whole number from 1, got {power!r}")
+        self.bodies, self.axis, self.power = Bodies(scene, [body]), axis, power
+        self.shown = {"scene": scene.name, "body": body, "axis": axis, "power": power}
+        self.component = _component(axis)
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return self.bodies.linear_velocity(next_state)[..., self.component] ** self.power
+
+
+class Position(Reward):
+    """Position of a body along a world axis after the step, metres (paper: height of the torso)."""
+
+    def __init__(self, scene: Scene, body: str, axis: Axis):
+        super().__init__()
+        self.bodies, self.axis = Bodies(scene, [body]), axis
+        self.shown = {"scene": scene.name, "body": body, "axis": axis}
+        self.component = _component(axis)
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return self.bodies.position(next_state)[..., self.component]
+
+
+class AngularSpeed(Reward):
+    """Squared angular speed of a body after the step, rad^2/s^2 (paper: Cheetah "Squared angular speed")."""
+
+    def __init__(self, scene: Scene, body: str):
+        super().__init__()
+        self.bodies = Bodies(scene, [body])
+        self.shown = {"scene": scene.name, "body": body}
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return self.bodies.angular_velocity(next_state).square().sum(-1)
+
+
+class VerticalDistance(Reward):
+    """Sum of squared vertical distances to a reference body after the step, m^2 (paper: "Feet to head height")."""
+
+    def __init__(self, scene: Scene, bodies: Sequence[str], reference: str):
+        super().__init__()
+        self.bodies, self.reference = Bodies(scene, bodies), Bodies(scene, [reference])
+        self.shown = {"scene": scene.name, "bodies": tuple(bodies), "reference": reference}
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        height = self.bodies.position(next_state)[..., 2]
+        return (height - self.reference.position(next_state)[..., 2]).square().sum(-1, keepdim=True)
+
+
+class TargetDistance(nn.Module):
+    """The suite's reward for reaching a target: 1 within ``radius`` of the target, less at larger distances.
+
+    At a distance ``d``, ``1 / (1 + (3 (d - radius) / margin)^2)``, as ``dm_control.utils.rewards.tolerance`` with a
+    long tail. ``entry`` of the observation is the vector to the target. The gradient there is 0.
+    """
+
+    def __init__(
+        self, graph: ObservationGraph, entry: str = "to_target", *, radius: float = 0.1, margin: float = 0.5
+    ) -> None:
+        super().__init__()
+        if entry not in graph.observation:
+            raise ValueError(f"Observations of {graph.name!r} have no {entry!r}; there are {list(graph.observation)}.")
+        if not (0 < radius < math.inf and 0 < margin < math.inf):
+            raise ValueError(f"radius={radius} and margin={margin} must be positive and finite.")
+        names = list(graph.observation)
+        start = sum(graph.observation[name] for name in names[: names.index(entry)])
+        self.where, self.radius, self.margin = slice(start, start + graph.observation[entry]), radius, margin
+
+    def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+        square = next_observation[..., self.where].square().sum(-1, keepdim=True)
+        # Clamp before the root: its gradient stays finite at 0.
+        beyond = square.clamp(min=self.radius**2).sqrt() - self.radius
+        return 1 / (1 + (3 * beyond / self.margin).square())
+
+
+def _component(axis: str) -> int:
+    if axis not in get_args(Axis):
+        raise ValueError(f"axis must be one of {', '.join(get_args(Axis))}, got {axis!r}")
+    return get_args(Axis).index(axis)
+
+
+_WALKER_UPRIGHT = ("torso", "right_thigh", "left_thigh", "right_leg", "left_leg")
+_WALKER_FEET = ("right_foot", "left_foot")
+
+# (system, task) -> builder of the reward; one line per row of the paper's table.
+_REWARDS: dict[tuple[str, str], Callable[[Scene], Reward]] = {
+    ("pendulum", "balance"): lambda scene: Balance(scene, ["pole"]),
+    ("cartpole", "balance"): lambda scene: Balance(scene, ["pole_1"]),
+    ("acrobot", "swing_up"): lambda scene: Balance(scene, ["upper_arm", "lower_arm"]),
+    ("swimmerN", "reach"): lambda scene: Reach(scene, "head"),
+    ("cheetah", "forward"): lambda scene: Velocity(scene, "torso", "x"),
+    ("cheetah", "height"): lambda scene: Position(scene, "torso", "z"),
+    ("cheetah", "vertical_speed"): lambda scene: Velocity(scene, "torso", "z", power=2),
+    ("cheetah", "spin"): lambda scene: AngularSpeed(scene, "torso"),
+    ("walker2d", "forward"): lambda scene: Velocity(scene, "torso", "x"),
+    ("walker2d", "height"): lambda scene: Position(scene, "torso", "z"),
+    ("walker2d", "inverse_verticality"): lambda scene: Balance(scene, _WALKER_UPRIGHT),
+    ("walker2d", "feet_to_head"): lambda scene: VerticalDistance(scene, _WALKER_FEET, "torso"),
+    ("jaco", "palm_pose"): lambda scene: ImitatePose(scene, ["jaco_hand/hand"]),
+    # Paper: "13 variables x 9 bodies": the moving nodes.
+    ("jaco", "full_pose"): lambda scene: ImitatePose(scene, scene.node_names[1:]),
+}
+
+
+def available_rewards() -> tuple[tuple[str, str], ...]:
+    """Every ``(system, task)`` of :func:`make_reward`; ``"swimmerN"`` stands for any number of links."""
+    return tuple(_REWARDS)
+
+
+def make_reward(task: str, scene: Scene) -> Reward:
+    """Build a reward of the paper by its task's name, such as ``"balance"``, for a system's scene or variant.
+
+    Paper: Walker2d's ``"inverse_verticality"`` is largest for a standing walker, as in the paper's text. For a walker
+    on its head use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
+    Raises ValueError for an unknown task (the message lists all), TypeError for a robot known by its joints alone.
+    """
+    require_bodies(scene)
+    system = re.sub(r"^swimmer\d+$", "swimmerN", scene.origin.get("system", scene.name))
+    builder = _REWARDS.get((system, task))
+    if builder is None:
+        known = ", ".join(f"{name} ({of})" for of, name in _REWARDS)
+        raise ValueError(f"no reward {task!r} for scene {scene.name!r}; there are: {known}")
+    return builder(scene)
