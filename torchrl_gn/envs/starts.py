@@ -73,7 +73,7 @@ class StartSampler:
         return draw_start_states(cast(Simulator, simulator), variant, self._rng)[0]
 
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:
-        states = np.array(states.detach().cpu() if isinstance(states, Tensor) else states, dtype=np.float64)
+        states = np.array(states.detach().cpu().numpy() if isinstance(states, Tensor) else states, dtype=np.float64)
         if states.shape != (count or max(1, len(states)), *self.shape):
             wanted = f"[{', '.join(map(str, (count or 'M', *self.shape)))}]"
             raise ValueError(f"start states of {self.scene.name!r} must be {wanted}, got {list(states.shape)}")
