@@ -13,8 +13,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-_SIZE = 480  # pixels of a picture's width and height
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return 0; errors print one message on standard error and exit with code 2."""
@@ -57,21 +55,19 @@ def _models() -> str:
     from torchrl_gn.training import load_pretrained, pretrained_names
 
     keys = ("one_step_error", "rollout_error_20", "rollout_error_100")
-    rows: list[tuple[str, ...]] = [
-        ("model", "system", "trained on", *(key.replace("_error", "").replace("_", " ") for key in keys))
-    ]
+    titles = [key.replace("_error", "").replace("_", " ") for key in keys]
+    rows = [["model", "system", "trained on", *titles]]
     for name in pretrained_names():
         loaded = load_pretrained(name)
         trained = [description["name"] for description in loaded.scene_descriptions]
         stated: Mapping[str, Any] = {key: value for key, value in loaded.metrics.items() if key != "evaluation"}
         for system in sorted(stated, key=lambda system: (system.rstrip("0123456789"), len(system), system)):
             errors = (f"{stated[system][key]:.1e}" if key in stated[system] else "-" for key in keys)
-            rows.append((name, system, "yes" if system in trained else "no", *errors))
+            rows.append([name, system, "yes" if system in trained else "no", *errors])
     return _table(rows) + "\nSquared errors of 20 trajectories, relative to the persistence baseline (no motion)."
 
 
 def _show(source: str, image: str | None) -> str:
-    """Return a scene's summary and, with ``image``, draw its start state."""
     from torchrl_gn.scenes import load_scene
 
     scene = load_scene(source)
@@ -82,7 +78,7 @@ def _show(source: str, image: str | None) -> str:
     from torchrl_gn.evaluation import rollout_frames
 
     start = Simulator(scene).observe(sample_start_states(scene, 1, 0))
-    picture = next(rollout_frames(scene, start, size=_SIZE, labels=("start state", "")))
+    picture = next(rollout_frames(scene, start, size=480, labels=("start state", "")))
     with atomic_path(image) as temporary:
         picture.save(temporary)
     return f"{scene}\n{image}"

@@ -1,4 +1,4 @@
-"""Report on this machine: hardware, libraries, speeds and recommended options (``torchrl-gn doctor``)."""
+"""Report on this machine (``torchrl-gn doctor``)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -19,7 +18,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.processor import instruction_sets, processor_name, product_speeds, restrictions
+from torchrl_gn.processor import instruction_sets, processor_name, product_speeds, restrictions, usable_cores
 from torchrl_gn.training import load_pretrained
 from torchrl_gn.training.checkpoint import package_versions
 
@@ -30,13 +29,21 @@ _MIN_GAIN = 1.3  # smallest speed-up for which to recommend more threads
 
 
 def diagnose() -> str:
-    """Return a report on processor, libraries and speeds, with advice; takes a few seconds."""
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    seconds = _thread_seconds(threads)
-    compiler = _compiler()
+    """Return a report on hardware, libraries and speeds, with recommended options; takes a few seconds."""
+    threads = usable_cores()
+    seconds, compiler = _thread_seconds(threads), _compiler()
     gpus = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
+    limited = " ".join(restrictions())
     sections = {
-        "System": [*_system(threads), ("GPU", ", ".join(gpus) or "none")],
+        "System": [
+            ("platform", platform.platform()),
+            ("processor", processor_name()),
+            ("cores of this process", str(threads)),
+            ("instruction sets", instruction_sets()),
+            ("torch uses", torch.backends.cpu.get_cpu_capability()),
+            *([("restricted by", limited)] if limited else []),
+            ("GPU", ", ".join(gpus) or "none"),
+        ],
         "Versions": [("python", sys.version.split()[0]), *package_versions().items()],
         "Libraries": [*_libraries(), ("C++ compiler", compiler or "none")],
         "Matrix products on one thread, GFLOP/s": _products(),
@@ -51,26 +58,14 @@ def diagnose() -> str:
     return "\n".join([*lines, "What to switch on here", *(f"  - {line}" for line in advice)])
 
 
-def _system(threads: int) -> list[tuple[str, str]]:
-    limited = restrictions()
-    return [
-        ("platform", platform.platform()),
-        ("processor", processor_name()),
-        ("cores of this process", str(threads)),
-        ("instruction sets", instruction_sets()),
-        ("torch uses", torch.backends.cpu.get_cpu_capability()),
-        *([("restricted by", " ".join(limited))] if limited else []),
-    ]
-
-
 def _libraries() -> list[tuple[str, str]]:
-    config = torch.__config__.show()
     patterns = {
         "MKL": r"Math Kernel Library Version ([\w.-]+)",
         "oneDNN": r"MKL-DNN v([\w.]+)",
         "BLAS": r"BLAS_INFO=(\w+)",
     }
-    rows = [(name, match[1]) for name, pattern in patterns.items() if (match := re.search(pattern, config))]
+    found = {name: re.search(pattern, torch.__config__.show()) for name, pattern in patterns.items()}
+    rows = [(name, match[1]) for name, match in found.items() if match]
     return [*rows, ("torch threads", str(torch.get_num_threads()))]
 
 
@@ -83,7 +78,6 @@ def _products() -> list[tuple[str, str]]:
 
 
 def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
-    """Time predictions and a training step on one and on all threads, in seconds."""
     loaded = load_pretrained(_MODEL)
     bound = loaded.model.bind(loaded.scene())
     specialized, loss = specialize(bound), ForwardModelLoss(bound)
@@ -97,8 +91,7 @@ def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
         with fast_matmul():
             loss(batch[:200])["loss_forward_model"].backward()
 
-    tasks: dict[str, Callable[[], None]] = {f"step of {count:,}": partial(predict, count) for count in _BATCHES}
-    tasks["gradient of 200"] = train
+    tasks = {**{f"step of {count:,}": partial(predict, count) for count in _BATCHES}, "gradient of 200": train}
     before, seconds = torch.get_num_threads(), {}
     try:
         for name, task in tqdm(tasks.items(), desc="measuring", leave=False):
@@ -116,11 +109,8 @@ def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
 
 
 def _compiler() -> str | None:
-    """Return the version of the C++ compiler that torch.compile uses."""
-    command = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
-    if not command:
-        return None
     try:
+        command = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++") or "g++"
         done = subprocess.run([command, "--version"], capture_output=True, text=True, timeout=30)
     except OSError:
         return None

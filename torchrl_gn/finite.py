@@ -9,9 +9,8 @@ from torch import Tensor
 
 
 def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> None:
-    """Raise ValueError, naming ``what``, value and index, if a number of ``value`` (any shape) is NaN or infinite."""
-    # Synchronises with a GPU: call it on a user's input, not between steps. Compiled code cannot raise on values.
-    if torch.compiler.is_compiling():
+    """Raise ValueError, naming ``what``, value and index, if a number of ``value`` is not finite; waits for a GPU."""
+    if torch.compiler.is_compiling():  # compiled code cannot raise on values
         return
     if isinstance(value, TensorDictBase):
         for key, entry in value.items(include_nested=True, leaves_only=True):

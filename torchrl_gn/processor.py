@@ -21,7 +21,6 @@ _ROWS, _SIZE = 1400, 128  # a layer of 200 Swimmer6 states
 _FLOP = 2 * _ROWS * _SIZE**2
 _ROUNDS = 7
 _LIMITS = ("ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA", "MKL_ENABLE_INSTRUCTIONS")
-"""Environment variables that restrict a process's instruction sets."""
 
 
 class SlowDtypeWarning(UserWarning):
@@ -50,7 +49,7 @@ class ProductSpeeds:
         return 1.0 if speed is None else max(self.float32, self.onednn if self.onednn_pays else 0.0) / speed
 
     def pays(self, dtype: torch.dtype) -> bool:
-        """Return whether a dtype is no slower than float32, up to noise."""
+        """Whether a dtype is no slower than float32, up to noise."""
         return self.slowdown(dtype) < 1.2
 
 
@@ -70,8 +69,7 @@ def product_speeds() -> ProductSpeeds:
 
 def processor_name() -> str:
     """Return the processor's model, such as ``"AMD EPYC"``."""
-    fields = _cpuinfo()
-    return fields.get("model name") or platform.processor() or platform.machine()
+    return _cpuinfo().get("model name") or platform.processor() or platform.machine()
 
 
 def instruction_sets() -> str:
@@ -88,22 +86,24 @@ def restrictions() -> list[str]:
     return [f"{name}={os.environ[name]}" for name in _LIMITS if os.environ.get(name)]
 
 
+def usable_cores() -> int:
+    """Number of cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @functools.cache
 def _cpuinfo() -> dict[str, str]:
-    """Return the first core's fields of Linux's ``/proc/cpuinfo``; empty on other systems."""
     try:
         first = Path("/proc/cpuinfo").read_text().split("\n\n")[0]
     except OSError:
         return {}
-    pairs = (line.partition(":") for line in first.splitlines())
-    return {name.strip(): value.strip() for name, _, value in pairs}
+    return {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in first.splitlines())}
 
 
 def onednn_precision():
     """Return the settings with oneDNN's ``fp32_precision``, or None before torch 2.9."""
     settings = getattr(torch.backends.mkldnn, "matmul", None)
-    usable = torch.backends.mkldnn.is_available() and hasattr(settings, "fp32_precision")
-    return settings if usable else None
+    return settings if torch.backends.mkldnn.is_available() and hasattr(settings, "fp32_precision") else None
 
 
 @torch.no_grad()

@@ -9,9 +9,8 @@ import pytest
 from PIL import Image, ImageColor
 
 from torchrl_gn.evaluation import canvas, rollout_frames, rollout_video
-from torchrl_gn.evaluation.camera import choose_view
 from torchrl_gn.evaluation.drawing import _nice, _outline
-from torchrl_gn.evaluation.geometry import SceneGeometry
+from torchrl_gn.evaluation.geometry import SceneGeometry, choose_view
 from torchrl_gn.evaluation.video import frame_stride
 from torchrl_gn.scenes import load_scene
 

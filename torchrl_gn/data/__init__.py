@@ -5,8 +5,7 @@ from torchrl_gn.data.controls import spline_controls as spline_controls
 from torchrl_gn.data.dataset import TrajectoryDataset as TrajectoryDataset
 from torchrl_gn.data.dataset import create_dataset as create_dataset
 from torchrl_gn.data.dataset import load_dataset as load_dataset
-from torchrl_gn.data.errors import DatasetError as DatasetError
-from torchrl_gn.data.errors import UnstableSimulationError as UnstableSimulationError
+from torchrl_gn.data.dataset_files import DatasetError as DatasetError
 from torchrl_gn.data.logs import LogReport as LogReport
 from torchrl_gn.data.logs import RobotLog as RobotLog
 from torchrl_gn.data.logs import load_robot_log as load_robot_log
@@ -17,4 +16,5 @@ from torchrl_gn.data.replay import TrajectoryStorage as TrajectoryStorage
 from torchrl_gn.data.replay import WindowSampler as WindowSampler
 from torchrl_gn.data.replay import trajectory_buffer as trajectory_buffer
 from torchrl_gn.data.simulate import Simulator as Simulator
+from torchrl_gn.data.simulate import UnstableSimulationError as UnstableSimulationError
 from torchrl_gn.data.start_states import sample_start_states as sample_start_states

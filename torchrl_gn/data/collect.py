@@ -10,15 +10,12 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data.controls import spline_controls
-from torchrl_gn.data.errors import UnstableSimulationError
-from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Scene
 
-CHUNK = 250
-"""Sequences per derived seed; data depend on it, so it never changes."""
-
+CHUNK = 250  # sequences per derived seed; data depend on it, so it never changes
 _ATTEMPTS = 20
 _MAX_REJECTED = 0.1
 
@@ -34,16 +31,12 @@ def collect_trajectories(
     simulator: Simulator | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> TensorDict:
-    """Simulate a scene under random control (paper, SM "Datasets"), independently of the number of threads.
-
-    Starts come from :func:`~torchrl_gn.data.sample_start_states`, actions from
-    :func:`~torchrl_gn.data.spline_controls`.
+    """Simulate a scene from :func:`~torchrl_gn.data.sample_start_states` under random control (paper, SM "Datasets").
 
     Args:
         scene: the scene, or variants of one, which the sequences take in turn.
-        steps: control steps ``T`` of each.
-        split: index of an independent split; :func:`~torchrl_gn.data.create_dataset` uses 0, 1, 2.
-        knot_interval: control steps between the knots of the random actions.
+        split: index of an independent split; data sets use 0, 1, 2.
+        knot_interval: as of :func:`~torchrl_gn.data.spline_controls`.
         simulator: simulator of the same scenes, to reuse its threads.
         progress: called with the numbers of sequences done and wanted.
 
@@ -52,9 +45,7 @@ def collect_trajectories(
         ``[num, T+1, S]``; with variants also ``parameters`` (:class:`~torchrl_gn.scenes.PhysicalParameters`).
 
     Raises:
-        ValueError: if ``num`` or ``steps`` is below one, or ``simulator`` is of another scene.
-        UnstableSimulationError: if over a tenth, and over ten, of a chunk's simulations are unstable; fewer are
-            redrawn.
+        UnstableSimulationError: over a tenth, and over ten, of 250 simulations are unstable; fewer are redrawn.
     """
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
@@ -75,7 +66,7 @@ def collect_trajectories(
 
 
 def variant_parameters(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDict:
-    """Physical parameters ``[n]`` of the scenes with indices ``[n]``."""
+    """Physical parameters ``[n]`` of the scenes ``variant`` ``[n]``."""
     which, row = np.unique(variant, return_inverse=True)
     values = torch.stack([PhysicalParameters.of(scenes[index]).tensordict() for index in which])
     return cast(TensorDict, values[torch.from_numpy(row)])
@@ -84,10 +75,7 @@ def variant_parameters(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDi
 def collect_chunk(
     simulator: Simulator, variant: np.ndarray, steps: int, seed: int, key: tuple[int, ...], *, knot_interval: float
 ) -> tuple[TensorDict, int]:
-    """Simulate sequences of the scenes ``variant`` ``[count]`` with the one seed of (``seed``, ``key``).
-
-    Returns a TensorDict ``[count]`` of ``state``, ``action`` and ``physics``, and the number of redrawn simulations.
-    """
+    """Simulate sequences ``[count]`` of the scenes ``variant`` ``[count]``; returns also the number of redrawn ones."""
     scene, count = simulator.scene, len(variant)
     result, rejected, pending = None, 0, torch.arange(count)
     for attempt in range(_ATTEMPTS):
@@ -110,6 +98,5 @@ def collect_chunk(
             return result, rejected
     raise UnstableSimulationError(
         f"{rejected} simulations of {scene.name!r} became unstable while drawing {count} sequences of {steps} steps. "
-        "Use a smaller physics step in the model, smaller action bounds, or a larger "
-        "knot_interval."
+        "Use a smaller physics step in the model, smaller action bounds, or a larger knot_interval."
     )

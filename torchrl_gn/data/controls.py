@@ -1,4 +1,4 @@
-"""Random controls (paper, SM "Random control"), and NumPy generators from seeds."""
+"""Random controls, and NumPy generators from seeds."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ def spline_controls(
 
     Cubic splines through knots that are uniform within each action's bounds, from a random phase on, clipped to the
     bounds. ``knot_interval`` is in control steps; the paper does not give it. ``rng`` is a generator or a seed.
-
-    Raises ValueError if ``num`` or ``steps`` is negative, or ``knot_interval`` is not above 0 and finite.
     """
     if num < 0 or steps < 0:
         raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")
@@ -33,10 +31,8 @@ def spline_controls(
 
     knots = math.ceil((steps - 1) / knot_interval) + 2 + 2 * _MARGIN
     values = rng.uniform(scene.action_low, scene.action_high, (knots, num, scene.num_actions))
-    phase = rng.uniform(0.0, 1.0, (num, 1))
+    phase = rng.uniform(0.0, 1.0, (num, 1))  # each sequence has its own, so none calls the spline
     spline = CubicSpline(np.arange(knots), values, bc_type="natural")
-
-    # CubicSpline reads all sequences at the same times; each has its own phase.
     time = _MARGIN + phase + np.arange(steps) / knot_interval  # [num, T], in knots
     segment = np.minimum(time.astype(np.int64), knots - 2)
     x = (time - segment)[..., None]

@@ -16,7 +16,6 @@ from tensordict import TensorDict
 from torchrl_gn.data.collect import CHUNK, collect_chunk, variant_parameters
 from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
-from torchrl_gn.data.errors import DatasetError
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.physical_parameters import ParameterNames, take_columns
@@ -28,10 +27,9 @@ from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_p
 class TrajectoryDataset:
     """Trajectories of a scene under random control, in three splits.
 
-    Each split is a TensorDict ``[M]``, float64: ``state`` ``[M, T+1, N, 13]``, ``action`` ``[M, T, A]`` and ``physics``
-    ``[M, T+1, S]``; of variants also ``parameters``, a TensorDict of :class:`~torchrl_gn.scenes.PhysicalParameters`,
-    and ``variant_parameters`` ``[M, P]``, in the order of :func:`~torchrl_gn.scenes.parameter_ranges`. They are mapped
-    from disk, read when needed; writing to them changes memory only, never the files.
+    Each split is a TensorDict ``[M]`` as of :func:`~torchrl_gn.data.collect_trajectories`; of variants also with
+    ``variant_parameters`` ``[M, P]``, in the order of :func:`~torchrl_gn.scenes.parameter_ranges`. It is mapped from
+    disk; writing to it never changes the files.
     """
 
     scene: Scene  # of variants, the standard one
@@ -43,7 +41,7 @@ class TrajectoryDataset:
     features: ParameterNames | None = field(default=None, repr=False)  # columns of ``parameters``, for binding a model
 
     def scene_of(self, split: str, index: int) -> Scene:
-        """The scene of one sequence of ``"train"``, ``"validation"`` or ``"test"``, rebuilt if it is a variant."""
+        """The scene of one sequence of a split, rebuilt if it is a variant."""
         if split not in SPLITS:
             raise ValueError(f"split={split!r} is not known; use one of {list(SPLITS)}.")
         parameters = getattr(self, split).get("variant_parameters", None)
@@ -67,24 +65,18 @@ def create_dataset(
 ) -> TrajectoryDataset:
     """Simulate a data set onto disk, or finish or load the one that is there. The default sizes are the paper's.
 
-    Data depend on the scene, sizes, ``steps``, ``seed``, ``variants`` and ``knot_interval`` alone. They are written in
-    chunks; after an interruption the same call continues and gives the same bits. Other processes wait for the first.
+    After an interruption the same call continues and gives the same bits. Other processes wait for the first.
 
     Args:
-        path: folder of the data set, new, empty or started by an equal call.
-        seed: not negative; splits are independent.
-        variants: number of random variants that the sequences of each split take in turn, no split another's; at least
-            as many as sequences: one each. Default: all are of the scene itself. The paper does not give it.
-        knot_interval: control steps between the knots of the random actions.
-        num_threads: threads of the simulation; default: the cores this process may use.
+        variants: number of random variants that the sequences of each split take in turn, no split another's.
+            Default: all are of the scene itself. The paper does not give it.
+        knot_interval: as of :func:`~torchrl_gn.data.spline_controls`.
         progress: called with sequences done and wanted, after every chunk.
-        map_chunks: works like ``map`` and in its order, such as ``imap`` of a pool of processes or of a
-            :class:`~torchrl_gn.training.RayCluster`. The data are the same.
+        map_chunks: works like ``map``, such as ``imap`` of a pool or of a :class:`~torchrl_gn.training.RayCluster`.
 
     Raises:
-        ValueError: an argument is out of range, or the scene is of no system that has variants.
         DatasetError: the folder holds something else, another or a damaged data set, which is not changed.
-        UnstableSimulationError: more than a tenth of a chunk's simulations, and more than ten, become unstable.
+        UnstableSimulationError: as :func:`~torchrl_gn.data.collect_trajectories`.
     """
     sizes = dict(zip(SPLITS, map(index, (train, validation, test)), strict=True))
     if seed < 0:
@@ -122,33 +114,25 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
 
     Args:
         scene: the scene it must be of; default: the one it was made with, rebuilt.
-        verify: compare every file with its checksums (reads all of it once).
+        verify: compare every file with its checksums.
 
     Raises:
-        DatasetError: it is missing, unfinished, damaged, or of another scene, physics or version of the format. The
-            message names the file and what to do.
+        DatasetError: it is missing, unfinished, damaged, or of another scene or version of the format.
     """
     files = DatasetFiles(Path(path))
     files.read()
     manifest, request = files.manifest, files.manifest["request"]
     if not files.is_complete():
         done = {split: len(chunks) for split, chunks in manifest["chunks"].items()}
-        raise DatasetError(
-            f"{files.manifest_path}: the data set is unfinished (chunks done: {done}). Call create_dataset "
-            "with the arguments it was started with to finish it."
-        )
+        raise files.error(f"unfinished (chunks done: {done}). Finish it with create_dataset and the same arguments.")
     if scene is None:
         if manifest["description"] is None:
-            raise DatasetError(
-                f"{files.manifest_path}: scene {request['scene']!r} was made from an MjSpec and "
-                "cannot be built again from the data set. Pass it as load_dataset(path, scene)."
-            )
+            raise files.error(f"scene {request['scene']!r} is of an MjSpec. Pass it as load_dataset(path, scene).")
         scene = scene_from_description(manifest["description"])
     elif scene.fingerprint() != request["fingerprint"]:
-        raise DatasetError(
-            f"{files.manifest_path}: the data set is of scene {request['scene']!r} "
-            f"(fingerprint {request['fingerprint']}), not of {scene.name!r} "
-            f"({scene.fingerprint()}). Load the data set of that scene, or create one in another folder."
+        raise files.error(
+            f"the data set is of scene {request['scene']!r} ({request['fingerprint']}), not of {scene.name!r}"
+            f" ({scene.fingerprint()}). Load that scene's data set, or create one in another folder."
         )
     return _open(files, scene, checksums=verify)
 
@@ -162,15 +146,15 @@ def _collect_missing(
 ) -> None:
     request, versions = files.manifest["request"], simulation_versions()
     if files.manifest["versions"] != versions:
-        raise DatasetError(
-            f"{files.manifest_path}: the data set was started with {files.manifest['versions']} and would go on "
-            f"differently with {versions}. Finish it with those versions, or use another folder."
+        raise files.error(
+            f"the data set was started with {files.manifest['versions']} and would go on differently with {versions}."
+            " Finish it with those versions, or use another folder."
         )
     stored, here = _stored_features(files), ParameterNames.of(scene)
     if stored and (missing := stored.missing_in(here)):
-        raise DatasetError(
-            f"{files.manifest_path}: the data set was started with static features {missing}, which this version of"
-            " torchrl_gn does not have. Finish it with that version, or use another folder."
+        raise files.error(
+            f"the data set was started with static features {missing}, which this version of torchrl_gn does not have."
+            " Finish it with that version, or use another folder."
         )
     chunks = list(_missing_chunks(files, scene))
     collect = partial(_collect, scene, request, num_threads)
@@ -213,13 +197,12 @@ def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple)
 
 
 def _system(scene: Scene) -> str:
-    """Name of the system that variants of a scene are of; ValueError if there is none, or the scene is a variant."""
     if "parameters" in scene.origin:
         raise ValueError(f"Scene {scene.name!r} is a variant already; give the standard system, without parameters.")
     if "system" not in scene.origin:
         raise ValueError(
-            f"Scene {scene.name!r} is an MJCF model, which has no parameters to vary; give one of the paper's systems"
-            " that torchrl_gn.scenes.parameter_ranges knows, or collect_trajectories a list of your own variants."
+            f"Scene {scene.name!r} is an MJCF model, which has no parameters to vary; give a system of"
+            " torchrl_gn.scenes.parameter_ranges, or collect_trajectories a list of your own variants."
         )
     return scene.origin["system"]
 
@@ -229,12 +212,11 @@ def _variants(scene: Scene, parameters: np.ndarray) -> list[Scene]:
 
 
 def _open(files: DatasetFiles, scene: Scene, *, checksums: bool) -> TrajectoryDataset:
-    chunks, features = files.manifest["chunks"], None
-    rejected = {split: sum(chunk["rejected"] for chunk in chunks[split]) for split in SPLITS}
+    features = None
+    rejected = {split: sum(each["rejected"] for each in chunks) for split, chunks in files.manifest["chunks"].items()}
     splits = {split: files.open(split, checksums=checksums) for split in SPLITS}
     if stored := _stored_features(files):
-        # In the order in which samples that are collected now have them.
-        features = ParameterNames.of(scene).common(stored)
+        features = ParameterNames.of(scene).common(stored)  # ordered as samples that are collected now
         for data in splits.values():
             _take_columns(data, features.columns_in(stored))
     return TrajectoryDataset(scene=scene, rejected=rejected, manifest=files.manifest, features=features, **splits)
@@ -246,7 +228,7 @@ def _stored_features(files: DatasetFiles) -> ParameterNames | None:
 
 
 def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
-    """Select columns of the static features in place; right ones stay mapped from disk."""
+    """Select columns of the static features in place; those in order stay mapped from disk."""
     for part, wanted in columns.items():
         values = data["parameters", part]
         if wanted != list(range(values.shape[-1])):

@@ -1,12 +1,4 @@
-"""Files of a data set: a manifest, and a memory-mapped TensorDict for each split, filled chunk by chunk.
-
-::
-
-    manifest.json                                        request, versions, finished chunks and their checksums
-    train/meta.json, state.memmap, action.memmap, ...    TensorDict's own format (TensorDict.load_memmap)
-    train/static/meta.json, nodes.memmap, ...            of variants, the numbers of each sequence's scene
-    validation/..., test/...
-"""
+"""Files of a data set: a manifest, and a memory-mapped TensorDict for each split, filled chunk by chunk."""
 
 from __future__ import annotations
 
@@ -22,12 +14,14 @@ import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
-from torchrl_gn.data.errors import DatasetError
-
 FORMAT = 4
 SPLITS = ("train", "validation", "test")
 _KEYS = {"format", "request", "description", "features", "versions", "chunks"}
 _REMEDY = "Restore it from a copy, or delete the data set's folder and create it again."
+
+
+class DatasetError(RuntimeError):
+    """A data set on disk is damaged, incomplete, of a newer format or of another scene."""
 
 
 def simulation_versions() -> dict[str, str]:
@@ -36,16 +30,16 @@ def simulation_versions() -> dict[str, str]:
 
 
 class DatasetFiles:
-    """Read and write the folder of a data set.
-
-    A chunk enters the manifest once its rows are on disk, and the manifest is replaced atomically: an interruption
-    leaves every chunk in the manifest whole.
-    """
+    """Read and write the folder of a data set: after an interruption every chunk in the manifest is whole."""
 
     def __init__(self, root: Path):
         self.root, self.manifest_path = root, root / "manifest.json"
         self._temporary = root / "manifest.json.tmp"
         self.manifest: dict = {}
+
+    def error(self, message: str) -> DatasetError:
+        """An error that names the manifest."""
+        return DatasetError(f"{self.manifest_path}: {message}")
 
     def lock(self) -> AbstractContextManager:
         """Lock out other processes that want the same data set; does nothing where nothing can be written."""
@@ -55,57 +49,41 @@ class DatasetFiles:
         return FileLock(root.with_name(f".{root.name}.lock")) if writable else nullcontext()
 
     def find(self, request: dict) -> bool:
-        """Whether the data set of a request is there, finished or started; reads its manifest and checks all its files.
-
-        Raises DatasetError if something else is there, another or a damaged data set.
-        """
+        """Whether the data set of a request is there; checks all its files; DatasetError for anything else."""
         if not self.manifest_path.is_file():
             if self.root.exists() and not self.root.is_dir():
                 raise DatasetError(f"{self.root}: not a folder. Use another path.")
             if self.root.is_dir() and any(file != self._temporary for file in self.root.iterdir()):
-                raise DatasetError(
-                    f"{self.root}: the folder is not empty and has no manifest.json, so it is no data set or a "
-                    "damaged one. Use another folder."
-                )
+                raise DatasetError(f"{self.root}: not empty and has no manifest.json. Use another folder.")
             return False
         self.read()
         there = self.manifest["request"]
         if differing := [key for key in request if there.get(key) != request[key]]:
             what = ", ".join(f"{key} is {there.get(key)}, not {request[key]}" for key in differing)
-            raise DatasetError(
-                f"{self.manifest_path}: another data set is there ({what}). Use another folder, or delete this one."
-            )
+            raise self.error(f"another data set is there ({what}). Use another folder, or delete this one.")
         for split in filter(self.rows_done, SPLITS):
             self.open(split, checksums=True)
         return True
 
     def read(self) -> None:
         """Read the manifest; DatasetError if it is missing, damaged or of another format."""
-        file = self.manifest_path
         try:
-            manifest = json.loads(file.read_text(encoding="utf-8"))
+            manifest = json.loads(self.manifest_path.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            raise DatasetError(
-                f"{file}: no such file, so there is no data set. Make one with create_dataset."
-            ) from None
+            raise self.error("no such file, so there is no data set. Make one with create_dataset.") from None
         except ValueError as error:
-            raise DatasetError(f"{file}: damaged ({error}). {_REMEDY}") from error
+            raise self.error(f"damaged ({error}). {_REMEDY}") from error
         if not isinstance(manifest, dict) or not isinstance(manifest.get("format"), int):
-            raise DatasetError(f"{file}: damaged (no format number). {_REMEDY}")
+            raise self.error(f"damaged (no format number). {_REMEDY}")
         if manifest["format"] != FORMAT:
-            order, remedy = "newer", "Update torchrl_gn."
-            if manifest["format"] < FORMAT:
-                order, remedy = "older", "Delete the folder and create it again, with the same seed, or use another."
-            raise DatasetError(
-                f"{file}: format {manifest['format']} is {order} than {FORMAT}, the only one that this version reads. "
-                + remedy
-            )
+            remedy = "Update torchrl_gn." if manifest["format"] > FORMAT else "Delete the folder and create it again."
+            raise self.error(f"format {manifest['format']}, but this version reads only {FORMAT}. {remedy}")
         if missing := _KEYS - manifest.keys():
-            raise DatasetError(f"{file}: damaged (no {sorted(missing)}). {_REMEDY}")
+            raise self.error(f"damaged (no {sorted(missing)}). {_REMEDY}")
         self.manifest = manifest
 
     def create(self, **entries: object) -> None:
-        """Make the folder and a manifest of these entries, the format and no chunks."""
+        """Make the folder and a manifest without chunks."""
         self.root.mkdir(parents=True, exist_ok=True)
         self.manifest = {"format": FORMAT, **entries, "chunks": {split: [] for split in SPLITS}}
         self._write()
@@ -145,10 +123,7 @@ class DatasetFiles:
         self._write()
 
     def open(self, split: str, *, checksums: bool) -> TensorDict:
-        """A split that was started, mapped from disk copy-on-write: writing to it never reaches the files.
-
-        Raises DatasetError if a file is missing, changed, of another size or, of a finished chunk, fails its checksum.
-        """
+        """A split that was started, mapped from disk copy-on-write; DatasetError if a file is missing or changed."""
         folder, chunks, count = self.root / split, self.manifest["chunks"][split], self.manifest["request"]["chunk"]
         for name, expected in chunks[0]["crc32"].items():
             file = folder / name
@@ -160,20 +135,16 @@ class DatasetFiles:
         shapes = TensorDict.load_memmap(folder, device=torch.device("meta"), allow_pickle=False).flatten_keys("/")
         entries = {tuple(name.split("/")): _map(folder / f"{name}.memmap", like) for name, like in shapes.items()}
         data = TensorDict(entries, batch_size=shapes.batch_size)
-        for number, chunk in enumerate(chunks if checksums else ()):
-            first = number * count
+        for first, chunk in zip(range(0, len(data), count), chunks if checksums else (), strict=False):
             rows = cast(TensorDict, data[first : first + count])
             for name, found in _checksums(rows).items():
                 if chunk["crc32"].get(name) != found:
-                    raise DatasetError(
-                        f"{folder / name}: sequences {first} to {first + len(rows) - 1} do not have their checksum: "
-                        f"damaged. {_REMEDY}"
-                    )
+                    where = f"{folder / name}: sequences {first} to {first + len(rows) - 1}"
+                    raise DatasetError(f"{where} do not have their checksum: damaged. {_REMEDY}")
         return data
 
 
 def _checksums(rows: TensorDict) -> dict[str, int]:
-    """Checksum of each file's rows; a tensor without elements has no file."""
     leaves = rows.flatten_keys("/").items()
     return {f"{name}.memmap": zlib.crc32(leaf.contiguous().numpy().data) for name, leaf in leaves if leaf.numel()}
 

@@ -28,26 +28,18 @@ def trajectory_buffer(
     """Replay buffer that draws transitions, or windows of them, from trajectories without copying these.
 
     Draws (trajectory, start time) uniformly with replacement. ``sample()`` gives a TensorDict ``[batch_size]``, or
-    ``[batch_size, window]`` for windows longer than one, of ``state`` ``[..., N, 13]``, ``action`` ``[..., A]``,
-    ``("next", "state")`` ``[..., N, 13]``, ``index`` ``[..., 2]`` (trajectory, time) and the trajectory's
-    ``parameters``. ``buffer[i]`` gives whole trajectories. ``state_dict()`` holds the random state, and the
-    trajectories with ``capacity``.
+    ``[batch_size, window]`` for windows longer than one, of ``state``, ``action``, ``("next", "state")``, ``index``
+    ``[..., 2]`` (trajectory, time) and ``parameters``. ``buffer[i]`` gives whole trajectories.
 
     Args:
         trajectories: ``[M]`` of ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and optionally ``parameters`` (a
             tensor ``[M, ...]`` or a TensorDict ``[M]``); other entries are ignored.
-        batch_size: transitions or windows in a sample.
         window: consecutive transitions in a draw.
-        seed: seed of the draws; default: drawn from torch's global generator.
+        seed: default: drawn from torch's global generator.
         capacity: trajectories to allocate, for ``extend`` to add more and replace the oldest; default: read-only.
-        query_windows: ``(count, length)`` of query windows at other times of the same trajectory, after the first
-            along the second dimension, ``[batch_size, window + count * length]`` (paper, SM "End-to-end training
-            algorithm for System ID").
+        query_windows: ``(count, length)`` of windows at other times of the same trajectory to append to each draw,
+            ``[batch_size, window + count * length]`` (paper, SM "End-to-end training algorithm for System ID").
         shard: ``(rank, size)``: return only this equal part of each draw; ranks with one seed share the draws.
-
-    Raises:
-        KeyError: if ``state`` or ``action`` is missing.
-        ValueError: if there is no trajectory, one is shorter than ``window``, or an argument does not fit.
     """
     if batch_size < 1 or window < 1:
         raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
@@ -58,11 +50,10 @@ def trajectory_buffer(
     if batch_size % shard[1]:
         raise ValueError(f"batch_size={batch_size} cannot be split evenly among {shard[1]} processes; use a multiple")
     trajectories = _checked(trajectories, max(window, query_windows[1] if query_windows else 1))
-    count = len(trajectories)
     if capacity is None:
         storage, writer = TrajectoryStorage(trajectories), ImmutableDatasetWriter()
-    elif capacity < count:
-        raise ValueError(f"capacity is {capacity}, but {count} trajectories are given")
+    elif capacity < len(trajectories):
+        raise ValueError(f"capacity is {capacity}, but {len(trajectories)} trajectories are given")
     else:
         room = trajectories.apply(lambda x: x.new_zeros(capacity, *x.shape[1:]), batch_size=[capacity])
         storage, writer = TrajectoryStorage(room, writable=True), TensorDictRoundRobinWriter()
@@ -84,19 +75,14 @@ class TrajectoryStorage(TensorStorage):
 
     @property
     def trajectories(self) -> TensorDictBase:
-        """``[M]`` trajectories, allocated ones included."""
         return cast(TensorDictBase, self._storage)
 
     @property
     def steps(self) -> int:
-        """Transitions ``T`` in each trajectory."""
         return self.trajectories.get("action").shape[1]
 
     def get(self, index: Any) -> TensorDictBase:
-        """Transitions at ``(trajectory, time)``: integers ``[B]`` or ``[B, W]`` each, or one ``[..., 2]``.
-
-        Rows of ``[B, W]`` must each be of one trajectory. Other indices give whole trajectories.
-        """
+        """Transitions at ``(trajectory, time)``, ``[B]`` or ``[B, W]`` each; other indices give whole trajectories."""
         if isinstance(index, Tensor) and index.ndim > 1:  # from a ReplayBufferEnsemble
             index = index.unbind(-1)
         if not isinstance(index, tuple):
@@ -109,20 +95,15 @@ class TrajectoryStorage(TensorStorage):
             "action": _rows(stored.get("action"), trajectory * self.steps + time),
             "next": TensorDict({"state": _rows(stored.get("state"), here + 1)}, batch_size=here.shape),
         }
-        parameters = stored.get("parameters", None)
-        if parameters is not None and trajectory.ndim == 1:
-            entries["parameters"] = parameters[trajectory]
-        elif parameters is not None:
-            rows = parameters[trajectory[:, 0]].unsqueeze(1)
-            entries["parameters"] = rows.expand(*trajectory.shape, *parameters.shape[1:])
+        if (parameters := stored.get("parameters", None)) is not None:
+            own = parameters[trajectory if trajectory.ndim == 1 else trajectory[:, :1]]
+            entries["parameters"] = own.expand(*trajectory.shape, *parameters.shape[1:])
         return TensorDict(entries, batch_size=here.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
-        """Write the stored entries of trajectories of the stored shape."""
         super().set(cursor, data.select(*self.trajectories.keys()), set_cursor=set_cursor)
 
     def state_dict(self) -> dict[str, Any]:
-        """The trajectories if writable, else nothing."""
         return super().state_dict() if self.writable else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -142,11 +123,10 @@ class WindowSampler(Sampler):
         shard: tuple[int, int] = (0, 1),
     ):
         self.window, self.query_windows, self.shard = window, query_windows, shard
-        self._generator = torch.Generator()
-        self._generator.manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+        self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
     def sample(self, storage: TrajectoryStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
-        """Draw ``batch_size`` windows; return this shard's (trajectory, time), ``[B]`` or ``[B, W]``, no metadata."""
+        """This shard's (trajectory, time), ``[B]`` or ``[B, W]``, of ``batch_size`` windows, and no metadata."""
         starts = storage.steps - self.window + 1
         if not len(storage):
             raise RuntimeError("The buffer has no trajectory yet: extend it first.")
@@ -163,7 +143,6 @@ class WindowSampler(Sampler):
         return (trajectory[own], time[own]), {}
 
     def _query_windows(self, start: Tensor, steps: int) -> Tensor:
-        """Draw times ``[B, count * length]`` of windows that do not start at ``start``."""
         assert self.query_windows is not None
         count, length = self.query_windows
         starts = steps - length + 1
@@ -172,10 +151,9 @@ class WindowSampler(Sampler):
         return (drawn[..., None] + torch.arange(length)).flatten(1)
 
     def _empty(self) -> None:
-        """Do nothing: draws are independent."""
+        pass  # draws are independent
 
     def state_dict(self) -> dict[str, Any]:
-        """The random state."""
         return {"generator": self._generator.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -205,22 +183,14 @@ def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:
             raise KeyError(f"trajectories have no {key!r}, only {sorted(map(str, trajectories.keys()))}")
     trajectories = trajectories.select(*_KEYS, strict=False)
     state, action = trajectories.get("state"), trajectories.get("action")
+    shapes = f"got state {list(state.shape)} and action {list(action.shape)}"
     if trajectories.batch_dims != 1 or state.ndim < 3 or action.ndim != 3:
-        raise ValueError(
-            "trajectories must be a TensorDict [M] of state [M, T+1, ...] and action [M, T, A], got "
-            f"{list(trajectories.shape)}, {list(state.shape)} and {list(action.shape)}"
-        )
+        raise ValueError(f"trajectories must be [M] of state [M, T+1, ...] and action [M, T, A], {shapes}")
     if state.shape[1] != action.shape[1] + 1:
-        raise ValueError(
-            f"a trajectory has one state more than actions, got state {list(state.shape)} and "
-            f"action {list(action.shape)}"
-        )
+        raise ValueError(f"a trajectory has one state more than actions, {shapes}")
     if not len(trajectories):
         raise ValueError("there is no trajectory to sample from")
     if action.shape[1] < window:
-        raise ValueError(
-            f"window is {window} transitions, but the trajectories have {action.shape[1]}: "
-            "use a smaller window or longer trajectories"
-        )
+        raise ValueError(f"window is {window} transitions, but the trajectories have {action.shape[1]}")
     # Samples are gathered from flat views, which strided tensors lack.
     return trajectories.apply(lambda x: x.detach().contiguous())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -14,10 +13,15 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_gn.finite import require_finite
+from torchrl_gn.processor import usable_cores
 from torchrl_gn.scenes.scene import Scene
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _HUGE = float(mujoco.mjMAXVAL)  # MuJoCo resets a simulation with larger numbers
+
+
+class UnstableSimulationError(RuntimeError):
+    """Too many simulations of a scene become unstable."""
 
 
 class Simulator:
@@ -32,18 +36,14 @@ class Simulator:
         scenes: the scene, or several of equal topology (variants of one system).
         num_threads: threads of the simulation; default: the cores this process may use.
         memory: bytes of MuJoCo's output held at a time; default: 8 MB a thread, at most 256 MB.
-
-    Raises:
-        ValueError: if there is no scene, topologies differ, or ``num_threads`` is below one.
     """
 
     def __init__(self, scenes: Scene | Sequence[Scene], num_threads: int | None = None, *, memory: int | None = None):
         self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
         _check_topology(self.scenes)
         self.scene = self.scenes[0]
-        if num_threads is None:
-            num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        if num_threads is None or num_threads < 1:
+        num_threads = usable_cores() if num_threads is None else num_threads
+        if num_threads < 1:
             raise ValueError(f"num_threads must be at least 1, got {num_threads}")
         self.num_threads = num_threads
         self.memory = min(2**23 * num_threads, 2**28) if memory is None else memory
@@ -62,12 +62,7 @@ class Simulator:
 
         Returns:
             TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, 13]`` and ``physics`` ``[*B, T+1, S]``, float64, given
-                states
-            first, and ``stable`` ``[*B]`` bool. Quaternion signs are MuJoCo's.
-
-        Raises:
-            ValueError: if a shape is wrong, or a value not finite (the message has its index).
-            TypeError: if ``physics`` is not float64 or ``actions`` not floating point.
+            states first, and ``stable`` ``[*B]`` bool. Quaternion signs are MuJoCo's.
         """
         scene = self.scene
         start = self._checked_physics(physics)
@@ -77,13 +72,10 @@ class Simulator:
         batch = start.shape[:-1]
         if controls.ndim < 2 or controls.shape[:-2] != batch or controls.shape[-1] != scene.num_actions:
             wanted = ", ".join([*map(str, batch), "T", str(scene.num_actions)])
-            raise ValueError(
-                f"actions of {scene.name!r} must be [{wanted}] to fit physics {list(start.shape)}, "
-                f"got {list(controls.shape)}"
-            )
+            raise ValueError(f"actions of {scene.name!r} must be [{wanted}], got {list(controls.shape)}")
         require_finite(controls, "actions")
-        steps, count = controls.shape[-2], int(np.prod(batch, dtype=np.int64))
         which = self._variants(variant, batch)
+        steps, count = controls.shape[-2], len(which)
         start = start.reshape(count, scene.physics_size)
         controls = controls.reshape(count, steps, scene.num_actions).astype(np.float64, copy=False)
 
@@ -100,15 +92,12 @@ class Simulator:
             state[rows] = sensors[:, ::held, scene.sensor_slice].reshape(state[rows].shape)
             recorded[rows, 0] = start[rows]
             recorded[rows, 1:] = after[:, held - 1 :: held][:, :steps]
-        result = {
-            "state": torch.from_numpy(state.reshape(*batch, *state.shape[1:])),
-            "physics": torch.from_numpy(recorded.reshape(*batch, *recorded.shape[1:])),
-            "stable": torch.from_numpy(stable.reshape(batch)),
-        }
+        arrays = {"state": state, "physics": recorded, "stable": stable}
+        result = {name: torch.from_numpy(array.reshape((*batch, *array.shape[1:]))) for name, array in arrays.items()}
         return TensorDict(result, batch_size=batch)
 
     def observe(self, physics: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None) -> Tensor:
-        """Body states ``[*B, N, 13]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`; kinematics alone."""
+        """Body states ``[*B, N, 13]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`."""
         start = self._checked_physics(physics)
         batch = start.shape[:-1]
         which = self._variants(variant, batch)
@@ -117,11 +106,8 @@ class Simulator:
         for row, values in enumerate(start.reshape(len(which), self.scene.physics_size)):
             model = self.scenes[which[row]].model
             mujoco.mj_setState(model, data, values, _PHYSICS)
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_comVel(model, data)
-            mujoco.mj_sensorPos(model, data)
-            mujoco.mj_sensorVel(model, data)
+            for stage in ("kinematics", "comPos", "comVel", "sensorPos", "sensorVel"):
+                getattr(mujoco, f"mj_{stage}")(model, data)
             state[row] = data.sensordata[where].reshape(state.shape[1:])
         return torch.from_numpy(state.reshape(*batch, *state.shape[1:]))
 
@@ -130,20 +116,14 @@ class Simulator:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advance states ``[n, S]``, float64, by one control step with actions ``[n, A]``, float64.
 
-        Saves the physics step that :meth:`rollout` adds to see the last state, so does not detect if that one is
-        unstable.
-
-        Returns:
-            Next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, 13]``, float64.
+        Returns next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, 13]``, float64.
+        Saves the physics step that :meth:`rollout` adds to see the last state, whose stability is not checked.
         """
         scene = self.scene
         start = self._checked_physics(physics, finite=False)
         which = self._variants(variant, start.shape[:-1])
-        if actions.shape != (*start.shape[:-1], scene.num_actions):
-            raise ValueError(
-                f"actions of {scene.name!r} must be {[*start.shape[:-1], scene.num_actions]} to fit physics"
-                f" {list(start.shape)}, got {list(actions.shape)}"
-            )
+        if actions.shape != (wanted := (*start.shape[:-1], scene.num_actions)):
+            raise ValueError(f"actions of {scene.name!r} must be {list(wanted)}, got {list(actions.shape)}")
         after, state = np.empty_like(start), np.empty((len(start), scene.num_nodes, 13))
         for rows in self._chunks(len(start), scene.substeps):
             held = np.repeat(actions[rows, None], scene.substeps, axis=1)
@@ -155,10 +135,7 @@ class Simulator:
     def settle(
         self, physics: np.ndarray, steps: int, variant: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Advance states ``[n, S]``, float64, by physics steps without control, and keep their time.
-
-        Returns states ``[n, S]`` and whether they are stable ``[n]``.
-        """
+        """States ``[n, S]`` after physics steps without control, with their old time, and stability ``[n]``."""
         start = self._checked_physics(physics)
         which = self._variants(variant, start.shape[:-1])
         settled, stable = np.empty_like(start), np.empty(len(start), dtype=bool)
@@ -186,17 +163,14 @@ class Simulator:
                 controls if self.scene.num_actions else None,
                 nstep=controls.shape[1],
             )
-        stable = self._is_stable(start, after)
-        # Summed in MuJoCo's order.
-        after[zero, :, 0] = np.cumsum(np.full(after.shape[1], self.scene.model.opt.timestep))
-        return after, sensors, stable
-
-    def _is_stable(self, start: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Whether the time always advances, as MuJoCo resets it at instability and then repeats the state."""
+        timestep = self.scene.model.opt.timestep
         time = np.concatenate([start[:, :1], after[:, :, 0]], axis=1)
-        advances = (np.diff(time, axis=1) > 0.5 * self.scene.model.opt.timestep).all(axis=1)
+        stable = (np.diff(time, axis=1) > 0.5 * timestep).all(axis=1)
         # Comparisons with NaN are false.
-        return advances & (np.abs(start) <= _HUGE).all(axis=1) & (np.abs(after) <= _HUGE).all(axis=(1, 2))
+        stable &= (np.abs(start) <= _HUGE).all(axis=1) & (np.abs(after) <= _HUGE).all(axis=(1, 2))
+        # Summed in MuJoCo's order.
+        after[zero, :, 0] = np.cumsum(np.full(after.shape[1], timestep))
+        return after, sensors, stable
 
     def _chunks(self, count: int, steps: int) -> Iterator[slice]:
         row = 8 * (self.scene.model.nsensordata + self.scene.physics_size + self.scene.num_actions)
@@ -208,9 +182,8 @@ class Simulator:
         if array.dtype != np.float64:
             raise TypeError(f"physics must be float64 to keep every digit, got {array.dtype}")
         if array.ndim < 1 or array.shape[-1] != self.scene.physics_size:
-            raise ValueError(
-                f"physics of {self.scene.name!r} must be [*B, {self.scene.physics_size}], got {list(array.shape)}"
-            )
+            wanted = f"[*B, {self.scene.physics_size}]"
+            raise ValueError(f"physics of {self.scene.name!r} must be {wanted}, got {list(array.shape)}")
         if finite:
             require_finite(array, "physics")
         return array
@@ -240,15 +213,21 @@ def _check_topology(scenes: tuple[Scene, ...]) -> None:
         raise ValueError("A simulator needs at least one scene.")
     first = scenes[0]
     for i, scene in enumerate(scenes[1:], start=1):
-        for what in ("node_names", "joint_names", "actuator_names", "substeps", "physics_size"):
+        for what in (
+            "node_names",
+            "joint_names",
+            "actuator_names",
+            "substeps",
+            "physics_size",
+            "senders",
+            "sensor_slice",
+        ):
             ours, theirs = getattr(first, what), getattr(scene, what)
-            if ours != theirs:
+            if not np.array_equal(ours, theirs):
                 raise ValueError(
-                    f"Scenes simulated together must have equal topology, but {what} of scene 0 "
-                    f"({first.name!r}) is {ours} and of scene {i} ({scene.name!r}) {theirs}."
+                    f"Scenes simulated together must have equal topology, but {what} of scene 0 ({first.name!r})"
+                    f" is {ours} and of scene {i} ({scene.name!r}) {theirs}."
                 )
-        if not np.array_equal(first.senders, scene.senders) or first.sensor_slice != scene.sensor_slice:
-            raise ValueError(f"Scenes simulated together must have equal topology; scene {i} ({scene.name!r}) differs.")
 
 
 @contextmanager

@@ -5,8 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from torchrl_gn.data.errors import UnstableSimulationError
-from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
 from torchrl_gn.scenes.scene import Scene
 
 _ATTEMPTS = 10
@@ -17,16 +16,12 @@ def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) ->
 
     - Cartpole: slider uniform in 0.1 m, hinge in 0.034 rad either side, velocities with standard deviation 0.01.
     - Cheetah: limited joints uniform in their limits.
-    - Others: limited hinges and sliders uniform in their limits, unlimited hinges in [-pi, pi], rotations of balls and
-      free joints uniform (limited balls: uniform axis, angle uniform in the limit); all else as in ``qpos0``, at rest.
+    - Others: limited joints uniform in their limits, unlimited hinges in [-pi, pi], rotations of balls and free joints
+      uniform; all else as in ``qpos0``, at rest.
     - JACO, not in the suite: as others, redrawn while bodies overlap (4 %), which would spin at over 100 rad/s.
 
-    Then simulates ``scene.settle_steps`` physics steps without control, keeps the time, and redraws unstable states.
-    ``rng`` is a generator or a seed.
-
-    Raises:
-        ValueError: if ``n`` is negative.
-        UnstableSimulationError: if states are still unstable after ten draws.
+    Then simulates ``scene.settle_steps`` physics steps without control, keeps the time, and redraws unstable states;
+    UnstableSimulationError after ten draws. ``rng`` is a generator or a seed.
     """
     if n < 0:
         raise ValueError(f"n must not be negative, got {n}")
@@ -50,21 +45,18 @@ def draw_start_states(
         rejected += len(pending)
         states[pending] = _draw_apart(simulator, variant[pending], rng)
     raise UnstableSimulationError(
-        f"{len(pending)} of {n} start states of {scene.name!r} became unstable within the "
-        f"{scene.settle_steps} physics steps after a reset, {_ATTEMPTS} times in a row. "
-        "Use a smaller physics step or softer contacts in the model."
+        f"{len(pending)} of {n} start states of {scene.name!r} became unstable within {scene.settle_steps} physics "
+        f"steps, {_ATTEMPTS} times in a row. Use a smaller physics step or softer contacts in the model."
     )
 
 
 def _draw_apart(simulator: Simulator, variant: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw start states, for JACO without overlapping bodies."""
     states, scenes = _draw_each(simulator, variant, rng), simulator.scenes
     if simulator.scene.origin.get("system") != "jaco":
         return states
     pending, data = np.arange(len(variant)), mujoco.MjData(simulator.scene.model)
     while len(pending):
-        overlapping = [row for row in pending if _overlaps(scenes[variant[row]].model, data, states[row])]
-        pending = np.array(overlapping, dtype=np.int64)
+        pending = pending[[_overlaps(scenes[variant[row]].model, data, states[row]) for row in pending]]
         states[pending] = _draw_each(simulator, variant[pending], rng)
     return states
 
@@ -83,38 +75,31 @@ def _overlaps(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray) -> 
 
 
 def _draw(scene: Scene, n: int, rng: np.random.Generator) -> np.ndarray:
-    model = scene.model
-    data = mujoco.MjData(model)
-    rest = np.empty(scene.physics_size)
-    mujoco.mj_getState(model, data, rest, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    model, rest = scene.model, np.empty(scene.physics_size)
+    mujoco.mj_getState(model, mujoco.MjData(model), rest, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     states = np.tile(rest, (n, 1))
     qpos = states[:, 1 : 1 + model.nq]  # after the time; both are views
     qvel = states[:, 1 + model.nq : 1 + model.nq + model.nv]
-    system = scene.origin.get("system")
-    if system == "cartpole":
+    if scene.origin.get("system") == "cartpole":
         qpos[:, 0] = rng.uniform(-0.1, 0.1, n)
         qpos[:, 1:] = rng.uniform(-0.034, 0.034, (n, model.nq - 1))
         qvel[:] = 0.01 * rng.standard_normal((n, model.nv))
     else:
-        _randomize_joints(model, qpos, rng, rotational=system != "cheetah")
+        _randomize_joints(model, qpos, rng, rotational=scene.origin.get("system") != "cheetah")
     return states
 
 
 def _randomize_joints(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Generator, *, rotational: bool) -> None:
-    """Randomise in place as ``dm_control.suite.utils.randomizers.randomize_limited_and_rotational_joints``.
-
-    ``rotational=False`` keeps unlimited joints, as Cheetah's reset does. Unlike in the suite, whose quaternions are
-    from the positive orthant, rotations of free joints are uniform.
-    """
-    kind = mujoco.mjtJoint
-    n = len(qpos)
+    """Randomise in place as the suite's ``randomize_limited_and_rotational_joints``, but with uniform rotations."""
+    kind, n = mujoco.mjtJoint, len(qpos)
     for joint in range(model.njnt):
         first, low, high = model.jnt_qposadr[joint], *model.jnt_range[joint]
         match model.jnt_type[joint], bool(model.jnt_limited[joint]):
             case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE), True):
                 qpos[:, first] = rng.uniform(low, high, n)
             case kind.mjJNT_BALL, True:
-                qpos[:, first : first + 4] = _limited_quaternions(n, high, rng)
+                axis, half = _unit(rng.standard_normal((n, 3))), 0.5 * rng.uniform(0.0, high, (n, 1))
+                qpos[:, first : first + 4] = np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
             case kind.mjJNT_HINGE, False if rotational:
                 qpos[:, first] = rng.uniform(-np.pi, np.pi, n)
             case kind.mjJNT_BALL, False if rotational:
@@ -125,9 +110,3 @@ def _randomize_joints(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Ge
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def _limited_quaternions(n: int, limit: float, rng: np.random.Generator) -> np.ndarray:
-    axis = _unit(rng.standard_normal((n, 3)))
-    half = 0.5 * rng.uniform(0.0, limit, (n, 1))
-    return np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)

@@ -33,14 +33,13 @@ from torchrl_gn.scenes.scene import Scene
 class ModelEnv(ModelBasedEnvBase):
     """Steps predicted by a learned model, with the specs of :class:`~torchrl_gn.envs.SceneEnv` but no ``physics``.
 
-    Stateless, batched over any leading batch, and differentiable in ``state``, ``action`` and the weights of the
-    submodule ``world_model``; nothing is detached. A prediction that is not finite keeps the last good state, sets
-    ``done`` and ``terminated`` and gives ``unstable_reward``. Rollouts do not check ``done``, which would wait for a
-    GPU; ``TransformedEnv`` around the environment does.
+    Stateless, batched over any leading batch, and differentiable in ``state``, ``action`` and the weights of
+    ``world_model``. A prediction that is not finite keeps the last good state, sets ``done`` and ``terminated`` and
+    gives ``unstable_reward``. Rollouts do not check ``done``; ``TransformedEnv`` around the environment does.
 
     ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state``, ``reset()`` from drawn ones. Physical
-    parameters (``parameters_key``) come from the TensorDict, else from the scene (zeros if inferred); TorchRL does not
-    carry them across auto-resets. A recurrent model's entry ``hidden_state`` begins at its initial value.
+    parameters come from the TensorDict, else from the scene (zeros if inferred); TorchRL does not carry them across
+    auto-resets.
 
     Args:
         model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
@@ -52,7 +51,6 @@ class ModelEnv(ModelBasedEnvBase):
     Raises:
         TypeError: the model lacks these keys or the scene.
         ValueError: an entry, the start states or the reward do not fit the scene, or are not finite.
-        KeyError: when stepping, no ``state`` or ``action``.
     """
 
     _supports_set_state = True
@@ -70,10 +68,8 @@ class ModelEnv(ModelBasedEnvBase):
     ):
         inputs, outputs = getattr(model, "in_keys", ()), getattr(model, "out_keys", ())
         if not {"state", "action"} <= set(inputs) or ("next", "state") not in outputs:
-            raise TypeError(
-                "the model must read 'state' and 'action' and write ('next', 'state'); "
-                f"{type(model).__name__} has in_keys {list(inputs)} and out_keys {list(outputs)}"
-            )
+            keys = f"{type(model).__name__} has in_keys {list(inputs)} and out_keys {list(outputs)}"
+            raise TypeError(f"the model must read 'state' and 'action' and write ('next', 'state'); {keys}")
         if not hasattr(model, "scene"):
             raise TypeError(f"the model has no attribute 'scene'; bind {type(model).__name__} to a scene first")
         if device is None:
@@ -84,6 +80,7 @@ class ModelEnv(ModelBasedEnvBase):
         self.reward = reward_of(reward, self, self.scene)
         self.unstable_reward = finite_reward(unstable_reward)
         self.starts = StartSampler(self.scene, start_states, seed)
+        self._state_shape = self.scene.num_nodes, self.scene.state_size
         self._simulator: Simulator | None = None
         set_specs(self, self.scene, physics=False)
         if self._parameters_key is not None:
@@ -94,20 +91,14 @@ class ModelEnv(ModelBasedEnvBase):
 
     @property
     def predictor(self) -> Predictor | ModulePredictor:
-        """The model, with the methods of a predictor."""
         return as_predictor(cast(TensorDictModuleBase, self.world_model))
 
     @property
     def _parameters_key(self) -> NestedKey | None:
         return getattr(self.world_model, "parameters_key", None)
 
-    @property
-    def _state_shape(self) -> tuple[int, int]:
-        return self.scene.num_nodes, self.scene.state_size
-
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDict:
-        if tensordict is None:
-            tensordict = TensorDict(batch_size=self.batch_size)
+        tensordict = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
         shape = tensordict.shape
         if set_state:
             state = read(tensordict, "state", self._state_shape, self).to(torch.float64, copy=True)
@@ -120,16 +111,14 @@ class ModelEnv(ModelBasedEnvBase):
                 state = self._simulator.observe(state)
         reset = TensorDict({"state": state}, batch_size=shape)
         if (key := self._parameters_key) is not None:
-            parameters = tensordict.get(key, None)
-            if parameters is None:
-                parameters = cast(TensorDictBase, self.world_model.own_parameters()).expand(shape)
+            if (parameters := tensordict.get(key, None)) is None:
+                parameters = cast(Any, self.world_model).own_parameters().expand(shape)
             else:
                 require_finite(parameters, f"{self}: {key!r}")
             reset.set(key, parameters)
         if "hidden_state" in self.world_model.in_keys:
-            hidden_state = tensordict.get("hidden_state", None)
-            if hidden_state is None:
-                hidden_state = cast(TensorDictBase, self.world_model.initial_hidden_state()).expand(shape).clone()
+            if (hidden_state := tensordict.get("hidden_state", None)) is None:
+                hidden_state = cast(Any, self.world_model).initial_hidden_state().expand(shape).clone()
             reset.set("hidden_state", hidden_state)
         return reset.to(self.device)
 
@@ -138,45 +127,35 @@ class ModelEnv(ModelBasedEnvBase):
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         # The model writes into its input: give it a shallow copy, with all entries, some of which it may refuse.
         predicted = self.world_model(tensordict.exclude("next"))["next"]
-        prediction = predicted["state"]
-        stable = prediction.isfinite().flatten(-2).all(-1, keepdim=True)
-        entries: dict[str, Any] = outcome(self, tensordict, state, action, prediction, stable)
+        stable = predicted["state"].isfinite().flatten(-2).all(-1, keepdim=True)
+        entries: dict[str, Any] = outcome(self, tensordict, state, action, predicted["state"], stable)
         if "hidden_state" in predicted.keys():
             entries["hidden_state"] = predicted["hidden_state"]
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def imagine(self, tensordict: TensorDictBase, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """States ``[*B, H + 1, N, 13]`` and rewards ``[*B, H, 1]`` of action sequences, in one call of the model.
+        """States ``[*B, H + 1, N, 13]`` and rewards ``[*B, H, 1]`` of action sequences ``[*B, H, A]``; differentiable.
 
-        Equals stepping, but is faster; predictions that are not finite are returned as they are. Differentiable.
-
-        Args:
-            tensordict: ``[*B]``, as for a step, without its ``action``.
-            actions: ``[*B, H, A]``, H at least 1.
+        Equals stepping a TensorDict ``[*B]``, but is faster; predictions that are not finite are returned as they are.
         """
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
         if actions.shape != shape or shape[-2] < 1:
-            raise ValueError(
-                f"actions must be [*B, H, {self.scene.num_actions}] with the TensorDict's batch"
-                f" {list(tensordict.shape)} and H at least 1, got {list(actions.shape)}"
-            )
+            wanted = f"{[*tensordict.shape, 'H', self.scene.num_actions]} with H at least 1"
+            raise ValueError(f"actions must be {wanted}, got {list(actions.shape)}")
         state = read(tensordict, "state", self._state_shape, self)
         model = self.predictor
         inputs = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
         states, _ = model.rollout(state, actions, *inputs)  # pyright: ignore[reportArgumentType]
-        task = cast("Tensor | None", tensordict.get("task", None))
-        if task is not None:
+        if (task := cast("Tensor | None", tensordict.get("task", None))) is not None:
             batch = tensordict.ndim
             task = task.unsqueeze(batch).expand(*task.shape[:batch], shape[-2], *task.shape[batch:])
         before, after = states[..., :-1, :, :], states[..., 1:, :, :]
         return states, step_reward(self.reward, before, actions, after, task)
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
-        """False: rollouts run their full length, without waiting for a GPU."""
-        return False
+        return False  # rollouts run their full length, without waiting for a GPU
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The input: rollouts do not reset."""
         return tensordict
 
     def _set_seed(self, seed: int | None) -> None:

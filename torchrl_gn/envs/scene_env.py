@@ -20,27 +20,20 @@ class SceneEnv(EnvBase):
     """MuJoCo simulation of a scene, stateless and batched over any leading batch; not differentiable.
 
     Entries:
-        - ``state`` ``[*B, N, 13]`` float64: position 3, w-first quaternion 4, linear velocity 3, angular velocity 3;
-          SI, world frame.
-        - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), all that a step starts from.
+        - ``state`` ``[*B, N, 13]`` float64: position, w-first quaternion, linear and angular velocity; world frame.
+        - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which a step starts from.
         - ``action`` ``[*B, A]``: float32 in the spec, float64 accepted. MuJoCo clamps limited controls.
         - ``variant`` ``[*B, 1]`` int64, with several scenes only: index of the sample's scene.
-        - ``done``, ``terminated`` ``[*B, 1]``: the simulation became unstable. The step keeps the last good state and
-          gives ``unstable_reward``. TorchRL's ``StepCounter`` limits the time.
+        - ``done``, ``terminated`` ``[*B, 1]``: the simulation became unstable; the last good state is kept.
 
     ``reset()`` draws start states for the TensorDict's batch; ``reset(tensordict, set_state=True)`` starts from its
-    ``physics``, or with several scenes from its ``variant`` alone. For collectors see :func:`~torchrl_gn.envs.batched`.
+    ``physics``. For collectors see :func:`~torchrl_gn.envs.batched`.
 
     Args:
-        scene: the scene, or variants of one (:func:`~torchrl_gn.scenes.sample_variants`). A batch cycles through them,
-            or follows the TensorDict's ``variant``; ``env.scene`` is the first.
+        scene: the scene, or variants of one. A batch cycles through them, or follows the TensorDict's ``variant``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own.
-        seed: default: drawn from torch's global generator.
         device: of the TensorDicts; the simulation runs on the CPU.
-
-    Raises:
-        ValueError: an entry, the start states or the reward do not fit the scene, or are not finite.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -79,14 +72,11 @@ class SceneEnv(EnvBase):
 
     @property
     def simulator(self) -> Simulator:
-        """The batched simulation, started at first use."""
-        if self._simulator is None:
-            self._simulator = Simulator(self.scenes, num_threads=self.num_threads)
+        self._simulator = self._simulator or Simulator(self.scenes, num_threads=self.num_threads)
         return self._simulator
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDict:
-        if tensordict is None:
-            tensordict = TensorDict(batch_size=self.batch_size)
+        tensordict = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
         shape = tensordict.shape
         if len(self.scenes) > 1 and tensordict.get("variant", None) is None:
             in_turn = (torch.arange(shape.numel()) % len(self.scenes)).reshape(*shape, 1)
@@ -98,7 +88,8 @@ class SceneEnv(EnvBase):
             physics = physics.cpu().to(torch.float64, copy=True)
         else:
             physics = self.starts.draw(shape, tensordict.get("_reset", None), variant, simulator=self.simulator)
-        entries = {"state": self.simulator.observe(physics, _each(variant)), "physics": physics}
+        which = None if variant is None else variant.squeeze(-1)
+        entries = {"state": self.simulator.observe(physics, which), "physics": physics}
         if variant is not None:
             entries["variant"] = variant
         return TensorDict(entries, batch_size=shape).to(self.device)
@@ -119,7 +110,8 @@ class SceneEnv(EnvBase):
         require_finite(action, f"{self}: 'action'")
         controls = action.unsqueeze(-2).cpu().to(torch.float64)
         variant = self.variant_of(tensordict)
-        simulated = self.simulator.rollout(physics.detach().cpu(), controls, _each(variant))
+        which = None if variant is None else variant.squeeze(-1)
+        simulated = self.simulator.rollout(physics.detach().cpu(), controls, which)
         # Entry by entry: TensorDict.to costs as much as a small simulation.
         stable = simulated["stable"].to(self.device).unsqueeze(-1)
         state, next_state = simulated["state"].to(self.device).unbind(-3)
@@ -138,7 +130,3 @@ class SceneEnv(EnvBase):
     def __getstate__(self) -> dict:
         # Copies and worker processes start their own threads and MuJoCo data.
         return {**super().__getstate__(), "_simulator": None}
-
-
-def _each(variant: Tensor | None) -> Tensor | None:
-    return None if variant is None else variant.squeeze(-1)

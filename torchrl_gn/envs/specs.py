@@ -21,7 +21,7 @@ RewardFunction = Callable[..., Tensor]
 
 
 def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -> None:
-    """Set an environment's specs for a scene: float64 observations, float32 actions and rewards, as in TorchRL."""
+    """Set an environment's specs for a scene: float64 observations, float32 actions and rewards."""
     device = env.device
 
     def unbounded(*shape: int) -> Unbounded:
@@ -33,8 +33,7 @@ def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -
     if variants > 1:
         observation["variant"] = Bounded(0, variants - 1, shape=torch.Size((1,)), dtype=torch.int64, device=device)
     env.observation_spec = Composite(observation, device=device)
-    # A step reads these besides the action.
-    inputs = {"physics" if physics else "state", "variant"} & observation.keys()
+    inputs = {"physics" if physics else "state", "variant"} & observation.keys()  # of a step, besides the action
     env.state_spec = Composite({key: observation[key].clone() for key in inputs}, device=device)
     actions: dict[str, Any] = {"shape": torch.Size((scene.num_actions,)), "dtype": torch.float32, "device": device}
     low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (scene.action_low, scene.action_high))
@@ -52,8 +51,7 @@ def spec_of(entries: TensorDictBase, device: torch.device | None) -> Composite:
 
 def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvBase) -> Tensor:
     """Return an entry ``[*B, *shape]`` of an input ``[*B]``; KeyError if missing, ValueError for another shape."""
-    value = tensordict.get(key, None)
-    if value is None:
+    if (value := tensordict.get(key, None)) is None:
         raise KeyError(f"{env} needs an entry {key!r} in its input; reset() writes the state, a policy the action")
     if value.shape != (expected := (*tensordict.shape, *shape)):
         raise ValueError(f"{env}: {key!r} must be {list(expected)}, got {list(value.shape)}")
@@ -61,7 +59,7 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
 
 
 def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
-    """Return the reward on the environment's device, copied if need be; raise ValueError if it is of another scene."""
+    """The reward on the environment's device, copied if need be; ValueError if it is of another scene."""
     if not isinstance(reward, nn.Module):
         return reward
     for each in reward.modules():
@@ -73,7 +71,7 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
 
 
 def finite_reward(value: float) -> float:
-    """Return the reward of an unstable step; raise ValueError if it is not finite, which would spoil averages."""
+    """The reward of an unstable step; ValueError if it is not finite."""
     if not math.isfinite(value):
         raise ValueError(f"unstable_reward must be finite, got {value}; give a large negative number")
     return float(value)
@@ -82,7 +80,7 @@ def finite_reward(value: float) -> float:
 def step_reward(
     reward: RewardFunction | None, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None
 ) -> Tensor:
-    """Return a step's reward ``[*B, 1]`` in float32, zero without a function; raise ValueError for another shape."""
+    """A step's reward ``[*B, 1]`` in float32, zero without a function; ValueError for another shape."""
     shape = (*next_state.shape[:-2], 1)
     if reward is None:
         return next_state.new_zeros(shape, dtype=torch.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -14,6 +15,7 @@ from torchrl.envs import BatchSizeTransform, EnvBase, TransformedEnv
 from torchrl_gn.data.controls import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.scene import Scene
 
@@ -21,11 +23,7 @@ StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndar
 
 
 class StartSampler:
-    """Draw start states of a scene (the first of its variants) or of a robot known by its joints, reproducibly.
-
-    ``start_states`` are ``[M, S]`` full MuJoCo states, drawn uniformly, or a function ``(n, generator) -> [n, S]``;
-    by default those of the system. A robot of joints needs node states ``[M, N, C]``. Others raise ValueError.
-    """
+    """Draw start states of a scene or of a robot known by its joints; ``start_states`` as of the environments."""
 
     def __init__(
         self, scene: Scene | KinematicTree, start_states: StartStates | None = None, seed: int | None = None
@@ -34,16 +32,9 @@ class StartSampler:
         joints = isinstance(scene, KinematicTree)
         self.shape = (scene.num_nodes, scene.state_size) if joints else (scene.physics_size,)
         if joints and start_states is None:
-            raise ValueError(
-                f"Nothing is known of where robot {scene.name!r} starts; give start_states"
-                f" [M, {scene.num_nodes}, {scene.state_size}], those of its log, say."
-            )
-        self._function: Callable[[int, np.random.Generator], np.ndarray] | None = None
-        self._table: np.ndarray | None = None
-        if isinstance(start_states, (Tensor, np.ndarray)):
-            self._table = self._checked(start_states, None)
-        else:
-            self._function = start_states
+            raise ValueError(f"Robot {scene.name!r} needs start_states {['M', *self.shape]}, those of its log, say.")
+        given = isinstance(start_states, (Tensor, np.ndarray))
+        self._source = self._checked(start_states, None) if given else start_states
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
@@ -60,16 +51,12 @@ class StartSampler:
     ) -> Tensor:
         """Return start states ``[*B, S]`` (robot of joints: ``[*B, N, C]``), float64, on the CPU, for a batch shape.
 
-        Args:
-            reset: ``[*B]`` or ``[*B, 1]`` bool, samples to draw for (default all); the others get a copy of one.
-            variant: ``[*B, 1]`` index of each sample's variant, if there are several.
-            simulator: of the scene or its variants; None for a robot of joints.
+        Samples where ``reset`` ``[*B]`` or ``[*B, 1]`` is False get a copy of another. ``variant`` is ``[*B, 1]``.
         """
         size = shape.numel()
         mask = np.ones(size, dtype=bool) if reset is None else reset.reshape(size).cpu().numpy()
         states = np.zeros((size, *self.shape))
-        count = int(mask.sum())
-        if count:
+        if count := int(mask.sum()):
             which = None if variant is None else variant.reshape(size).cpu().numpy()[mask]
             drawn = self._sample(count, which, simulator)
             states[:] = drawn[0]
@@ -77,39 +64,26 @@ class StartSampler:
         return torch.from_numpy(states).reshape(*shape, *self.shape)
 
     def _sample(self, count: int, variant: np.ndarray | None, simulator: Simulator | None) -> np.ndarray:
-        if self._table is not None:
-            return self._table[self._rng.integers(len(self._table), size=count)]
-        if self._function is not None:
-            return self._checked(self._function(count, self._rng), count)
+        if isinstance(self._source, np.ndarray):
+            return self._source[self._rng.integers(len(self._source), size=count)]
+        if self._source is not None:
+            return self._checked(self._source(count, self._rng), count)
         variant = np.zeros(count, dtype=np.int64) if variant is None else variant
         # A robot of joints has one of the above.
         return draw_start_states(cast(Simulator, simulator), variant, self._rng)[0]
 
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:
-        if isinstance(states, Tensor):
-            states = states.detach().cpu().numpy()
-        states = np.array(states, dtype=np.float64)
-        right = states.shape[1:] == self.shape and len(states) > 0
-        if not right or (count is not None and len(states) != count):
-            wanted = f"[{', '.join(map(str, ('M' if count is None else count, *self.shape)))}]"
+        states = np.array(states.detach().cpu().numpy() if isinstance(states, Tensor) else states, dtype=np.float64)
+        if states.shape != (count or max(1, len(states)), *self.shape):
+            wanted = f"[{', '.join(map(str, (count or 'M', *self.shape)))}]"
             raise ValueError(f"start states of {self.scene.name!r} must be {wanted}, got {list(states.shape)}")
-        finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
-        if not finite.all():
-            bad = int(np.flatnonzero(~finite)[0])
-            raise ValueError(f"start state {bad} of {self.scene.name!r} is not finite")
+        require_finite(states, f"start states of {self.scene.name!r}")
         return states
 
 
-class _Starts:
+def _reset_each(env: EnvBase, size: torch.Size, _: TensorDictBase | None, reset: TensorDictBase) -> TensorDictBase:
     """Reset every sample of a batch to its own start state: ``BatchSizeTransform`` alone repeats one."""
-
-    def __init__(self, env: EnvBase, batch_size: torch.Size) -> None:
-        self.env, self.batch_size = env, batch_size
-
-    def __call__(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if tensordict_reset.shape == self.batch_size:
-            return tensordict_reset
-        return self.env.reset(TensorDict(batch_size=self.batch_size))
+    return reset if reset.shape == size else env.reset(TensorDict(batch_size=size))
 
 
 def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
@@ -124,4 +98,4 @@ def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
     size = torch.Size(batch_size)
     if not size or min(size) < 1:
         raise ValueError(f"batch_size must be numbers of at least 1, got {list(size)}")
-    return TransformedEnv(env, BatchSizeTransform(batch_size=size, reset_func=_Starts(env, size)))
+    return TransformedEnv(env, BatchSizeTransform(batch_size=size, reset_func=partial(_reset_each, env, size)))

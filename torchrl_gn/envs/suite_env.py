@@ -36,13 +36,11 @@ def suite_env(
     """Make a task of the suite, whose observation is one entry ``observation`` ``[num_envs, O]`` float32.
 
     Args:
-        domain: for example ``"swimmer"``.
         task: for example ``"swimmer6"``; swimmers may have any number of links from 3.
         num_envs: number of environments, stepped in turn in this process.
         timestep: control step, seconds, a multiple of the physics step. Default: the suite's.
         steps: control steps of an episode; None: the suite's time limit.
         keys: the suite's entries to concatenate, in order. Default: all.
-        seed: of start states and targets; each environment derives its own.
 
     Example:
         >>> suite_env("swimmer", "swimmer6", num_envs=2, timestep=0.02).reset()["observation"].shape
@@ -53,8 +51,7 @@ def suite_env(
     seeds = np.random.SeedSequence(seed).generate_state(num_envs).tolist()
     make = partial(_make, domain, task, timestep, steps)
     order = tuple(_load(domain, task, 0).observation_spec()) if keys is None else tuple(keys)
-    env = SerialEnv(num_envs, [partial(make, seed=int(each)) for each in seeds])
-    env = TransformedEnv(env, DoubleToFloat())
+    env = TransformedEnv(SerialEnv(num_envs, [partial(make, seed=each) for each in seeds]), DoubleToFloat())
     for key in order:
         axes = env.observation_spec[key].ndim - 1  # without the batch of environments
         if axes > 1:
@@ -75,18 +72,15 @@ def observation_env(graph: ObservationGraph, domain: str, task: str, **options) 
     observation = {name: int(np.prod(entry.shape)) for name, entry in loaded.observation_spec().items()}
     actions = int(np.prod(loaded.action_spec().shape))
     if observation != dict(graph.observation) or actions != graph.num_actions:
-        raise ValueError(
-            f"Task {domain} {task} has observations {observation} and {actions} actions, graph {graph.name!r} arranges"
-            f" {dict(graph.observation)} and {graph.num_actions}."
-        )
+        given = f"Task {domain} {task} has observations {observation} and {actions} actions"
+        raise ValueError(f"{given}, graph {graph.name!r} arranges {dict(graph.observation)} and {graph.num_actions}.")
     return suite_env(domain, task, keys=list(graph.observation), **options)
 
 
 @cache
 def _suite() -> tuple[Any, Any, Any]:
-    """Import the suite, its swimmers and its environments without looking for a display."""
     before = os.environ.get("MUJOCO_GL")
-    os.environ.setdefault("MUJOCO_GL", "off")
+    os.environ.setdefault("MUJOCO_GL", "off")  # look for no display
     try:
         from dm_control import suite
         from dm_control.rl import control

@@ -1,10 +1,10 @@
-"""What figures and videos share: colours, and figures without a display or global pyplot state."""
+"""Colours and axes of figures and videos, without a display or global pyplot state."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torchrl_gn.atomic import atomic_path
 
@@ -45,6 +45,12 @@ def clean(axes: Axes) -> None:
     axes.tick_params(labelsize=8, color=MUTED)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED)
+
+
+def legend_below(axes: Axes, columns: int) -> None:
+    """Legend of the axes' lines or bars below the whole figure."""
+    options: dict[str, Any] = {"loc": "outside lower center", "ncols": columns, "fontsize": 8, "frameon": False}
+    axes.figure.legend(*axes.get_legend_handles_labels(), **options)
 
 
 def save(figure: Figure, path: str | os.PathLike) -> Path:

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from torchrl_gn.evaluation.camera import View, choose_view, follow
 from torchrl_gn.evaluation.canvas import GRID, INK, MUTED, PAPER, TRUTH
-from torchrl_gn.evaluation.geometry import SceneGeometry
-
-if TYPE_CHECKING:
-    from torchrl_gn.scenes import Scene
+from torchrl_gn.evaluation.geometry import SceneGeometry, View, choose_view, follow
+from torchrl_gn.scenes import Scene
 
 _OUTLINE = np.linspace(0, 2 * np.pi, 56, endpoint=False)
 _FAN = np.stack((np.cos(_OUTLINE), np.sin(_OUTLINE)), axis=-1)  # [K, 2] directions of the outline's corners
@@ -33,10 +29,7 @@ class Motion:
 
 
 class SceneDrawing:
-    """Draws panels of one scene with one camera, framed for a true state sequence.
-
-    ``truth`` ``[T, N, 13]`` alone sets the camera, so that a prediction's drift shows. ``size`` is in pixels.
-    """
+    """Panels of a scene, ``size`` pixels wide, with a camera that follows ``truth`` ``[T, N, 13]`` alone."""
 
     def __init__(self, scene: Scene, truth: np.ndarray, size: int) -> None:
         self.geometry = SceneGeometry(scene)
@@ -47,9 +40,7 @@ class SceneDrawing:
         self._follow = self.view.project(follow(scene, truth))
         self.truth = self.motion(truth)
         moving = [o for o, moves in zip(self.truth.outlines, self._moving, strict=True) if moves]
-        if not moving:  # no visible moving geoms: frame the nodes
-            moving = [self.view.project(truth[:, :, :3])]
-        points = np.concatenate(moving, axis=1) - self._follow[:, None]
+        points = np.concatenate(moving or [self.view.project(truth[:, :, :3])], axis=1) - self._follow[:, None]
         low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
         self._middle = (low + high) / 2
         self.extent = float(max((high - low).max(), 1e-6) * 1.16)
@@ -57,7 +48,6 @@ class SceneDrawing:
             self._middle[1] = low[1] + 0.42 * self.extent  # little room below the lowest point
 
     def _find_floor(self, truth: np.ndarray) -> float | None:
-        """Height of the floor plane, or of the lowest fixed point of a spatial scene."""
         if self.geometry.floor is not None or self.view.planar:
             return self.geometry.floor
         positions, rotations = self.geometry.poses(truth[:1])
@@ -106,8 +96,7 @@ class SceneDrawing:
                     draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="white", outline=INK)
         else:
             middle = self.size * _SMOOTH / 2
-            font = ImageFont.load_default(18 * _SMOOTH)
-            draw.text((middle, middle), "prediction diverged", INK, font, "mm")
+            draw.text((middle, middle), "prediction diverged", INK, ImageFont.load_default(18 * _SMOOTH), "mm")
         return image
 
     def _pixels(self, step: int, points: np.ndarray) -> np.ndarray:
@@ -129,37 +118,35 @@ class SceneDrawing:
         for index in motion.order[step]:
             if self._moving[index] == (color is None):
                 continue
-            node = int(self.geometry.geom_node[self.geometry.shapes[index].geom])
             if color is None:
                 fill, rim = _mix(MUTED, PAPER, 0.6), _mix(MUTED, PAPER, 0.2)
             elif edge is not None:
                 fill, rim = color, edge
             else:
                 # Two tints tell neighbouring bodies apart.
+                node = int(self.geometry.geom_node[self.geometry.shapes[index].geom])
                 fill, rim = _mix(color, "#ffffff", 0.12 + 0.2 * (node % 2)), _mix(color, "#000000", 0.35)
             self._polygon(draw, step, motion.outlines[index][step], fill, rim, width=round(1.2 * _SMOOTH))
 
     def _ground(self, draw: ImageDraw.ImageDraw, step: int) -> None:
-        spacing = _nice(self.extent / 4)
+        spacing, side = _nice(self.extent / 4), self.size * _SMOOTH
         center = self._follow[step] + self._middle
         low, high = center - self.extent / 2, center + self.extent / 2
-        side, line, grid = self.size * _SMOOTH, _SMOOTH, GRID
         if self.view.planar:  # a grid that stays where it is; from the side its vertical lines, and the floor
             above = self.view.up[2] == 0
             for axis in range(2 if above else 1):
                 for value in _ticks(low[axis], high[axis], spacing):
                     at = self._pixels(step, np.full(2, value))[axis]
-                    draw.line((at, 0, at, side) if axis == 0 else (0, at, side, at), fill=grid, width=line)
+                    draw.line((at, 0, at, side) if axis == 0 else (0, at, side, at), fill=GRID, width=_SMOOTH)
             if self._floor is not None and not above:
                 at = self._pixels(step, np.array([0.0, self._floor]))[1]
                 if at < side:
                     draw.rectangle((0, at, side, side), fill=_mix(MUTED, PAPER, 0.75))
-                    draw.line((0, at, side, at), fill=MUTED, width=2 * line)
+                    draw.line((0, at, side, at), fill=MUTED, width=2 * _SMOOTH)
         elif self._floor is not None:
             # The floor point behind the picture's centre, from which a patch of grid spreads.
-            view, height = self.view, self._floor
-            on_plane = center[0] * view.right + center[1] * view.up
-            middle = on_plane + view.toward * (height - on_plane[2]) / view.toward[2]
+            view, on_plane = self.view, center[0] * self.view.right + center[1] * self.view.up
+            middle = on_plane + view.toward * (self._floor - on_plane[2]) / view.toward[2]
             reach = spacing * math.ceil(2.5 * self.extent / spacing)
             for axis in range(2):
                 for value in _ticks(middle[axis] - reach, middle[axis] + reach, spacing):
@@ -167,7 +154,7 @@ class SceneDrawing:
                     ends[:, axis] = value
                     ends[:, 1 - axis] += [-reach, reach]
                     pixels = self._pixels(step, view.project(ends))
-                    draw.line(tuple(pixels.flatten().tolist()), fill=grid, width=line)
+                    draw.line(tuple(pixels.flatten().tolist()), fill=GRID, width=_SMOOTH)
 
 
 def _outline(points: np.ndarray, radius: float) -> np.ndarray:
@@ -181,7 +168,6 @@ def _ticks(low: float, high: float, spacing: float) -> np.ndarray:
 
 
 def _nice(value: float) -> float:
-    """Largest number up to ``value`` of the form 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return power * max(factor for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))
 

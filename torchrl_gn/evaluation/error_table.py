@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -38,7 +37,7 @@ class ErrorTable:
         return self.errors[name]
 
     def to_metrics(self) -> dict[str, float]:
-        """Flat names and plain numbers, ready for a logger or a JSON file.
+        """Numbers by name for a logger or a JSON file.
 
         For every error ``E``: ``E`` (total), ``E/<component>`` or, if left out, ``E/left_out/<component>`` = 1,
         ``E/baseline/<component>`` (mean square of the persistence baseline), and ``E/diverged`` (sequences).
@@ -54,15 +53,12 @@ class ErrorTable:
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table's cells as text: a row of titles, the total, every component, the baseline."""
-        rows = [_titles(self), ("total", *(_number(error.total) for error in self.errors.values()))]
-        for component in next(iter(self.errors.values())).baselines:
-            values = (
-                "left out" if component in error.left_out else _number(error.components[component])
-                for error in self.errors.values()
-            )
-            rows.append((component.replace("_", " "), *values))
-        rows.append(("persistence baseline", *(_number(1.0) for _ in self.errors)))
-        return rows
+        errors = self.errors.values()
+        rows = [_titles(self), ("total", *(_number(error.total) for error in errors))]
+        for name in next(iter(errors)).baselines:
+            values = (_number(e.components[name]) if name in e.components else "left out" for e in errors)
+            rows.append((name.replace("_", " "), *values))
+        return [*rows, ("persistence baseline", *[_number(1.0)] * len(errors))]
 
     def to_table(self) -> str:
         """Errors relative to the persistence baseline as lines of text, one column per error."""
@@ -71,11 +67,8 @@ class ErrorTable:
     __str__ = to_table
 
     def _divergences(self) -> list[str]:
-        return [
-            f"{error.name}: {error.diverged} of {error.sequences} sequences diverged"
-            for error in self.errors.values()
-            if error.diverged
-        ]
+        bad = [error for error in self.errors.values() if error.diverged]
+        return [f"{error.name}: {error.diverged} of {error.sequences} sequences diverged" for error in bad]
 
 
 def summary(tables: Mapping[str, ErrorTable]) -> str:
@@ -93,16 +86,10 @@ def _titles(table: ErrorTable) -> tuple[str, ...]:
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    """Rows of cells as lines, the first ruled off."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join((row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))))
-        for row in rows
-    ]
+    first, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join((row[0].ljust(first), *map(str.rjust, row[1:], widths))) for row in rows]
     return [lines[0], "-" * len(lines[0]), *lines[1:]]
 
 
 def _number(value: float) -> str:
-    if not math.isfinite(value):
-        return str(value)
     return f"{value:.3f}" if 0.1 <= value < 1000 or value == 0 else f"{value:.2e}"

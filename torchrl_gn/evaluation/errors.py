@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -18,24 +18,16 @@ from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.scenes import Scene
 
-if TYPE_CHECKING:
-    from torchrl_gn.scenes import Scene
-
-# Mean squared changes below this are rounding of positions of the order of metres, not motion.
-_ROUNDING = 1e-24
-
-HORIZONS = (20, 100)
-"""Steps of the rollouts that are measured where nothing else is asked for."""
+HORIZONS = (20, 100)  # default lengths of rollouts, steps
+_ROUNDING = 1e-24  # mean squared changes below this are rounding errors of metres, not motion
 
 
 def squared_errors(prediction: Tensor, truth: Tensor, layout: StateLayout = BODY_STATE) -> Tensor:
-    """Squared error ``[..., C]`` of every component of a state, in float64: m^2, rad^2, (m/s)^2, (rad/s)^2.
+    """Squared error ``[..., C]`` of every component of states ``[..., 13]``: m^2, rad^2, (m/s)^2, (rad/s)^2.
 
-    Args:
-        prediction: ``[..., 13]``; quaternions need not have unit norm, and ``q`` equals ``-q``.
-        truth: ``[..., 13]``.
-        layout: meaning of the channels. Default: the state of a body.
+    In float64. Quaternions need not have unit norm, and ``q`` equals ``-q``.
     """
     prediction, truth = prediction.double(), truth.double()
     errors = []
@@ -66,42 +58,31 @@ def evaluate_errors(
 ) -> ErrorTable:
     """Evaluate a model on test trajectories, in batches, in evaluation mode, without gradients.
 
-    ``one_step_error`` is over every step, relative to its input state unchanged; ``rollout_error_<H>`` over steps 1 to
-    ``H`` of rollouts from state 0, relative to state 0 unchanged. Each component is a ratio of means over predicted
-    nodes, steps and sequences; the total is their mean. A component that never moves in the truth is left out. If a
-    prediction diverges (:func:`~torchrl_gn.evaluation.guarded_rollout`), its error is infinite, and so is the mean.
+    ``one_step_error`` is over every step, ``rollout_error_<H>`` over steps 1 to ``H`` of rollouts from state 0, each
+    relative to its start state unchanged. A component is a ratio of means over predicted nodes, steps and sequences,
+    left out if it never moves; the total is their mean, infinite if a prediction diverges.
 
     Args:
         model: reads state and action at its first two ``in_keys``, writes the next state at its first ``out_keys``.
-        trajectories: batch ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]``, ``"action"`` ``[M, T, A]`` and, if
-            the model reads them, physical parameters ``[M]`` at its ``parameters_key``; may be memory-mapped.
-        horizons: lengths of the rollouts to measure, at most ``T``.
-        burn_in: steps at the start of every trajectory that are not evaluated; a recurrent model's hidden state runs
-            through them.
+        trajectories: ``[M]`` with ``"state"`` ``[M, T + 1, N, 13]``, ``"action"`` ``[M, T, A]`` and, if the model reads
+            them, physical parameters ``[M]`` at its ``parameters_key``.
+        burn_in: steps at the start of every trajectory that only prepare a recurrent model's hidden state.
         keep: number of predicted rollouts to return in the table.
         scene: which nodes count and which components are movable. Default: ``model.scene``.
-
-    Raises:
-        ValueError: shapes do not fit, trajectories are too short, empty, of another scene or not finite, or nothing
-            moves in them.
     """
-    if scene is None:
-        scene = cast("Scene", model.scene)
+    scene = scene or cast(Scene, model.scene)
     layout: StateLayout = getattr(model, "layout", BODY_STATE)
     horizons = sorted({int(horizon) for horizon in horizons})
     states, actions = trajectories.get("state"), trajectories.get("action")
-    if horizons and horizons[0] < 1:
-        raise ValueError(f"Horizons must be at least 1 step, got {horizons[0]}.")
-    if burn_in < 0:
-        raise ValueError(f"burn_in={burn_in} must not be negative.")
+    if burn_in < 0 or (horizons and horizons[0] < 1):
+        raise ValueError(f"Horizons must be at least 1 step, got {horizons}, and burn_in={burn_in} not negative.")
     _check(states, actions, [burn_in + horizon for horizon in horizons], batch_size, scene, layout)
     steps, horizon = actions.shape[1] - burn_in, max(horizons, default=0)
     device = device or next(itertools.chain(model.parameters(), model.buffers()), states).device
     predicted = torch.as_tensor(scene.predicted, device=device)
     single, rollouts = _Sums(1, layout, predicted), _Sums(horizon, layout, predicted)
     predictor = as_predictor(model)
-    parameters = predictor.parameters_in(trajectories)
-    if parameters is not None:
+    if (parameters := predictor.parameters_in(trajectories)) is not None:
         require_finite(parameters, "parameters of the trajectories")
     kept: list[Tensor] = []
 
@@ -129,7 +110,7 @@ def evaluate_errors(
 
 
 class _Sums:
-    """Streaming sums of squared errors: of the model and of the persistence baseline, step by step."""
+    """Sums of squared errors of the model and of the persistence baseline, step by step."""
 
     def __init__(self, steps: int, layout: StateLayout, predicted: Tensor) -> None:
         self.layout, self.predicted = layout, predicted
@@ -141,9 +122,7 @@ class _Sums:
         """Add ``[B, N, 13]`` states and return ``[B]``, where the prediction is still a state."""
         truth = truth[:, self.predicted]
         squared = self._squared(prediction, truth)
-        valid = squared.isfinite().all(-1)
-        if alive is not None:
-            valid &= alive
+        valid = squared.isfinite().all(-1) & (True if alive is None else alive)
         self.model[step] += torch.where(valid[:, None], squared, torch.inf).sum(0)
         self.persistence[step] += self._squared(initial, truth).sum(0)
         return valid
@@ -157,26 +136,21 @@ class _Sums:
 
     def error(self, name: str, steps: int, sequences: int, count: int, fixed: set[str]) -> PredictionError:
         """Error over the first ``steps`` rows, which hold ``sequences * count`` terms in all."""
-        number = sequences * count
-        model, persistence = ((sums[:steps].sum(0) / number).tolist() for sums in (self.model, self.persistence))
-        names = self.layout.names
-        baselines = dict(zip(names, persistence, strict=True))
-        left_out = tuple(n for n in names if n in fixed or baselines[n] <= _ROUNDING)
-        components = {n: value / baselines[n] for n, value in zip(names, model, strict=True) if n not in left_out}
+        means = ((sums[:steps].sum(0) / (sequences * count)).tolist() for sums in (self.model, self.persistence))
+        squared, baselines = (dict(zip(self.layout.names, values, strict=True)) for values in means)
+        left_out = tuple(n for n, value in baselines.items() if n in fixed or value <= _ROUNDING)
+        components = {n: value / baselines[n] for n, value in squared.items() if n not in left_out}
         if not components:
             raise ValueError(f"Nothing moves in the trajectories, so {name} relative to no change has no meaning.")
-        squared = dict(zip(names, model, strict=True))
         return PredictionError(name, components, squared, baselines, left_out, sequences, self.diverged[steps - 1])
 
 
 def _add_rollouts(guarded: GuardedRollout, truth: Tensor, sums: _Sums, keep: int) -> Tensor:
     """Add the errors of rollouts to ``sums``, return the first ``keep`` of them, NaN from where they diverged."""
-    initial = truth[:, 0]
-    alive = torch.ones(len(truth), dtype=torch.bool, device=truth.device)
-    kept = [initial[:keep]]
+    alive, kept = guarded.good_steps >= 0, [truth[:keep, 0]]
     for step in range(1, guarded.states.shape[1]):
         current = guarded.states[:, step]
-        alive = sums.add(step - 1, current, truth[:, step], initial, alive & (guarded.good_steps >= step))
+        alive = sums.add(step - 1, current, truth[:, step], truth[:, 0], alive & (guarded.good_steps >= step))
         sums.diverged[step - 1] += int((~alive).sum())
         kept.append(torch.where(alive[:keep, None, None], current[:keep], torch.nan))
     return torch.stack(kept, dim=1).cpu()
@@ -207,7 +181,7 @@ def _batches(
 
 
 def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:
-    """``[..., N]``: nodes of ``[..., N, 13]`` that have a zero quaternion (or ``cos = sin = 0``)."""
+    """``[..., N]``, whether nodes have a zero quaternion (or ``cos = sin = 0``)."""
     angular = [layout.slices[component.name] for component in layout.components if component.kind != "add"]
     return torch.stack([(state[..., where] == 0).all(-1) for where in angular]).any(0)
 
@@ -216,21 +190,15 @@ def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Sce
     if states is None or actions is None:
         raise ValueError('Trajectories need the entries "state" [M, T + 1, N, 13] and "action" [M, T, A].')
     if states.ndim != 4 or states.shape[2:] != (scene.num_nodes, layout.size):
-        raise ValueError(
-            f"States of scene {scene.name!r} must be [M, T + 1, {scene.num_nodes}, {layout.size}],"
-            f" got {list(states.shape)}."
-        )
+        wanted = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"
+        raise ValueError(f"States of scene {scene.name!r} must be {wanted}, got {list(states.shape)}.")
     if states.shape[0] == 0 or states.shape[1] < 2:
         raise ValueError(f"Errors need at least one sequence of two states, got {list(states.shape)}.")
     expected = (states.shape[0], states.shape[1] - 1, scene.num_actions)
     if actions.shape != expected:
-        raise ValueError(
-            f"Actions must be {list(expected)} to go with states {list(states.shape)}, got {list(actions.shape)}."
-        )
+        raise ValueError(f"Actions must be {list(expected)} like the states, got {list(actions.shape)}.")
     if horizons and horizons[-1] > expected[1]:
-        raise ValueError(
-            f"A rollout of {horizons[-1]} steps needs trajectories of {horizons[-1] + 1} states, got {states.shape[1]}."
-        )
+        raise ValueError(f"A rollout of {horizons[-1]} steps needs trajectories as long, got {expected[1]} steps.")
     if batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {batch_size}.")
 

@@ -7,16 +7,17 @@ import math
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from torch import Tensor
 
-from torchrl_gn.evaluation.canvas import INK, MUTED, SERIES, TRUTH, clean, new_figure, save, series_color
+from torchrl_gn.evaluation.canvas import INK, MUTED, SERIES, TRUTH, clean, legend_below, new_figure, save, series_color
 from torchrl_gn.evaluation.error_table import ErrorTable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _WIDEST = 12.0  # inches of panels side by side
 _CURVES = (6.4, 3.8)  # inches of a figure of curves
@@ -25,10 +26,7 @@ _CURVES = (6.4, 3.8)  # inches of a figure of curves
 def plot_loglog(
     panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]], path: str | os.PathLike, *, ylabel: str
 ) -> Path:
-    """Lines on logarithmic axes, panels side by side.
-
-    ``panels`` holds ``(x, y)`` by label, by the name of the panel's horizontal axis.
-    """
+    """Lines ``(x, y)`` by label on logarithmic axes, in panels side by side by the name of the horizontal axis."""
     figure = new_figure((4.2 * len(panels) + 0.6, 3.8))
     for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for number, (label, (x, y)) in enumerate(lines.items()):
@@ -48,21 +46,17 @@ def plot_rewards(
 ) -> Path:
     """Reward over time for planners or policies: mean of the episodes, in a pale band from worst to best.
 
-    Args:
-        rewards: ``[B, T]`` by label; NaN after the end of an episode.
-        timestep: seconds of a control step.
+    ``rewards`` holds ``[B, T]`` by label; NaN after the end of an episode. ``timestep`` is in seconds.
     """
-    figure = new_figure(_CURVES)
-    axes = figure.subplots()
+    axes = new_figure(_CURVES).subplots()
     for number, (label, values) in enumerate(rewards.items()):
         values = values.detach().double().cpu().numpy()
         time = timestep * np.arange(1, values.shape[1] + 1)
         running = np.isfinite(values).any(0)  # steps that some episode reaches
-        time, values = time[running], values[:, running]
+        values = values[:, running]
         band = np.nanmin(values, 0), np.nanmean(values, 0), np.nanmax(values, 0)
-        _band(axes, time, *band, series_color(number), label)
-    _label(axes, "time [s]", ylabel)
-    return save(figure, path)
+        _band(axes, time[running], *band, series_color(number), label)
+    return _finish(axes, "time [s]", ylabel, path)
 
 
 def plot_planning_curves(
@@ -73,14 +67,12 @@ def plot_planning_curves(
     ``curves`` holds milliseconds of planning per control step, mean rewards and half-lengths of their error bars,
     ``[N]`` each, by label.
     """
-    figure = new_figure(_CURVES)
-    axes = figure.subplots()
+    axes = new_figure(_CURVES).subplots()
     style = {"linewidth": 1.6, "marker": "o", "markersize": 4, "elinewidth": 0.8, "capsize": 2}
     for number, (label, (times, rewards, deviations)) in enumerate(curves.items()):
         axes.errorbar(times, rewards, yerr=deviations, color=series_color(number), label=label, **style)
     axes.set_xscale("log")
-    _label(axes, "planning a control step [ms]", "mean reward of a step")
-    return save(figure, path)
+    return _finish(axes, "planning a control step [ms]", "mean reward of a step", path)
 
 
 def plot_learning_curves(
@@ -90,17 +82,13 @@ def plot_learning_curves(
 
     ``curves`` holds environment steps ``[T]`` and returns ``[S, T]`` of ``S`` seeds by label.
     """
-    figure = new_figure(_CURVES)
-    axes = figure.subplots()
+    axes = new_figure(_CURVES).subplots()
     for number, (label, (frames, returns)) in enumerate(curves.items()):
-        if any(len(of) != len(frames) for of in returns):
-            raise ValueError(
-                f"Every seed of {label!r} must have {len(frames)} returns, got {[len(of) for of in returns]}."
-            )
+        if set(lengths := [len(of) for of in returns]) - {len(frames)}:
+            raise ValueError(f"Every seed of {label!r} must have {len(frames)} returns, got {lengths}.")
         low, median, high = np.quantile(np.asarray(returns, float), (0.25, 0.5, 0.75), axis=0)
         _band(axes, frames, low, median, high, series_color(number), label)
-    _label(axes, "environment steps", "return of an episode")
-    return save(figure, path)
+    return _finish(axes, "environment steps", "return of an episode", path)
 
 
 def plot_training_curve(
@@ -111,8 +99,7 @@ def plot_training_curve(
 ) -> Path:
     """Losses or validation errors over training time, on a logarithmic scale.
 
-    ``curves`` holds ``(seconds, values)`` by label; values that are not positive and finite are skipped. Raises
-    ValueError if nothing can be drawn.
+    ``curves`` holds ``(seconds, values)`` by label; values that are not positive and finite are skipped.
     """
     kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for label, (seconds, values) in curves.items():
@@ -126,15 +113,12 @@ def plot_training_curve(
         raise ValueError(f"No curve of {list(curves)} has a value above zero to draw.")
     longest = max(x.max() for x, _ in kept.values())
     unit, scale = ("h", 3600) if longest > 3 * 3600 else ("min", 60) if longest > 180 else ("s", 1)
-
-    figure = new_figure((7.0, 4.2))
-    axes = figure.subplots()
+    axes = new_figure((7.0, 4.2)).subplots()
     for number, (label, (x, y)) in enumerate(kept.items()):
         look = {"color": series_color(number), "marker": "o" if len(x) <= 60 else None}
         axes.plot(x / scale, y, label=label, linewidth=1.6, markersize=3, **look)
     axes.set_yscale("log")
-    _label(axes, f"training time [{unit}]", ylabel)
-    return save(figure, path)
+    return _finish(axes, f"training time [{unit}]", ylabel, path)
 
 
 def plot_errors(
@@ -152,8 +136,7 @@ def plot_errors(
         raise ValueError("plot_errors needs at least one table.")
     names = list(errors or next(iter(tables.values())).errors)
     for label, table in tables.items():
-        missing = [name for name in names if name not in table.errors]
-        if missing:
+        if missing := [name for name in names if name not in table.errors]:
             raise ValueError(f"Table {label!r} lacks the errors {missing}; it has {list(table.errors)}.")
     figure = new_figure((max(6.0, 1.5 + len(names) * (1.2 + 0.75 * len(tables))), 4.2))
     panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
@@ -164,12 +147,10 @@ def plot_errors(
     for axes, name in zip(panels, names, strict=True):
         for place, table in enumerate(tables.values()):
             error = table[name]
-            diverged = not math.isfinite(error.total)
-            color = MUTED if diverged else TRUTH
-            axes.bar(place, top if diverged else max(error.total, bottom), width=0.62, color=color, alpha=0.85)
-            if diverged:
-                middle = math.sqrt(bottom * top)
-                axes.text(place, middle, "diverged", rotation=90, ha="center", va="center", color="w")
+            height, color = (max(error.total, bottom), TRUTH) if math.isfinite(error.total) else (top, MUTED)
+            axes.bar(place, height, width=0.62, color=color, alpha=0.85)
+            if not math.isfinite(error.total):
+                axes.text(place, (bottom * top) ** 0.5, "diverged", rotation=90, ha="center", va="center", color="w")
             for component, value in error.components.items():
                 if bottom < value < top:
                     axes.plot(place, value, markers[component], color=INK, markersize=4, markerfacecolor="w")
@@ -178,8 +159,7 @@ def plot_errors(
     for component, marker in markers.items():
         panels[-1].plot([], [], marker, color=INK, markerfacecolor="w", label=component.replace("_", " "))
     panels[-1].plot([], [], "--", color=INK, label="persistence baseline")
-    handles, labels = panels[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    legend_below(panels[-1], 5)
     return save(figure, path)
 
 
@@ -191,11 +171,8 @@ def plot_bars(
 ) -> Path:
     """Groups of bars on a logarithmic axis (paper, figure "One-step and rollout errors for different models").
 
-    Each panel has a group per system, each group a bar per model, and a dashed line at 1, the persistence
-    baseline. Heights that are not finite are drawn to the top, hatched.
-
-    Args:
-        panels: ``(height, half-range)`` by system, by model, by the panel's title; a missing system leaves a gap.
+    ``panels`` holds ``(height, half-range)`` by system, by model, by the panel's title; a missing system leaves a gap.
+    The dashed line is the persistence baseline. Heights that are not finite are drawn to the top, hatched.
     """
     models = list(dict.fromkeys(model for panel in panels.values() for model in panel))
     groups = list(dict.fromkeys(group for panel in panels.values() for bars in panel.values() for group in bars))
@@ -210,8 +187,7 @@ def plot_bars(
     width = 0.84 / len(models)
     for axes, (title, panel) in zip(figure.subplots(rows, columns, squeeze=False).flat, panels.items(), strict=True):
         for number, model in enumerate(models):
-            # Lighter where the colours repeat.
-            look = {"color": series_color(number), "alpha": 0.9 if number < len(SERIES) else 0.45}
+            look = {"color": series_color(number), "alpha": 0.9 if number < len(SERIES) else 0.45}  # colours repeat
             axes.bar(0, 0, label=model, **look)
             for group, (height, half_range) in panel.get(model, {}).items():
                 place = groups.index(group) + (number - (len(models) - 1) / 2) * width
@@ -222,21 +198,20 @@ def plot_bars(
         _frame_bars(axes, title, groups, (bottom, top), horizontal=6)
         if not beside or axes is figure.axes[0]:
             axes.set_ylabel(ylabel, fontsize=8)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(models)), fontsize=8, frameon=False)
+    legend_below(figure.axes[0], min(4, len(models)))
     return save(figure, path)
 
 
 def _band(axes: Axes, x, low: np.ndarray, middle: np.ndarray, high: np.ndarray, color: str, label: str) -> None:
-    """A line in a pale band."""
     axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
     axes.plot(x, middle, color=color, label=label, linewidth=1.6)
 
 
-def _label(axes: Axes, xlabel: str, ylabel: str) -> None:
+def _finish(axes: Axes, xlabel: str, ylabel: str, path: str | os.PathLike) -> Path:
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.legend(frameon=False, fontsize=9)
     clean(axes)
+    return save(cast("Figure", axes.figure), path)
 
 
 def _log_range(heights: Iterable[float]) -> tuple[float, float]:
@@ -246,7 +221,7 @@ def _log_range(heights: Iterable[float]) -> tuple[float, float]:
 
 
 def _frame_bars(axes: Axes, title: str, groups: Collection[str], limits: tuple[float, float], horizontal: int) -> None:
-    """Axes of bars with a dashed line at 1; more than ``horizontal`` group names are slanted."""
+    """Frame bars, with a dashed line at 1; more than ``horizontal`` group names are slanted."""
     axes.axhline(1.0, color=INK, linestyle="--", linewidth=1)
     axes.set_xticks(range(len(groups)), list(groups), rotation=30 if len(groups) > horizontal else 0, fontsize=9)
     axes.set_title(title, fontsize=10)

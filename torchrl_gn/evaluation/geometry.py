@@ -1,21 +1,20 @@
-"""Poses of a scene's geometric shapes for given node states."""
+"""Poses of a scene's shapes for given node states, the camera that looks at them, and kinetic energy."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
-
-if TYPE_CHECKING:
-    from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Scene
 
 _Geom = mujoco.mjtGeom
+_AZIMUTH, _ELEVATION = np.radians(-55.0), np.radians(18.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,33 +34,22 @@ class SceneGeometry:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         node_of_root = {int(body): node for node, body in enumerate(scene.body)}
-        self._body_node = np.array([node_of_root[int(root)] for root in model.body_weldid])
-        # [G] node that carries each geom
-        self.geom_node = self._body_node[model.geom_bodyid]
+        body_node = np.array([node_of_root[int(root)] for root in model.body_weldid])
+        self.geom_node = body_node[model.geom_bodyid]  # [G] node that carries each geom
         # The offsets are the same in any configuration.
         roots = scene.body[self.geom_node]
         root_mat = data.xmat.reshape(-1, 3, 3)[roots]
         self._pos = np.einsum("gji,gj->gi", root_mat, data.geom_xpos - data.xpos[roots])
         self._mat = np.einsum("gji,gjk->gik", root_mat, data.geom_xmat.reshape(-1, 3, 3))
-        self.shapes = [
-            shape for geom in range(model.ngeom) if _is_visible(model, geom) if (shape := _shape(model, geom))
-        ]
-        # Whether each shape belongs to the world.
-        self.fixed = [self.geom_node[shape.geom] == 0 for shape in self.shapes]
-        self.joints = self._joints(model)
+        self.shapes = [shape for geom in range(model.ngeom) if (shape := _shape(model, geom))]
+        self.fixed = [self.geom_node[shape.geom] == 0 for shape in self.shapes]  # to the world
+        # Node and [3] anchor in its frame of hinges and balls of bodies that do not slide too.
+        rotating = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)])
+        kept = np.flatnonzero(~np.isin(model.jnt_bodyid, model.jnt_bodyid[~rotating]))
+        self.joints = [(int(body_node[model.jnt_bodyid[joint]]), model.jnt_pos[joint].copy()) for joint in kept]
         planes = [g for g in range(model.ngeom) if model.geom_type[g] == _Geom.mjGEOM_PLANE]
         levels = [data.geom_xpos[g][2] for g in planes if data.geom_xmat[g].reshape(3, 3)[2, 2] > 0.99]
         self.floor = float(levels[0]) if levels else None
-
-    def _joints(self, model: mujoco.MjModel) -> list[tuple[int, np.ndarray]]:
-        """Node and ``[3]`` anchor in its frame of hinges and balls of bodies that do not slide too."""
-        rotating = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
-        sliding = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if int(model.jnt_type[j]) not in rotating}
-        return [
-            (int(self._body_node[body]), model.jnt_pos[joint].copy())
-            for joint, body in enumerate(model.jnt_bodyid)
-            if int(body) not in sliding
-        ]
 
     def poses(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions ``[T, G, 3]`` and rotations ``[T, G, 3, 3]`` of all geoms for node states ``[T, N, 13]``."""
@@ -86,15 +74,12 @@ def node_frames(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return states[..., BODY_STATE.slices["position"]], matrix
 
 
-def _is_visible(model: mujoco.MjModel, geom: int) -> bool:
-    # MuJoCo's viewers show groups 0 to 2; higher ones hold collision shapes.
-    material = model.geom_matid[geom]
-    alpha = model.geom_rgba[geom][3] if material < 0 else model.mat_rgba[material][3]
-    return model.geom_group[geom] <= 2 and alpha > 0 and model.geom_rgba[geom][3] > 0
-
-
 def _shape(model: mujoco.MjModel, geom: int) -> Shape | None:
-    kind, size = model.geom_type[geom], model.geom_size[geom]
+    kind, size, material = model.geom_type[geom], model.geom_size[geom], model.geom_matid[geom]
+    alpha = model.geom_rgba[geom][3] * (1.0 if material < 0 else model.mat_rgba[material][3])
+    # MuJoCo's viewers show groups 0 to 2; higher ones hold collision shapes.
+    if model.geom_group[geom] > 2 or alpha <= 0:
+        return None
     if kind == _Geom.mjGEOM_SPHERE:
         return Shape(geom, np.zeros((1, 3)), float(size[0]))
     if kind == _Geom.mjGEOM_CAPSULE:
@@ -124,3 +109,54 @@ def _directions(number: int) -> np.ndarray:
     height, angle = 1 - 2 * index / number, np.pi * (1 + 5**0.5) * index
     radius = np.sqrt(1 - height**2)
     return np.stack((radius * np.cos(angle), radius * np.sin(angle), height), axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A parallel projection."""
+
+    right: np.ndarray  # [3] unit vector that points right in the picture
+    up: np.ndarray  # [3] up
+    toward: np.ndarray  # [3] towards the viewer
+    planar: bool  # whether everything moves in the plane of the picture
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """World points ``[..., 3]`` to picture coordinates ``[..., 2]``, metres."""
+        return points @ np.stack((self.right, self.up), axis=-1)
+
+
+def choose_view(scene: Scene) -> View:
+    """Straight at the plane of motion if no node leaves it, else oblique from above."""
+    movable = np.asarray(scene.movable.any(axis=0))
+    x, y, z = np.eye(3)
+    # From above for z; from the front, with z up, for the others.
+    for normal, (right, up) in ((1, (x, z)), (2, (x, y)), (0, (y, z))):
+        others = [axis for axis in range(3) if axis != normal]
+        if not movable[normal] and not movable[[3 + axis for axis in others]].any():
+            return View(right, up, np.cross(right, up), True)
+    flat = np.array([np.cos(_AZIMUTH), np.sin(_AZIMUTH), 0.0])
+    toward = np.cos(_ELEVATION) * flat + np.sin(_ELEVATION) * z
+    right = np.cross(z, flat)
+    return View(right, np.cross(toward, right), toward, False)
+
+
+def follow(scene: Scene, states: np.ndarray) -> np.ndarray:
+    """Point ``[T, 3]`` that the camera follows: mean of the moving nodes, along translation-invariant axes only."""
+    return np.where(scene.translation_invariant, states[:, scene.predicted, :3].mean(axis=1), 0.0)
+
+
+def kinetic_energy(state: Tensor, scene: Scene) -> Tensor:
+    """Kinetic energy ``[...]``, joules, of all moving bodies in states ``[..., N, 13]``, without joint armature."""
+    names, values = scene.static.node_names, torch.as_tensor(scene.static.nodes).to(state)
+
+    def feature(name: str, size: int) -> Tensor:
+        return values[:, [names.index(f"{name}[{index}]") for index in range(size)]]
+
+    mass, moves = values[:, names.index("mass")], torch.as_tensor(scene.predicted).to(state)
+    orientation, linear, angular = state[..., 3:7], state[..., 7:10], state[..., 10:13]
+    offset = quaternion.rotate(orientation, feature("ipos", 3))
+    velocity = linear + torch.linalg.cross(angular, offset)
+    principal = quaternion.product(orientation, feature("iquat", 4))
+    spin = quaternion.rotate(quaternion.conjugate(principal), angular)
+    energy = mass * velocity.square().sum(-1) + (feature("inertia", 3) * spin.square()).sum(-1)
+    return 0.5 * (energy * moves).sum(-1)

@@ -11,14 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.evaluation.canvas import AXES, INK, MUTED, PREDICTION, TRUTH, clean, new_figure, save
+from torchrl_gn.evaluation.canvas import AXES, INK, MUTED, PREDICTION, TRUTH, clean, legend_below, new_figure, save
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.scenes import KinematicTree, Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from torchrl_gn.scenes import KinematicTree, Scene
 
 _TRUE: dict[str, Any] = {"linewidth": 3.2, "alpha": 0.35}
 _PREDICTED: dict[str, Any] = {"linewidth": 1.2, "linestyle": (0, (4, 1.5))}
@@ -34,31 +33,22 @@ _PANELS = (
 def plot_body_trajectory(
     truth: Tensor, prediction: Tensor, scene: Scene, path: str | os.PathLike, *, node: int | str | None = None
 ) -> Path:
-    """Predicted against true state of one body (paper, figure "Evaluation rollout in a Swimmer6").
+    """Predicted against true states ``[T + 1, N, 13]`` of one body (paper, "Evaluation rollout in a Swimmer6").
 
-    Args:
-        truth: ``[T + 1, N, 13]`` true states.
-        prediction: ``[T + 1, N, 13]`` predicted states; values that are not finite leave gaps.
-        path: file to write; its suffix (``.png``, ``.pdf``, ``.svg``) sets the format.
-        node: index or name of the body. Default: the middle moving one (link 3 of Swimmer6, as in the paper).
+    Values that are not finite leave gaps. ``node`` is an index or a name; default: the middle moving one, link 3 of
+    Swimmer6.
     """
-    expected = (scene.num_nodes, BODY_STATE.size)
-    if truth.ndim != 3 or truth.shape != prediction.shape or truth.shape[1:] != expected:
-        raise ValueError(
-            f"Truth and prediction of scene {scene.name!r} must both be [T + 1, {scene.num_nodes}, 13],"
-            f" got {list(truth.shape)} and {list(prediction.shape)}."
-        )
+    if truth.ndim != 3 or truth.shape != prediction.shape or truth.shape[1:] != (scene.num_nodes, 13):
+        shapes = f"[T + 1, {scene.num_nodes}, 13], got {list(truth.shape)} and {list(prediction.shape)}"
+        raise ValueError(f"Truth and prediction of scene {scene.name!r} must both be {shapes}.")
     index = _node_index(scene, node)
     true, predicted = (states[:, index].detach().double().cpu().numpy() for states in (truth, prediction))
-    where = BODY_STATE.slices["orientation"]
-    true, predicted = _align_signs(true.copy(), predicted.copy(), where)
+    true, predicted = _align_signs(true.copy(), predicted.copy(), BODY_STATE.slices["orientation"])
     time = np.arange(len(true)) * scene.timestep
-
     figure = new_figure((9.0, 5.6))
     for axes, (name, label, channels) in zip(figure.subplots(2, 2, sharex=True).flat, _PANELS, strict=True):
         values = BODY_STATE.slices[name]
         for channel, letter in enumerate(channels):
-            # The scalar part takes the fourth colour, so that x, y and z keep theirs.
             color = AXES["xyzw".index(letter)]
             axes.plot(time, true[:, values][:, channel], color=color, **_TRUE)
             axes.plot(time, predicted[:, values][:, channel], color=color, **_PREDICTED)
@@ -87,8 +77,7 @@ def plot_motions(
     Args:
         panels: true states ``[S, T + 1, N, 13]`` and predicted states ``[S, H + 1, N, 13]`` of their last ``H + 1``
             steps, by title.
-        scene: the scene of the states, or one of its variants.
-        node: index or name of the body. Default: the middle moving one.
+        labels: names of the ``S`` systems.
     """
     index, where = _node_index(scene, node), BODY_STATE.slices["orientation"]
     figure = new_figure((4.6 * len(panels) + 0.4, 3.6))
@@ -118,7 +107,6 @@ def plot_motions(
 
 
 def _rotated(orientation: Tensor, start: Tensor, axis: int) -> np.ndarray:
-    """Angle ``[T]`` rotated about an axis of the body's frame since the start, whole revolutions counted."""
     relative = quaternion.product(quaternion.conjugate(start), orientation)
     return np.unwrap(2 * torch.atan2(relative[:, 1 + axis], relative[:, 0]).detach().cpu().numpy())
 
@@ -143,13 +131,14 @@ def plot_joints(
     def angles(states: Tensor) -> np.ndarray:
         return np.unwrap(torch.atan2(states[:, 1], states[:, 0]).detach().cpu().numpy())
 
+    def velocities(states: Tensor) -> np.ndarray:
+        return states[:, 2].detach().cpu().numpy()
+
     figure = new_figure((2.9 * len(joints) + 0.8, 4.8))
     grid = figure.subplots(2, len(joints), squeeze=False, sharex=True)
     colors = (PREDICTION, *AXES)
     for column, joint in enumerate(joints):
-        for axes, read in zip(
-            grid[:, column], (angles, lambda states: states[:, 2].detach().cpu().numpy()), strict=True
-        ):
+        for axes, read in zip(grid[:, column], (angles, velocities), strict=True):
             true = read(truth[:, joint + 1])
             axes.plot(np.arange(len(true)) * scene.timestep, true, **_MEASURED)
             for number, (name, states) in enumerate(predictions.items()):
@@ -163,15 +152,13 @@ def plot_joints(
     grid[0, 0].set_ylabel("angle [rad]", fontsize=9)
     grid[1, 0].set_ylabel("velocity [rad/s]", fontsize=9)
     grid[0, 0].plot([], [], label="measured", **_MEASURED)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    legend_below(grid[0, 0], 4)
     return save(figure, path)
 
 
 def _node_index(scene: Scene, node: int | str | None) -> int:
     if node is None:
-        moving = np.flatnonzero(scene.predicted)
-        if not len(moving):
+        if not len(moving := np.flatnonzero(scene.predicted)):
             raise ValueError(f"Nothing moves in scene {scene.name!r}.")
         return int(moving[(len(moving) - 1) // 2])
     if isinstance(node, str):

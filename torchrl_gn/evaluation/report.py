@@ -1,24 +1,28 @@
-"""Evaluate a trained model in one call: errors and pictures, or errors on newly collected trajectories."""
+"""Evaluate a trained model in one call, and how well it identifies systems."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
 import numpy as np
-from tensordict import TensorDictBase
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.evaluation.figures import plot_errors
-from torchrl_gn.evaluation.identification import identification_errors
 from torchrl_gn.evaluation.motion_figures import plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
-from torchrl_gn.identification import IdentifyingModel
+from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.scenes import Scene, sample_variants
+
+_PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # on squared weights, as shares of the number of samples
 
 
 def report(
@@ -29,22 +33,15 @@ def report(
     horizons: tuple[int, ...] = HORIZONS,
     scene: Scene | None = None,
 ) -> tuple[ErrorTable, list[Path]]:
-    """Evaluate a model, bound to the scene of the trajectories, and draw the first of them.
+    """Evaluate a model on trajectories ``[M]`` of its scene, and draw the first, which may be of a variant ``scene``.
 
-    Args:
-        trajectories: ``[M]`` with ``state`` ``[M, T + 1, N, 13]``, ``action`` ``[M, T, A]`` and physical parameters at
-            the model's ``parameters_key`` if it has one.
-        scene: scene of the first trajectory, if that is a variant of the model's.
-
-    Returns:
-        The error table, and the written files: ``prediction.png`` (one body), ``errors.png`` and ``rollout.gif``.
+    Returns the error table, and the written files: ``prediction.png`` (one body), ``errors.png`` and ``rollout.gif``.
     """
     folder, scene = Path(folder), scene or model.scene
     table = evaluate_errors(model, trajectories, horizons=horizons, keep=1)
-    truth, prediction = trajectories["state"][0, : table.rollouts.shape[1]], table.rollouts[0]
-    finite = prediction.isfinite().flatten(1).all(1)
-    length = int(finite.long().cumprod(0).sum())
-    truth, prediction = truth[:length], prediction[:length]
+    prediction = table.rollouts[0]
+    prediction = prediction[: int(prediction.isfinite().flatten(1).all(1).long().cumprod(0).sum())]
+    truth = trajectories["state"][0, : len(prediction)]
     files = [
         plot_body_trajectory(truth, prediction, scene, folder / "prediction.png"),
         plot_errors({scene.name: table}, folder / "errors.png"),
@@ -62,10 +59,10 @@ def fresh_errors(
     seed: int,
     context_length: int = 20,
 ) -> ErrorTable:
-    """Evaluate a model on new random trajectories of a scene, the same ones for the same seed.
+    """Evaluate a model on new random trajectories of a scene, of at least 100 control steps.
 
-    A model that identifies is evaluated on random variants of the scene: each is identified from one trajectory
-    (``context_length`` steps) and predicted on another. ``length`` in control steps must be at least 100.
+    A model that identifies is evaluated on random variants: each is identified from the first ``context_length`` steps
+    of one trajectory and predicted on another.
     """
     if length < max(HORIZONS):
         raise ValueError(f"length={length} is too short: errors are measured over rollouts of {max(HORIZONS)} steps.")
@@ -77,3 +74,70 @@ def fresh_errors(
     both = collect_trajectories(variants, 2 * sequences, length, seed, split=4)
     observed, predicted = (cast(TensorDictBase, half) for half in (both[:sequences], both[sequences:]))
     return identification_errors(*model.bind(scene), observed, predicted, steps=context_length)
+
+
+@torch.no_grad()
+def identification_errors(
+    model: Predictor,
+    inference: BoundInferenceModel,
+    observed: TensorDictBase,
+    trajectories: TensorDictBase,
+    *,
+    steps: int | None = None,
+    wrong: bool = False,
+    horizons: Sequence[int] = HORIZONS,
+    one_step: bool = True,
+) -> ErrorTable:
+    """Errors of predictions with what was inferred from other trajectories of the same systems.
+
+    Args:
+        model: forward model that reads what the inference model writes.
+        observed: ``[M]`` with ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``: one trajectory of
+            every system.
+        trajectories: ``[M]`` test trajectories of the same systems in the same order.
+        steps: number of transitions to identify from. Default: all.
+        wrong: give every system what was inferred of another (paper, figure "System identification performance").
+    """
+    if len(observed) != len(trajectories):
+        raise ValueError(f"There are {len(observed)} observed and {len(trajectories)} test trajectories; give pairs.")
+    if wrong and len(observed) < 2:
+        raise ValueError("Another system takes at least two trajectories.")
+    action = cast(Tensor, observed.get("action"))[:, :steps]
+    state = cast(Tensor, observed.get("state"))[:, : action.shape[1] + 1]
+    device = next(inference.parameters()).device
+    parameters = inference.identify(state.to(device), action.to(device))
+    if wrong:
+        parameters = parameters.apply(lambda value: value.roll(1, 0))
+    entries = {key: trajectories.get(key) for key in ("state", "action")}
+    test = TensorDict({**entries, "parameters": parameters}, batch_size=[len(parameters)])
+    return evaluate_errors(model, test, horizons=horizons, one_step=one_step)
+
+
+def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
+    """Coefficients of determination ``[P]`` of linear maps from features ``[M, F]`` to targets ``[M, P]``.
+
+    Ridge regression on standardised features, for each target with the penalty of lowest leave-one-out error, fitted to
+    the first ``train`` samples and tested on the rest; at least two each.
+    """
+    if train < 2 or len(features) - train < 2:
+        raise ValueError(f"train={train} of {len(features)} samples leaves too few to fit to or to test on.")
+    features, targets = features.double(), targets.double()
+    fitted, tested = features[:train], features[train:]
+    mean, std = fitted.mean(0), fitted.std(0)
+    used = std > 1e-9 * mean.abs().clamp(min=1)
+    fitted, tested = ((part[:, used] - mean[used]) / std[used] for part in (fitted, tested))
+    center = targets[:train].mean(0)
+    wanted = targets[:train] - center
+    u, s, v = torch.linalg.svd(fitted, full_matrices=False)
+    projected = u.T @ wanted
+    best, record = torch.zeros_like(targets[train:]), torch.full_like(center, torch.inf)
+    for penalty in _PENALTIES:
+        gain = s / (s.square() + penalty * train)
+        # The mean is fitted too.
+        influence = (u.square() * (s * gain)).sum(1, keepdim=True) + 1 / train
+        missed = wanted - u @ ((s * gain)[:, None] * projected)
+        error = (missed / (1 - influence).clamp(min=1e-9)).square().sum(0)
+        predicted = tested @ (v.T @ (gain[:, None] * projected))
+        best, record = torch.where(error < record, predicted, best), torch.minimum(error, record)
+    left = targets[train:] - center - best
+    return 1 - left.square().sum(0) / (targets[train:] - targets[train:].mean(0)).square().sum(0)

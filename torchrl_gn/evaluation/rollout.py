@@ -16,15 +16,12 @@ from torchrl_gn.finite import require_finite
 def rollout(
     model: TensorDictModuleBase, state: Tensor, actions: Tensor, parameters: TensorDictBase | None = None
 ) -> Tensor:
-    """States ``[*B, T + 1, N, 13]`` that a model predicts from a start state, which comes first.
-
-    Differentiable in the state, the actions and the model's weights. Inputs are checked, predictions are not: see
-    :func:`guarded_rollout`.
+    """States ``[*B, T + 1, N, 13]`` that a model predicts from a start state, which comes first; differentiable.
 
     Args:
         model: reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
-        state: ``[*B, N, 13]`` start states.
-        actions: ``[*B, T, A]`` controls; ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``.
+        state: ``[*B, N, 13]``.
+        actions: ``[*B, T, A]``.
         parameters: physical parameters of each rollout ``[*B]``, or without batch. Default: the scene's.
     """
     _check(state, actions, parameters)
@@ -60,12 +57,8 @@ def guarded_rollout(
     the range of its training (:meth:`~torchrl_gn.dynamics.Predictor.in_range`).
 
     Args:
-        model: like ``parameters`` as of :func:`rollout`.
-        state: ``[*B, N, 13]`` start states; they are not judged.
-        actions: ``[*B, T, A]``.
         hidden_state: ``[*B]`` hidden state of a recurrent model before the start.
-        every: steps between two checks (each waits for a GPU). The batch is then narrowed to what goes on; a compiled
-            model keeps its batch and stops when all have diverged. Other modules are checked after every step.
+        every: steps between two checks of a predictor (each waits for a GPU); other modules: 1.
     """
     _check(state, actions, parameters)
     if not (limit > 0 and every >= 1):
@@ -86,8 +79,7 @@ def guarded_rollout(
     for first in range(0, steps, every):
         now = actions[:, first : first + every]
         predicted, hidden_state = predictor.rollout(current, now, parameters, hidden_state)  # pyright: ignore[reportArgumentType]
-        predicted = predicted[:, 1:]
-        current, count = predicted[:, -1], predicted.shape[1]
+        predicted, current, count = predicted[:, 1:], predicted[:, -1], now.shape[1]
         states[rows, first + 1 : first + 1 + count] = predicted
         fine = predictor.in_range(predicted, limit)
         if bool(fine.all()):
@@ -109,10 +101,8 @@ def guarded_rollout(
 
 def _check(state: Tensor, actions: Tensor, parameters: TensorDictBase | None) -> None:
     if state.ndim < 2 or actions.ndim < 2 or state.shape[:-2] != actions.shape[:-2]:
-        raise ValueError(
-            f"rollout needs a state [*B, N, 13] and actions [*B, T, A] with the same *B,"
-            f" got {list(state.shape)} and {list(actions.shape)}."
-        )
+        shapes = f"{list(state.shape)} and {list(actions.shape)}"
+        raise ValueError(f"rollout needs a state [*B, N, 13] and actions [*B, T, A] of one *B, got {shapes}.")
     for what, given in (("state", state), ("actions", actions), ("parameters", parameters)):
         if given is not None:
             require_finite(given, what)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +15,10 @@ from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.evaluation.canvas import GRID, INK, PREDICTION, TRUTH
+from torchrl_gn.scenes import Scene
 
 if TYPE_CHECKING:
     from PIL import Image
-
-    from torchrl_gn.scenes import Scene
 
 _SHORTEST_FRAME = 0.02  # seconds; viewers slow down GIFs with shorter frames
 _HEADER = 58  # pixels above the panels
@@ -36,18 +37,11 @@ def rollout_video(
 ) -> Path:
     """Write a rollout as a video: the truth on the left; on the right the prediction, with the truth pale behind.
 
-    The camera looks at the plane of motion (or from the side and above) and follows the truth along
-    translation-invariant axes. Bodies are drawn where the states put them, even with joints apart.
-
     Args:
-        truth: ``[T + 1, N, 13]`` true states.
+        truth: ``[T + 1, N, 13]`` true states, finite.
         prediction: ``[T + 1, N, 13]`` predicted states, or None; frames of non-finite states say so.
         path: file to write: ``.gif``, or ``.mp4`` (needs imageio-ffmpeg).
         speed: 1 is real time. States are skipped to keep frames at least 20 ms long.
-
-    Raises:
-        ValueError: shapes do not fit the scene, the truth is not finite, or an option is out of range.
-        ImportError: Pillow is not installed, or imageio-ffmpeg for an ``.mp4``.
     """
     path = Path(path)
     if path.suffix not in (".gif", ".mp4"):
@@ -63,7 +57,7 @@ def rollout_video(
 
 
 def frame_stride(interval: float) -> int:
-    """Number of states per frame that keeps frames at least 20 ms long, for states ``interval`` seconds apart."""
+    """Number of states, ``interval`` seconds apart, in a frame of at least 20 ms."""
     return max(1, math.ceil(_SHORTEST_FRAME / interval - 1e-6))
 
 
@@ -76,12 +70,7 @@ def rollout_frames(
     size: int = 360,
     labels: tuple[str, str] = ("truth", "prediction"),
 ) -> Iterator[Image.Image]:
-    """RGB pictures of :func:`rollout_video` with even widths and heights, one for ``every`` states.
-
-    Args:
-        truth: ``[T + 1, N, 13]``.
-        prediction: ``[T + 1, N, 13]`` or None.
-    """
+    """RGB pictures of :func:`rollout_video` with even widths and heights, one for ``every`` states."""
     sequences = [_to_numpy(scene, "Truth", truth)]
     if prediction is not None:
         if prediction.shape != truth.shape:
@@ -92,22 +81,19 @@ def rollout_frames(
     if every < 1 or size < 32 or size % 2:
         raise ValueError(f"every must be at least 1 and size an even number from 32, got {every} and {size}.")
     try:
-        import PIL  # noqa: F401
+        from torchrl_gn.evaluation.drawing import SceneDrawing
     except ImportError:
         raise ImportError('Pictures and videos need Pillow: pip install "torchrl_gn[figures]".') from None
-    sequences = [states[::every] for states in sequences]
-    panels = _drawn_panels(scene, sequences, size)
-    return (_compose(scene.name, step * every * scene.timestep, row, size, labels) for step, row in enumerate(panels))
 
+    def frames() -> Iterator[Image.Image]:
+        drawing = SceneDrawing(scene, sequences[0][::every], size)
+        motions = [drawing.truth, *(drawing.motion(states[::every]) for states in sequences[1:])]
+        for step in range(len(drawing.truth.valid)):
+            row = zip(motions, (TRUTH, PREDICTION), (False, True), strict=False)
+            panels = [drawing.panel(step, motion, color, ghost=ghost) for motion, color, ghost in row]
+            yield _compose(scene.name, step * every * scene.timestep, panels, size, labels)
 
-def _drawn_panels(scene: Scene, sequences: list[np.ndarray], size: int) -> Iterator[list[Image.Image]]:
-    from torchrl_gn.evaluation.drawing import SceneDrawing
-
-    drawing = SceneDrawing(scene, sequences[0], size)
-    motions = [drawing.truth, *map(drawing.motion, sequences[1:])]
-    for step in range(len(sequences[0])):
-        row = zip(motions, (TRUTH, PREDICTION), (False, True), strict=False)
-        yield [drawing.panel(step, motion, color, ghost=ghost) for motion, color, ghost in row]
+    return frames()
 
 
 def _compose(name: str, time: float, row: list[Image.Image], size: int, labels: tuple[str, str]) -> Image.Image:
@@ -117,13 +103,10 @@ def _compose(name: str, time: float, row: list[Image.Image], size: int, labels: 
     draw = ImageDraw.Draw(image)
     draw.text((_GAP + 2, 16), name, INK, ImageFont.load_default(17), "lm")
     draw.text((image.width - _GAP - 2, 16), f"t = {time:.2f} s", INK, ImageFont.load_default(17), "rm")
-    for number, (panel, label) in enumerate(zip(row, labels, strict=False)):
+    for number, (panel, label, color) in enumerate(zip(row, labels, (TRUTH, PREDICTION), strict=False)):
         left = _GAP + number * (size + _GAP)
-        color = (TRUTH, PREDICTION)[number]
         draw.text((left + size // 2, 44), label, color, ImageFont.load_default(15), "mm")
-        if panel.width != size:
-            panel = panel.reduce(panel.width // size)
-        image.paste(panel, (left, _HEADER))
+        image.paste(panel.reduce(panel.width // size), (left, _HEADER))
         draw.rectangle((left, _HEADER, left + size - 1, _HEADER + size - 1), outline=GRID)
     return image
 
@@ -134,10 +117,7 @@ def _write_gif(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
     pictures = list(frames)
     # One palette for all frames, from a sample of them, keeps colours from flickering.
     sample = pictures[:: max(1, len(pictures) // 6)]
-    strip = Image.new("RGB", (sample[0].width, sample[0].height * len(sample)))
-    for number, picture in enumerate(sample):
-        strip.paste(picture, (0, number * picture.height))
-    colors = strip.quantize(128)
+    colors = Image.fromarray(np.concatenate([np.asarray(picture) for picture in sample])).quantize(128)
     pictures = [picture.quantize(palette=colors, dither=Image.Dither.NONE) for picture in pictures]
     # GIF counts in hundredths of a second: round the running time, not each frame, to stay in real time.
     ends = [round(100 * seconds * (number + 1)) for number in range(len(pictures))]
@@ -151,23 +131,16 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
     except ImportError:
         raise ImportError("Writing .mp4 needs ffmpeg: pip install imageio-ffmpeg, or write a .gif.") from None
     first = next(frames)
-    # Rates need not be whole numbers, despite the annotation.
-    rate: Any = 1 / seconds
-    writer = imageio_ffmpeg.write_frames(
-        str(path), first.size, fps=rate, quality=8, macro_block_size=2, ffmpeg_log_level="error"
-    )
-    writer.send(None)
-    try:
-        writer.send(first.tobytes())
-        for frame in frames:
+    rate: Any = 1 / seconds  # need not be a whole number, despite the annotation
+    options: dict[str, Any] = {"quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    with closing(imageio_ffmpeg.write_frames(str(path), first.size, fps=rate, **options)) as writer:
+        writer.send(None)
+        for frame in itertools.chain([first], frames):
             writer.send(frame.tobytes())
-    finally:
-        writer.close()
 
 
 def _to_numpy(scene: Scene, what: str, states: Tensor) -> np.ndarray:
     if states.ndim != 3 or states.shape[0] == 0 or states.shape[1:] != (scene.num_nodes, 13):
-        raise ValueError(
-            f"{what} of scene {scene.name!r} must be [T + 1, {scene.num_nodes}, 13], got {list(states.shape)}."
-        )
+        wanted = f"[T + 1, {scene.num_nodes}, 13]"
+        raise ValueError(f"{what} of scene {scene.name!r} must be {wanted}, got {list(states.shape)}.")
     return states.detach().double().cpu().numpy()

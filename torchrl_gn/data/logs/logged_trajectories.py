@@ -34,17 +34,14 @@ class LogReport:
         kept = f"{self.trajectories:,} trajectories, {self.kept:,} transitions"
         gaps = "no time stamps: only jumps show gaps" if self.gaps is None else _cuts("gaps", self.gaps)
         lines = [
-            f"{self.rows:,} rows in {self.episodes:,} episodes: {kept}",
-            f"  {_cuts('jumps', self.jumps)}",
-            f"  {gaps}",
+            f"{self.rows:,} rows in {self.episodes:,} episodes: {kept}\n  {_cuts('jumps', self.jumps)}\n  {gaps}",
             f"  dropped {self.not_finite:,} rows that are not finite, {self.short:,} rows of pieces too short",
         ]
         if self.interpolated:
             lines.append(f"  interpolated between rows, at steps of {1e3 * self.timestep:g} ms")
         if self.constant:
-            lines.append(
-                f"  commands that never vary: {', '.join(map(str, self.constant))}; no model learns what they do"
-            )
+            constant = ", ".join(map(str, self.constant))
+            lines.append(f"  commands that never vary: {constant}; no model learns what they do")
         lines += [f"  not read: {name!r}, {why}" for name, why in self.unread.items()]
         return "\n".join(lines)
 
@@ -66,29 +63,22 @@ def log_trajectories(
 ) -> tuple[TensorDict, LogReport]:
     """Cut a log into trajectories of equal length, none across a gap, a jump, an episode or a row that is not finite.
 
-    States lie at even steps from the first row of every piece, interpolated linearly between rows. The action of a step
-    is the mean over it of the commands, each held until the next row.
+    States are interpolated linearly between rows; an action is the mean of the commands over a step.
 
     Args:
-        steps: transitions in each trajectory.
         resample: time step of the trajectories, seconds; default: the log's.
-        lag: rows by which commands act late: a state is paired with the command that many rows before.
+        lag: rows by which commands act late.
         jump: a change of angle is a jump if the part that velocities do not explain exceeds this many times its 90 %
             quantile, and the change at the largest logged velocity.
-        overlap: start trajectories at every step; default: without overlap.
+        overlap: start trajectories at every step.
         episodes: indices of the episodes to use; default: all.
 
     Returns:
         TensorDict ``[M]``, float64, of ``state`` ``[M, steps + 1, J + 1, 3 + extras]``, ``action`` ``[M, steps, A]``
         and integer ``episode`` ``[M]``, and the report.
-
-    Raises:
-        ValueError: if an option is invalid, or no trajectory is left.
     """
     if steps < 1 or lag < 0 or not jump > 0:
-        raise ValueError(
-            f"steps={steps}, lag={lag}, jump={jump}: steps must be at least 1, lag at least 0, jump above 0."
-        )
+        raise ValueError(f"steps={steps} must be at least 1, lag={lag} at least 0, jump={jump} above 0.")
     chosen = list(range(len(log.length))) if episodes is None else [int(episode) for episode in episodes]
     stride, at, finite, gaps, jumps = _stride(log, resample), log.at, log.finite, log.gaps, log.jumps(jump)
     channels = np.stack((log.angle, log.velocity, *log.extra.values()), 1)
@@ -125,17 +115,15 @@ def log_trajectories(
         unread=log.unread,
     )
     if not num_trajectories:
-        raise ValueError(
-            f"No piece of the log has {steps} transitions of {1e3 * report.timestep:g} ms; take fewer.\n{report}"
-        )
-    data = {"state": np.concatenate(states), "action": np.concatenate(actions), "episode": np.concatenate(which)}
-    return TensorDict(
-        {key: torch.from_numpy(value) for key, value in data.items()}, batch_size=[num_trajectories]
-    ), report
+        step = f"{1e3 * report.timestep:g} ms"
+        raise ValueError(f"No piece of the log has {steps} transitions of {step}; take fewer.\n{report}")
+    parts = {"state": states, "action": actions, "episode": which}
+    entries = {key: torch.from_numpy(np.concatenate(part)) for key, part in parts.items()}
+    return TensorDict(entries, batch_size=[num_trajectories]), report
 
 
 def _stride(log: RobotLog, resample: float | None) -> float:
-    """Trajectories' time step in steps of the log, a whole number if within rounding errors."""
+    """Trajectories' time step in steps of the log, rounded if almost whole."""
     if resample is None:
         return 1.0
     if not 0 < resample < np.inf:
@@ -159,17 +147,13 @@ def _pieces(
 
 
 def _places(found: np.ndarray, log: RobotLog, episodes: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """(episode, row in it) of flags ``[R - 1]`` between rows."""
     begins = log.begins
     each = ((episode, np.flatnonzero(found[begins[episode] : begins[episode + 1] - 1])) for episode in episodes)
     return tuple((episode, int(row)) for episode, rows in each for row in rows)
 
 
 def _interpolated(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate ``channels`` ``[n, C, J]``, the first an angle, from rows at ``at`` ``[n]`` to a grid ``[K + 1]``.
-
-    Returns values ``[C, K + 1, J]``, exact at rows, and numbers of rows needed up to each ``[K + 1]``.
-    """
+    """Values ``[C, K + 1, J]`` on a grid of channels ``[n, C, J]``, the first an angle, and rows needed up to each."""
     row = np.searchsorted(at, grid, side="right") - 1
     after = np.minimum(row + 1, len(at) - 1)
     share = (grid - at[row]) / np.where(after > row, at[after] - at[row], 1)

@@ -39,8 +39,8 @@ class RobotLog:
     @property
     def finite(self) -> np.ndarray:
         """``[R]`` bool, rows whose numbers are all finite."""
-        channels = [self.angle, self.velocity, self.command, *self.extra.values()]
-        channels += [] if self.time is None else [self.time[:, None]]
+        stamps = [] if self.time is None else [self.time[:, None]]
+        channels = [self.angle, self.velocity, self.command, *self.extra.values(), *stamps]
         return np.logical_and.reduce([np.isfinite(values).all(1) for values in channels])
 
     @property
@@ -92,7 +92,7 @@ class RobotLog:
 
 
 def short_way(change: np.ndarray) -> np.ndarray:
-    """Wrap angle changes to [-pi, pi), radians."""
+    """Wrap angle changes, radians, to [-pi, pi)."""
     return (change + np.pi) % (2 * np.pi) - np.pi
 
 
@@ -110,17 +110,12 @@ def log_tree(
         resample: time step, seconds; default: the log's.
         commands: indices of the commands of each joint, none without motor; default: as many for each joint, in order.
         joint_parents: parent of each joint, -1 for the base; default: the joint before it.
-
-    Raises:
-        ValueError: if commands do not divide evenly, are not in the log, or are finite in no row.
     """
     joints, count = log.num_joints, log.command.shape[1]
     if commands is None:
         if count % joints:
-            raise ValueError(
-                f"{count} commands do not divide evenly among {joints} joints; give those of each joint, such as"
-                " commands=[[0], []] if the second of two joints has no motor."
-            )
+            wrong = f"{count} commands do not divide evenly among {joints} joints"
+            raise ValueError(f"{wrong}; give those of each, such as commands=[[0], []] if only the first has a motor.")
         each = count // joints
         commands = [range(joint * each, (joint + 1) * each) for joint in range(joints)]
     low, high = log.command_bounds()

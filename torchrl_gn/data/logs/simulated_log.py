@@ -9,9 +9,8 @@ import numpy as np
 import torch
 
 from torchrl_gn.data.controls import spline_controls
-from torchrl_gn.data.errors import UnstableSimulationError
 from torchrl_gn.data.logs.robot_log import RobotLog
-from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
 from torchrl_gn.data.start_states import sample_start_states
 from torchrl_gn.scenes.scene import Scene
 
@@ -35,15 +34,10 @@ def simulate_log(
 
     Args:
         scene: a robot whose joints are all hinges.
-        delay: control steps until a command acts.
-        time_constant: of the lag, seconds; 0: no lag.
+        time_constant: of the lag, seconds.
         play: width of the play, as a fraction of the command's range.
         quantum: resolution of the encoders, radians.
         noise: standard deviation of the encoders, radians.
-
-    Raises:
-        ValueError: if the scene has joints other than hinges, or no motors.
-        UnstableSimulationError: if a simulation becomes unstable.
     """
     model = scene.model
     if (model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE).any() or not scene.num_actions:
@@ -59,8 +53,7 @@ def simulate_log(
     measured = angle + noise * rng.normal(size=angle.shape)
     measured = np.round(measured / quantum) * quantum if quantum > 0 else measured
     velocity = np.diff(measured, axis=1) / scene.timestep
-    # The first row has no velocity, the last no executed command.
-    rows = episodes * (steps - 1)
+    rows = episodes * (steps - 1)  # the first row has no velocity, the last no executed command
     return RobotLog(
         angle=measured[:, 1:-1].reshape(rows, -1),
         velocity=velocity[:, :-1].reshape(rows, -1),
@@ -71,7 +64,6 @@ def simulate_log(
 
 
 def _motors(command: np.ndarray, scene: Scene, delay: int, time_constant: float, play: float) -> np.ndarray:
-    """Actions ``[n, T, A]`` of motors under commands ``[n, T, A]``."""
     width = play * (scene.action_high - scene.action_low) / 2
     share = 1.0 if time_constant <= 0 else 1 - np.exp(-scene.timestep / time_constant)
     rest = np.clip(np.zeros(scene.num_actions), scene.action_low, scene.action_high)
