@@ -140,8 +140,10 @@ class ModelEnv(ModelBasedEnvBase):
         """
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
         if actions.shape != shape or shape[-2] < 1:
-            wanted = f"{[*tensordict.shape, 'H', self.scene.num_actions]} with H at least 1"
-            raise ValueError(f"actions must be {wanted}, got {list(actions.shape)}")
+            raise ValueError(
+                f"actions must be [*B, H, {self.scene.num_actions}] with the TensorDict's batch"
+                f" {list(tensordict.shape)} and H at least 1, got {list(actions.shape)}"
+            )
         state = read(tensordict, "state", self._state_shape, self)
         model = self.predictor
         inputs = model.parameters_in(tensordict), model.hidden_state_in(tensordict)

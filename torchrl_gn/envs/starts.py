@@ -15,7 +15,6 @@ from torchrl.envs import BatchSizeTransform, EnvBase, TransformedEnv
 from torchrl_gn.data.controls import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
-from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.scene import Scene
 
@@ -32,7 +31,10 @@ class StartSampler:
         joints = isinstance(scene, KinematicTree)
         self.shape = (scene.num_nodes, scene.state_size) if joints else (scene.physics_size,)
         if joints and start_states is None:
-            raise ValueError(f"Robot {scene.name!r} needs start_states {['M', *self.shape]}, those of its log, say.")
+            raise ValueError(
+                f"Nothing is known of where robot {scene.name!r} starts; give start_states"
+                f" [M, {scene.num_nodes}, {scene.state_size}], those of its log, say."
+            )
         given = isinstance(start_states, (Tensor, np.ndarray))
         self._source = self._checked(start_states, None) if given else start_states
         self.seed(seed)
@@ -77,7 +79,9 @@ class StartSampler:
         if states.shape != (count or max(1, len(states)), *self.shape):
             wanted = f"[{', '.join(map(str, (count or 'M', *self.shape)))}]"
             raise ValueError(f"start states of {self.scene.name!r} must be {wanted}, got {list(states.shape)}")
-        require_finite(states, f"start states of {self.scene.name!r}")
+        finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
+        if not finite.all():
+            raise ValueError(f"start state {int(finite.argmin())} of {self.scene.name!r} is not finite")
         return states
 
 
