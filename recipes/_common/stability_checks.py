@@ -259,5 +259,5 @@ def orientation_loss(s: Setting) -> float:
     scale = s.exact.model.delta_normalizer.inverse_std[where]
     weight = s.exact.movable[:, where] * scale
     expected = (off * weight).square().sum() / (weight > 0).sum()
-    errors = loss._component_errors(torch.zeros_like(target), target)
+    errors = loss.component_errors(torch.zeros_like(target), target)
     return s.error(errors[BODY_STATE.names.index("orientation")], expected)

@@ -119,7 +119,7 @@ def test_teacher_forcing_feeds_true_states_first(bound, trajectories, forced):
     hidden_state, current, errors, program = None, state[:, 0], [], bound.program()
     for step in range(5):
         delta, hidden_state = eager.delta(program, current, action[:, step], hidden_state)
-        errors.append(loss._component_errors(delta, bound.layout.delta(current, target[:, step])))
+        errors.append(loss.component_errors(delta, bound.layout.delta(current, target[:, step])))
         following = state[:, step + 1] if step + 1 < min(forced, 5) else bound.layout.apply(current, delta)
         current = following
     expected = torch.stack(errors).mean(0).sum() / 4

@@ -24,7 +24,7 @@ from torchrl_gn.evaluation import (
     plot_training_curve,
     summary,
 )
-from torchrl_gn.evaluation.motion_figures import _align_signs, _node_index, _rotated
+from torchrl_gn.evaluation.motion_figures import align_signs, node_index, rotation_angle
 
 from .conftest import moving_states
 
@@ -76,12 +76,12 @@ def test_body_trajectory(scenes, tmp_path, name):
 
 
 def test_default_body_is_link_3_of_swimmer6(scenes):
-    assert _node_index(scenes["swimmer6"], None) == 3
-    assert _node_index(scenes["swimmer6"], "head") == 1
+    assert node_index(scenes["swimmer6"], None) == 3
+    assert node_index(scenes["swimmer6"], "head") == 1
     with pytest.raises(ValueError, match="no node 'tail'"):
-        _node_index(scenes["swimmer6"], "tail")
+        node_index(scenes["swimmer6"], "tail")
     with pytest.raises(ValueError, match="nodes 0 to 6"):
-        _node_index(scenes["swimmer6"], 9)
+        node_index(scenes["swimmer6"], 9)
 
 
 def test_quaternions_are_shown_without_jumps():
@@ -92,7 +92,7 @@ def test_quaternions_are_shown_without_jumps():
     jumping, other = smooth.copy(), smooth.copy()
     jumping[1:, 3:7] *= signs[1:, None]
     other[:, 3:7] *= -signs[:, None]
-    true, predicted = _align_signs(jumping, other, slice(3, 7))
+    true, predicted = align_signs(jumping, other, slice(3, 7))
     np.testing.assert_allclose(true, smooth)
     np.testing.assert_allclose(predicted, smooth)
 
@@ -150,7 +150,7 @@ def test_rewards_over_planning_time(tmp_path, monkeypatch):
 def test_motions_count_whole_turns(scenes, tmp_path):
     angle = torch.linspace(0, 9, 40, dtype=torch.float64)
     turned = torch.stack((torch.cos(angle / 2), 0 * angle, torch.sin(angle / 2), 0 * angle), 1)
-    np.testing.assert_allclose(_rotated(turned, turned[:1], 1), angle)
+    np.testing.assert_allclose(rotation_angle(turned, turned[:1], 1), angle)
     states = moving_states(scenes["swimmer6"], 40).expand(3, -1, -1, -1)
     panels = {"with control": (states, states[:, 20:])}
     path = plot_motions(panels, scenes["swimmer6"], tmp_path / "motions.png", labels=("a", "b", "c"))

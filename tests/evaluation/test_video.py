@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, ImageColor
 
 from torchrl_gn.evaluation import canvas, rollout_frames, rollout_video
-from torchrl_gn.evaluation.drawing import _nice, _outline
+from torchrl_gn.evaluation.drawing import convex_outline, nice_spacing
 from torchrl_gn.evaluation.geometry import SceneGeometry, choose_view
 from torchrl_gn.evaluation.video import frame_stride
 from torchrl_gn.scenes import load_scene
@@ -64,11 +64,11 @@ def test_views_look_at_the_plane_of_motion(scenes):
 
 def test_outline_of_a_capsule_is_exact():
     points = np.array([[[-2.0, 0.0], [2.0, 0.0]]])
-    outline = _outline(points, 0.5)[0]
+    outline = convex_outline(points, 0.5)[0]
     distance = np.linalg.norm(outline - np.stack((np.clip(outline[:, 0], -2, 2), 0 * outline[:, 1]), -1), axis=-1)
     np.testing.assert_allclose(distance, 0.5, atol=1e-12)
     assert outline[:, 0].max() == pytest.approx(2.5)
-    assert [_nice(value) for value in (0.19, 0.2, 0.7, 3.0, 99.0)] == pytest.approx([0.1, 0.2, 0.5, 2.0, 50.0])
+    assert [nice_spacing(value) for value in (0.19, 0.2, 0.7, 3.0, 99.0)] == pytest.approx([0.1, 0.2, 0.5, 2.0, 50.0])
 
 
 @pytest.mark.parametrize("name", ["pendulum", "swimmer6"])

@@ -172,7 +172,7 @@ def test_windows_feed_the_model_its_own_predictions(make_loss, windows, noise):
     generator.manual_seed(3)
     out = loss(batch)
     generator.manual_seed(3)
-    current, total = loss._perturb(batch["state"][:, 0]), 0.0
+    current, total = loss.perturb(batch["state"][:, 0]), 0.0
     for step in range(batch.shape[1]):
         delta = loss.model.delta(current, batch["action"][:, step])
         target = BODY_STATE.delta(current, batch["next", "state"][:, step])
@@ -281,7 +281,7 @@ def test_fitted_normalisers_give_the_network_unit_targets(make_loss, windows, no
     loss = make_loss("swimmer6", noise=noise, generator=torch.Generator().manual_seed(0), model=options)
     model, batch = loss.model.model, windows["swimmer6"].reshape(-1)
     loss.generator.manual_seed(0)
-    state = loss._perturb(batch["state"])
+    state = loss.perturb(batch["state"])
     target = BODY_STATE.delta(state, batch["next", "state"])
     if model.integrate:
         target = BODY_STATE.residual(state, target, loss.model.scene.timestep)

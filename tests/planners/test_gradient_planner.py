@@ -224,12 +224,12 @@ def test_a_first_plan_is_of_the_best_samples_only(monkeypatch):
     """None of them starts anew before it was planned; later ones do, close to the best."""
     env, start = point_env(1.0), at(-0.3, 0.2)
     planner = GradientPlanner(env, HORIZON, 1, warm_up=0, candidates=4, samples=9, seed=3)
-    drawn, splines = [], planner._splines
-    monkeypatch.setattr(planner, "_splines", lambda *counts: drawn.append(splines(*counts)) or drawn[-1].clone())
+    drawn, splines = [], planner.random_plans
+    monkeypatch.setattr(planner, "random_plans", lambda *counts: drawn.append(splines(*counts)) or drawn[-1].clone())
     planner(start)
     (samples,) = drawn
     samples[:, 0] = 0
-    returns = planner._imagine(at(-0.3, 0.2).repeat_interleave(9, 0), samples)
+    returns = planner.predicted_returns(at(-0.3, 0.2).repeat_interleave(9, 0), samples)
     best = samples.gather(1, returns.argsort(1, descending=True)[:, :4, None, None].expand(-1, -1, HORIZON, 1))
     torch.testing.assert_close(start["plan", "actions"][:, :, :-1], best[:, :, 1:])
     planner(start)
@@ -238,8 +238,8 @@ def test_a_first_plan_is_of_the_best_samples_only(monkeypatch):
 
 def test_as_many_samples_as_candidates_are_sorted_too():
     planner, start = GradientPlanner(point_env(1.0), 4, warm_up=0, candidates=3, samples=3, seed=0), at(1.0)
-    first = planner._initial_plan(start)
-    totals = planner._imagine(start.repeat_interleave(3, 0), first)
+    first = planner.initial_plan(start)
+    totals = planner.predicted_returns(start.repeat_interleave(3, 0), first)
     assert (totals.diff(dim=1) <= 0).all() and (first[:, 0] != 0).any()
 
 
@@ -412,9 +412,9 @@ def test_noise_is_a_share_of_the_range_around_the_best():
     plan[:, 1:] = -0.9
     for noise in (0.0, 0.05, 0.5):
         planner = GradientPlanner(point_env(2.0), HORIZON, candidates=4, noise=noise, seed=0)
-        off = planner._resample(plan)[:, 2:] - 0.1
+        off = planner.resample(plan)[:, 2:] - 0.1
         assert (off.abs() <= noise + 1e-6).all() and (off.abs().max() > 0.5 * noise or noise == 0)
-        assert torch.equal(planner._resample(plan)[:, :2], plan[:, :2])
+        assert torch.equal(planner.resample(plan)[:, :2], plan[:, :2])
 
 
 def test_a_gradient_that_is_no_number_costs_an_iteration_and_no_more():

@@ -86,11 +86,11 @@ def test_what_an_inference_model_wrote_is_planned_with(folds):
     parameters = bound.own_parameters().expand(2).apply(torch.randn_like)
     start["parameters"] = parameters
     planner(start)
-    total = planner._imagine(start.select("state", "parameters"), torch.zeros(2, 1, 3, 1))
+    total = planner.predicted_returns(start.select("state", "parameters"), torch.zeros(2, 1, 3, 1))
     for row in range(2):
         other = parameters.clone()
         other["nodes"][1 - row] += 1
-        changed = planner._imagine(start.select("state").set("parameters", other), torch.zeros(2, 1, 3, 1))
+        changed = planner.predicted_returns(start.select("state").set("parameters", other), torch.zeros(2, 1, 3, 1))
         assert changed[row] == pytest.approx(total[row].item(), rel=1e-6)
         assert changed[1 - row] != pytest.approx(total[1 - row].item(), rel=1e-6)
     folds.clear()

@@ -67,10 +67,10 @@ class SceneDrawing:
         floor = self._floor if not self.view.planar else None
         for shape in self.geometry.shapes:
             points = positions[:, shape.geom, None] + np.einsum("tij,pj->tpi", rotations[:, shape.geom], shape.points)
-            outlines.append(_outline(self.view.project(points), shape.radius))
+            outlines.append(convex_outline(self.view.project(points), shape.radius))
             depths.append(points.mean(axis=1) @ self.view.toward)
             if floor is not None:
-                flat = _outline(points[..., :2], shape.radius)
+                flat = convex_outline(points[..., :2], shape.radius)
                 shadows.append(self.view.project(np.concatenate((flat, np.full((*flat.shape[:-1], 1), floor)), -1)))
         order = np.argsort(np.stack(depths, axis=-1), axis=-1, kind="stable") if depths else np.zeros((len(states), 0))
         return Motion(outlines, order.astype(int), shadows, self.view.project(self.geometry.anchors(states)), valid)
@@ -129,7 +129,7 @@ class SceneDrawing:
             self._polygon(draw, step, motion.outlines[index][step], fill, rim, width=round(1.2 * _SMOOTH))
 
     def _ground(self, draw: ImageDraw.ImageDraw, step: int) -> None:
-        spacing, side = _nice(self.extent / 4), self.size * _SMOOTH
+        spacing, side = nice_spacing(self.extent / 4), self.size * _SMOOTH
         center = self._follow[step] + self._middle
         low, high = center - self.extent / 2, center + self.extent / 2
         if self.view.planar:  # a grid that stays where it is; from the side its vertical lines, and the floor
@@ -157,7 +157,7 @@ class SceneDrawing:
                     draw.line(tuple(pixels.flatten().tolist()), fill=GRID, width=_SMOOTH)
 
 
-def _outline(points: np.ndarray, radius: float) -> np.ndarray:
+def convex_outline(points: np.ndarray, radius: float) -> np.ndarray:
     """Corners ``[T, K, 2]`` of the convex outline of points ``[T, P, 2]`` thickened by a radius."""
     farthest = (points @ _FAN.T).argmax(axis=1)  # [T, K]
     return np.take_along_axis(points, farthest[..., None], axis=1) + radius * _FAN
@@ -167,7 +167,8 @@ def _ticks(low: float, high: float, spacing: float) -> np.ndarray:
     return np.arange(math.ceil(low / spacing), math.floor(high / spacing) + 1) * spacing
 
 
-def _nice(value: float) -> float:
+def nice_spacing(value: float) -> float:
+    """The nearest 1, 2 or 5 times a power of ten below a value."""
     power = 10.0 ** math.floor(math.log10(value))
     return power * max(factor for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))
 

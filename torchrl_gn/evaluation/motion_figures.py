@@ -41,9 +41,9 @@ def plot_body_trajectory(
     if truth.ndim != 3 or truth.shape != prediction.shape or truth.shape[1:] != (scene.num_nodes, 13):
         shapes = f"[T + 1, {scene.num_nodes}, 13], got {list(truth.shape)} and {list(prediction.shape)}"
         raise ValueError(f"Truth and prediction of scene {scene.name!r} must both be {shapes}.")
-    index = _node_index(scene, node)
+    index = node_index(scene, node)
     true, predicted = (states[:, index].detach().double().cpu().numpy() for states in (truth, prediction))
-    true, predicted = _align_signs(true.copy(), predicted.copy(), BODY_STATE.slices["orientation"])
+    true, predicted = align_signs(true.copy(), predicted.copy(), BODY_STATE.slices["orientation"])
     time = np.arange(len(true)) * scene.timestep
     figure = new_figure((9.0, 5.6))
     for axes, (name, label, channels) in zip(figure.subplots(2, 2, sharex=True).flat, _PANELS, strict=True):
@@ -79,7 +79,7 @@ def plot_motions(
             steps, by title.
         labels: names of the ``S`` systems.
     """
-    index, where = _node_index(scene, node), BODY_STATE.slices["orientation"]
+    index, where = node_index(scene, node), BODY_STATE.slices["orientation"]
     figure = new_figure((4.6 * len(panels) + 0.4, 3.6))
     for axes, (title, (truth, prediction)) in zip(
         figure.subplots(1, len(panels), squeeze=False, sharey=True)[0], panels.items(), strict=True
@@ -91,7 +91,7 @@ def plot_motions(
             relative = quaternion.product(quaternion.conjugate(start), truth[system, :, index, where])
             main, true = int(relative[:, 1:].square().sum(0).argmax()), np.zeros(0)
             for states, offset, look in ((truth, 0, _TRUE), (prediction, first, {**_PREDICTED, "label": label})):
-                rotated = _rotated(states[system, :, index, where], start, main)
+                rotated = rotation_angle(states[system, :, index, where], start, main)
                 if offset:  # count whole revolutions as the truth does where the prediction begins
                     rotated = rotated + 2 * np.pi * round((true[offset] - rotated[0]) / (2 * np.pi))
                 else:
@@ -106,7 +106,8 @@ def plot_motions(
     return save(figure, path)
 
 
-def _rotated(orientation: Tensor, start: Tensor, axis: int) -> np.ndarray:
+def rotation_angle(orientation: Tensor, start: Tensor, axis: int) -> np.ndarray:
+    """Angle ``[T]`` about an axis since a start orientation, unwrapped, radians."""
     relative = quaternion.product(quaternion.conjugate(start), orientation)
     return np.unwrap(2 * torch.atan2(relative[:, 1 + axis], relative[:, 0]).detach().cpu().numpy())
 
@@ -156,7 +157,8 @@ def plot_joints(
     return save(figure, path)
 
 
-def _node_index(scene: Scene, node: int | str | None) -> int:
+def node_index(scene: Scene, node: int | str | None) -> int:
+    """Index of a node given by index or name; default: the middle moving one."""
     if node is None:
         if not len(moving := np.flatnonzero(scene.predicted)):
             raise ValueError(f"Nothing moves in scene {scene.name!r}.")
@@ -170,7 +172,8 @@ def _node_index(scene: Scene, node: int | str | None) -> int:
     return node
 
 
-def _align_signs(true: np.ndarray, predicted: np.ndarray, where: slice) -> tuple[np.ndarray, np.ndarray]:
+def align_signs(true: np.ndarray, predicted: np.ndarray, where: slice) -> tuple[np.ndarray, np.ndarray]:
+    """Orientations with the signs of their neighbours in time, and predictions with those of the truth."""
     q, p = true[:, where], predicted[:, where]
     # The product of all sign changes so far undoes every jump between q and -q.
     jumps = np.where((q[1:] * q[:-1]).sum(-1) < 0, -1.0, 1.0)

@@ -129,7 +129,7 @@ class ForwardModelLoss(LossModule):
             if component.kind == "add":
                 scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]]
         self.noise_scale.copy_(scale)
-        noisy = self._perturb(state)
+        noisy = self.perturb(state)
         # Not the model's statistics: over several scenes they would underweight errors in slow ones.
         change = Normalizer(layout.delta_size, floor=1e-9)
         change.update(layout.delta(noisy, next_state).cpu(), model.movable.cpu())
@@ -161,15 +161,15 @@ class ForwardModelLoss(LossModule):
         if state.ndim == 3:
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
         layout, steps = self.model.layout, state.shape[1]
-        current, hidden = self._perturb(state[:, 0]), None
+        current, hidden = self.perturb(state[:, 0]), None
         errors, program = state.new_zeros(len(layout.components)), self.model.program(parameters)
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
             delta, hidden = eager.delta(program, current, action[:, step], hidden)
-            errors = errors + self._component_errors(delta, target)
+            errors = errors + self.component_errors(delta, target)
             if step + 1 < steps:
                 teacher_forced = step + 1 < self.teacher_forced_steps
-                current = self._perturb(state[:, step + 1]) if teacher_forced else layout.apply(current, delta)
+                current = self.perturb(state[:, step + 1]) if teacher_forced else layout.apply(current, delta)
         errors, scale = errors / steps, self._scale(self.noise_scale)
         movable = torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
         loss = errors.sum() / movable.sum().clamp(min=1)
@@ -200,7 +200,8 @@ class ForwardModelLoss(LossModule):
             require_finite(parameters, f"{self.model.parameters_key!r} of the batch")
         return parameters
 
-    def _perturb(self, state: Tensor) -> Tensor:
+    def perturb(self, state: Tensor) -> Tensor:
+        """States ``[*B, N, 13]`` with input noise."""
         if self.noise == 0:
             return state
         shape = (*state.shape[:-1], self.model.layout.delta_size)
@@ -215,7 +216,8 @@ class ForwardModelLoss(LossModule):
         weight = torch.where(self.error_weight < 0, self.trained.delta_normalizer.inverse_std, self.error_weight)
         return (weight * self.model.movable).to(like.dtype)
 
-    def _component_errors(self, delta: Tensor, target: Tensor) -> Tensor:
+    def component_errors(self, delta: Tensor, target: Tensor) -> Tensor:
+        """Error of each component: squared, by the variance of its change, averaged over samples and nodes."""
         layout, scale = self.model.layout, self._scale(delta)
         errors = []
         for component in layout.components:

@@ -137,7 +137,7 @@ class GradientPlanner(RecedingHorizonPlanner):
                 if len(rows) == 0:
                     continue
                 some = entries if len(rows) == len(flat) else cast(TensorDictBase, entries[rows])
-                start = self._resample(plan[rows]) if resumed else self._initial_plan(some)
+                start = self.resample(plan[rows]) if resumed else self.initial_plan(some)
                 best[rows], improved = self._improve(some, start, step_size[rows], resumed=resumed)
                 if resumed:
                     step_size[rows] *= torch.where(improved, 2.0, self.shrink)
@@ -173,38 +173,39 @@ class GradientPlanner(RecedingHorizonPlanner):
         usable = read.apply(lambda entry: entry.clone() if entry.is_inference() else entry)
         return cast(TensorDictBase, usable).to(self.imagined.device)
 
-    def _imagine(self, starts: TensorDictBase, plan: Tensor) -> Tensor:
+    def predicted_returns(self, starts: TensorDictBase, plan: Tensor) -> Tensor:
         """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` from states ``[B K]``; minus infinity if diverged."""
         states, rewards = self.imagined.imagine(starts, self._actions(plan).flatten(0, 1))
         finite = states.isfinite().flatten(1).all(1)
         total = torch.where(finite, rewards.sum((-2, -1)), -torch.inf).reshape(plan.shape[:2])
         return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
 
-    def _initial_plan(self, entries: TensorDictBase) -> Tensor:
+    def initial_plan(self, entries: TensorDictBase) -> Tensor:
         """Return the best random sequences ``[B, K, H, A]``, zero actions among them."""
         rows = len(entries)
-        drawn = self._splines(rows, self.samples)
+        drawn = self.random_plans(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
         # A compiled model recompiles, in minutes, for every number of rows: use the later one.
         size = self.candidates if self.imagined.predictor.fixed_batch else self.samples
         drawn = drawn[:, : self.samples // size * size]
         starts = _repeated(entries, size)
         with torch.no_grad():
-            total = torch.cat([self._imagine(starts, part) for part in drawn.split(size, dim=1)], dim=1)
+            total = torch.cat([self.predicted_returns(starts, part) for part in drawn.split(size, dim=1)], dim=1)
         total = total.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
         best = total.argsort(dim=1, descending=True, stable=True)[:, : self.candidates]
         return drawn.gather(1, best[..., None, None].expand(-1, -1, *drawn.shape[2:]))
 
-    def _splines(self, rows: int, count: int) -> Tensor:
+    def random_plans(self, rows: int, count: int) -> Tensor:
+        """Scaled smooth random sequences ``[rows, count, H, A]``."""
         drawn = torch.from_numpy(spline_controls(self.imagined.scene, rows * count, self.horizon, self._rng))
         return self._scaled(drawn.float().to(self.half_range.device)).reshape(rows, count, self.horizon, -1)
 
-    def _resample(self, plan: Tensor) -> Tensor:
+    def resample(self, plan: Tensor) -> Tensor:
         """Replace the worse half of the candidates ``[B, K, H, A]`` by perturbations of the first, the best."""
         count = self.candidates // 2
         if not count:
             return plan
-        noise = self.noise * self._splines(len(plan), count)
+        noise = self.noise * self.random_plans(len(plan), count)
         return torch.cat([plan[:, : self.candidates - count], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
 
     def _improve(
@@ -225,7 +226,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         for iteration in range(self.iterations if resumed else self.warm_up):
             with torch.enable_grad():
                 actions = plan + scale * offset
-                total = self._imagine(starts, actions)
+                total = self.predicted_returns(starts, actions)
                 depends = total.requires_grad
                 gradient = torch.autograd.grad(-total.sum(), offset, allow_unused=True)[0] if depends else None
                 if gradient is None:
@@ -243,7 +244,7 @@ class GradientPlanner(RecedingHorizonPlanner):
                 offset.copy_(((plan + scale * offset).clamp(-1, 1) - plan) / scale)
         with torch.no_grad():
             actions = plan + scale * offset
-            best, best_return = _keep_better(best, best_return, actions, self._imagine(starts, actions))
+            best, best_return = _keep_better(best, best_return, actions, self.predicted_returns(starts, actions))
         failed = int((best_return == -torch.inf).all(1).sum())
         if failed:
             fallback = "their last plan is kept" if resumed else "there is no plan yet, and nothing is done"
