@@ -26,7 +26,7 @@ class ModulePredictor:
     Its other inputs are the hidden state: carried from step to step, updated by what the module writes at ``next``.
     """
 
-    fixed_batch = False
+    fixed_batch = recurrent = False
     check_every = 1  # steps between two checks of a guarded rollout: a module may refuse states that are not finite
 
     def __init__(self, module: TensorDictModuleBase) -> None:

@@ -110,6 +110,11 @@ class Predictor(TensorDictModuleBase):
         return next(itertools.chain(linear, core.parameters())).dtype
 
     @property
+    def recurrent(self) -> bool:
+        """Whether a hidden state runs through the steps."""
+        return self.model.core.recurrent
+
+    @property
     def fixed_batch(self) -> bool:
         """Whether another batch size costs a compilation."""
         return False
@@ -145,7 +150,7 @@ class Predictor(TensorDictModuleBase):
 
     def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """Hidden state that samples bring to a recurrent model; None: the initial one."""
-        return tensordict.get("hidden_state", None) if self.model.core.recurrent else None
+        return tensordict.get("hidden_state", None) if self.recurrent else None
 
     def in_range(self, states: Tensor, limit: float) -> Tensor:
         """Which states ``[*B, N, 13]`` are finite and within ``limit`` times training's range, ``[*B]``."""
@@ -153,7 +158,7 @@ class Predictor(TensorDictModuleBase):
 
     def initial_hidden_state(self) -> TensorDict | None:
         """Initial hidden state of a recurrent model, without batch; None of others."""
-        if not self.model.core.recurrent:
+        if not self.recurrent:
             return None
         return self.model.core.start(static_graph(self, self.scene_parameters)).tensordict()
 
@@ -174,8 +179,8 @@ class Predictor(TensorDictModuleBase):
             parameters=values,
             nodes=InputScaling.of(model.node_normalizer),
             edges=InputScaling.of(model.edge_normalizer),
-            recurrent=model.core if model.core.recurrent else None,
-            static=static if model.core.recurrent else None,
+            recurrent=model.core if self.recurrent else None,
+            static=static if self.recurrent else None,
             core=UnfoldedCore(model.core, static) if unfolded else model.core.fold(self.incidence, static),
             output=OutputScaling.of(model.residual_normalizer),
             change_std=model.delta_normalizer.std,
@@ -245,7 +250,7 @@ class Predictor(TensorDictModuleBase):
         if states.shape[-3] == 0:
             raise ValueError("There is no state to predict from.")
         check_shapes(self.scene, states[..., 0, :, :], actions[..., 0, :], parameters)
-        if not self.model.core.recurrent:
+        if not self.recurrent:
             if parameters is not None and parameters.ndim:
                 parameters = parameters.unsqueeze(-1).expand(actions.shape[:-1])
             return self.step(states, actions, parameters)

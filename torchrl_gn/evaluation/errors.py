@@ -95,7 +95,7 @@ def evaluate_errors(
             single.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
         for state, action, own in _batches(states, actions, parameters, batch_size, device, layout) if horizons else ():
             wanted, hidden_state = max(0, min(keep - sum(map(len, kept)), len(state))), None
-            if burn_in:
+            if burn_in and predictor.recurrent:  # others have nothing to warm up
                 _, hidden_state = predictor.teacher_forced(state[:, :burn_in], action[:, :burn_in], own)
             state, action = state[:, burn_in:], action[:, burn_in:]
             guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own, hidden_state=hidden_state)
