@@ -237,11 +237,8 @@ class Predictor(TensorDictModuleBase):
         """
         for action in actions.unbind(-2)[:1]:
             check_shapes(self.scene, state, action, parameters)
-        states, hidden, executor = [state], self._graph(hidden_state), self.executor(parameters)
-        for action in actions.unbind(-2):
-            state, hidden = executor.step(state, action, hidden)
-            states.append(state)
-        return torch.stack(states, dim=-3), None if hidden is None else hidden.tensordict()
+        states, hidden = self.executor(parameters).rollout(state, actions, self._graph(hidden_state))
+        return states, None if hidden is None else hidden.tensordict()
 
     def teacher_forced(
         self, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None

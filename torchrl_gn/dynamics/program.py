@@ -115,6 +115,10 @@ class Executor(Protocol):
         """Next state ``[*B, N, 13]`` and hidden state of a state and an action ``[*B, A]``."""
         ...
 
+    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        """States ``[*B, T + 1, N, 13]`` from a start state under actions ``[*B, T, A]``, and the last hidden state."""
+        ...
+
 
 def _runs(rows: list[int], size: int) -> tuple[tuple[bool, slice], ...]:
     """Where to take a full row of ``size`` from: adjacent kept ``rows``, or their constants."""

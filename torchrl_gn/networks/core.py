@@ -9,7 +9,8 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor, nn
 
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
-from torchrl_gn.networks.incidence import Incidence
+from torchrl_gn.networks.incidence import Incidence, Rows
+from torchrl_gn.networks.layers import LayerList
 
 
 class FoldedCore(Protocol):
@@ -29,6 +30,17 @@ class ReducibleCore(FoldedCore, Protocol):
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> ReducibleCore:
         """The same core with fewer, rescaled dynamic and output features; ``shift`` is added to the scaled output."""
+        ...
+
+
+@runtime_checkable
+class ListedCore(FoldedCore, Protocol):
+    """A folded core that is a list of linear layers, which the native executor runs."""
+
+    predicted: Rows  # nodes that are predicted
+
+    def layers(self) -> LayerList | None:
+        """Its layers; None if they cannot be listed."""
         ...
 
 

@@ -61,3 +61,18 @@ def copy_into(old, new) -> bool:
         for a, b in pairs:
             a.copy_(b)
     return True
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether nested tuples and dataclasses hold equal tensors and otherwise the same objects."""
+    if a is b:
+        return True
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, Tensor):
+        return a.shape == b.shape and a.dtype == b.dtype and bool(torch.equal(a, b))
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    if is_dataclass(a):
+        return all(same(getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
+    return not isinstance(a, torch.nn.Module) and a == b

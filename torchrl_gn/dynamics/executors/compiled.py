@@ -65,6 +65,9 @@ class CompiledExecutor:
             after, *rest = detached(self.run, *inputs)
         return after, Graph(rest[0], rest[1], rest[2], self.program.edge_index) if rest else None
 
+    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        return eager.rollout_by_steps(self, state, actions, hidden)
+
     def _start(self, state: Tensor, action: Tensor) -> Graph:
         program = self.program
         assert program.recurrent is not None

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.features.canonical_state import CanonicalState
 from torchrl_gn.dynamics.features.feature import StepInputs
-from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.dynamics.program import Executor, StepProgram
 from torchrl_gn.networks.graph import Graph, graph_concat
 
 
@@ -24,6 +24,20 @@ class EagerExecutor:
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         return step(self.program, state, action, hidden)
+
+    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        return rollout_by_steps(self, state, actions, hidden)
+
+
+def rollout_by_steps(
+    executor: Executor, state: Tensor, actions: Tensor, hidden: Graph | None
+) -> tuple[Tensor, Graph | None]:
+    """States ``[*B, T + 1, N, 13]`` of an executor's steps under actions ``[*B, T, A]``, and the last hidden state."""
+    states = [state]
+    for action in actions.unbind(-2):
+        state, hidden = executor.step(state, action, hidden)
+        states.append(state)
+    return torch.stack(states, dim=-3), hidden
 
 
 def features(program: StepProgram, canonical: CanonicalState, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,7 +69,12 @@ def delta(
         before = program.recurrent.start(graph) if hidden is None else hidden
         hidden = program.recurrent.update(graph, program.static, before)
         graph = graph_concat(graph, hidden)
-    residual = program.output(program.core.predict(graph), state.dtype)
+    return change(program, state, canonical, program.core.predict(graph)), hidden
+
+
+def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predicted: Tensor) -> Tensor:
+    """Change ``[*B, N, 12]`` of a state from the network's output ``[*B, N, F_out]``."""
+    residual = program.output(predicted, state.dtype)
     if canonical.rotation is not None:
         residual = program.layout.rotate_delta(residual, *canonical.rotation)
     if program.timestep is not None:
@@ -66,7 +85,7 @@ def delta(
         matrices = canonical.matrices if canonical.rotation is None else program.canonicalizer.matrices(state)
         assert matrices is not None
         change = program.projection(state, matrices, change, program.change_std, program.parameters)
-    return change, hidden
+    return change
 
 
 def step(program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None) -> tuple[Tensor, Graph | None]:

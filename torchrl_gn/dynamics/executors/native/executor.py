@@ -1,0 +1,197 @@
+"""Run a step program in compiled C++: whole rollouts, and their gradients, in one call."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics.executors.eager import EagerExecutor, rollout_by_steps
+from torchrl_gn.dynamics.executors.native import library
+from torchrl_gn.dynamics.executors.native.state_maths import StateMaths, may_be_constant
+from torchrl_gn.dynamics.executors.native.tape import TooLongError
+from torchrl_gn.dynamics.executors.native.trace import UntraceableError
+from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.networks.core import ListedCore
+from torchrl_gn.networks.graph import Graph
+from torchrl_gn.networks.layers import LayerList
+from torchrl_gn.networks.snapshot import same
+
+TILE = 24  # samples that stay in a processor's cache from layer to layer
+STORED_BYTES = 2**28  # activations' derivatives are kept for the gradient up to this size, else computed again
+_DTYPES = (torch.float32, torch.float64)
+
+
+class _NotTracedError(Exception):
+    pass
+
+
+class NativeExecutor:
+    """Run the step in C++ on a processor; by torch operations what it cannot: ``reason`` says why.
+
+    State maths in float64, the network in the program's float32 or float64. Differentiable once, in state and action;
+    the gradient in a component of the state that cannot move is that of copying it. Results depend neither on the batch
+    that a sample is in nor on the number of threads.
+    """
+
+    fixed_batch = False
+
+    def __init__(self, program: StepProgram) -> None:
+        self.program, self.eager = program, EagerExecutor(program)
+        self.network: library.NativeNetwork | None = None
+        self.maths: library.NativeMaths | None = None
+        self.reason: str | None = None  # why it runs by torch operations
+        self.version = 0
+        self.update(program)
+
+    def update(self, program: StepProgram) -> None:
+        """Take another program of the same scene: its state maths are traced again only if they differ."""
+        self.version += 1
+        if not same(_maths_of(self.program), _maths_of(program)):
+            self.maths = None
+        self.program, self.eager = program, EagerExecutor(program)
+        layers, self.reason = _layers(program)
+        self.layers = layers
+        if layers is None:
+            self.network = None
+        elif self.network is None or not self.network.update(layers):
+            self.maths = None
+            try:
+                self.network = library.NativeNetwork(layers)
+            except library.NoCompilerError as error:
+                self.network, self.reason = None, str(error)
+
+    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        if self._runs(state, action):
+            with contextlib.suppress(_NotTracedError):
+                return self._rollout(state, action.unsqueeze(-2), False).squeeze(-3), None
+        return self.eager.step(state, action, hidden)
+
+    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        if actions.shape[-2] and self._runs(state, actions):
+            with contextlib.suppress(_NotTracedError):
+                return self._rollout(state, actions, True), None
+        return rollout_by_steps(self.eager, state, actions, hidden)
+
+    def _runs(self, state: Tensor, action: Tensor) -> bool:
+        return (
+            self.network is not None
+            and state.dtype in _DTYPES
+            and action.dtype in _DTYPES
+            and state.is_cpu
+            and action.is_cpu
+            and state.numel() > 0
+            and not torch.compiler.is_compiling()
+            and not torch._C._are_functorch_transforms_active()
+        )
+
+    def _rollout(self, state: Tensor, actions: Tensor, with_start: bool) -> Tensor:
+        if torch.is_grad_enabled() and (state.requires_grad or actions.requires_grad):
+            return _Differentiable.apply(self, state, actions, with_start)  # pyright: ignore[reportReturnType]
+        return self.run(state.detach().contiguous(), actions.detach().contiguous(), with_start)
+
+    def tile(self, state: Tensor) -> int:
+        """Samples of a tile: enough tiles for all threads."""
+        count = state.shape[:-2].numel()
+        return min(TILE, -(-count // torch.get_num_threads()))
+
+    def run(self, state: Tensor, actions: Tensor, with_start: bool, stored: Tensor | None = None) -> Tensor:
+        """States ``[*B, T (+ 1), N, C]`` of contiguous tensors."""
+        out = state.new_empty(*state.shape[:-2], actions.shape[-2] + with_start, *state.shape[-2:])
+        size = state.shape[-2] * state.shape[-1]
+        call = (
+            *(state.numel() // size, actions.shape[-2], self.tile(state), torch.get_num_threads()),
+            *(library.array(state), size, library.array(actions), library.array(out), int(with_start)),
+            *(library.NOTHING, library.NOTHING, None if stored is None else stored.data_ptr()),
+        )
+        assert self.network is not None
+        while self.maths is None or not library.rollout(self.network, self.maths, call):
+            self._trace(state)
+        return out
+
+    def _trace(self, states: Tensor) -> None:
+        """Make the state maths for states whose constant channels are those of the first, as far as all have them."""
+        flat = states.reshape(-1, *states.shape[-2:]).double().numpy()
+        if self.maths is None:
+            values, constant = flat[0], may_be_constant(self.program, flat[0])
+        else:
+            values, constant = self.maths.maths.state, self.maths.maths.is_constant
+        constant = constant & (np.abs(flat - values) <= 1e-10 * (1 + np.abs(values))).all(0)
+        core = self.program.core
+        assert isinstance(core, ListedCore) and self.layers is not None
+        try:
+            maths = StateMaths(self.program, np.where(constant, values, 0.0), constant, *_outputs(core, self.layers))
+        except (UntraceableError, TooLongError) as error:
+            self.network, self.reason = None, str(error)
+            raise _NotTracedError from error
+        self.maths = library.NativeMaths(maths, self.layers)
+
+
+class _Differentiable(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, executor: NativeExecutor, state: Tensor, actions: Tensor, with_start: bool) -> Tensor:
+        ctx.executor, ctx.version, ctx.with_start = executor, executor.version, with_start
+        ctx.tile = executor.tile(state)
+        state, actions = state.detach().contiguous(), actions.detach().contiguous()
+        network = executor.network
+        assert network is not None
+        ctx.stored, numbers = None, actions.shape[:-1].numel() * network.kept
+        if numbers * network.dtype.itemsize <= STORED_BYTES:
+            ctx.stored = torch.empty(numbers, dtype=network.dtype)
+        out = executor.run(state, actions, with_start, ctx.stored)
+        ctx.save_for_backward(out if with_start else state, actions)
+        ctx.maths = executor.maths
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        executor, (states, actions) = ctx.executor, ctx.saved_tensors
+        if ctx.version != executor.version:
+            raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
+        size, steps = states.shape[-2] * states.shape[-1], actions.shape[-2]
+        gradient = gradient.contiguous()
+        of_state = gradient.new_empty(*actions.shape[:-2], *states.shape[-2:])
+        of_actions = torch.empty_like(actions)
+        library.rollout_adjoint(
+            executor.network,
+            ctx.maths,
+            (
+                *(actions.shape[:-2].numel(), steps, ctx.tile, torch.get_num_threads()),
+                *(library.array(states), size * (steps + 1 if ctx.with_start else 1), library.array(actions)),
+                *(library.array(gradient), int(ctx.with_start)),
+                *(library.array(of_state), library.array(of_actions)),
+                None if ctx.stored is None else ctx.stored.data_ptr(),
+            ),
+        )
+        return None, of_state, of_actions, None
+
+
+def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
+    """The network as a list of layers, or why it cannot be one."""
+    core = program.core
+    if program.recurrent is not None:
+        return None, "a recurrent model runs by torch operations"
+    if program.movable.device.type != "cpu":
+        return None, f"on {program.movable.device.type}, it runs by torch operations"
+    if program.dtype not in _DTYPES:
+        return None, f"{str(program.dtype).removeprefix('torch.')} products run by torch operations"
+    layers = core.layers() if isinstance(core, ListedCore) else None
+    if layers is None:
+        return None, "a core without a list of layers, or parameters of each sample, run by torch operations"
+    return layers, None
+
+
+def _outputs(core: ListedCore, layers: LayerList) -> tuple[np.ndarray, int]:
+    """Nodes that the network predicts, and components of each."""
+    last = layers.layers[-1]
+    predicted = torch.arange(layers.nodes[0])[core.predicted].numpy()
+    return predicted, last.count * len(last.weight) // max(len(predicted), 1)
+
+
+def _maths_of(program: StepProgram) -> tuple:
+    """All parts of a program but its network."""
+    return tuple(getattr(program, field.name) for field in fields(program) if field.name != "core")

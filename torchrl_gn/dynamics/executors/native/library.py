@@ -1,0 +1,238 @@
+"""Build the C++ code once for this processor, and call it."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
+from torchrl_gn.dynamics.executors.native.tape import Tape
+from torchrl_gn.networks.layers import LayerList
+from torchrl_gn.processor import processor_name
+
+SOURCES = sorted(path for path in Path(__file__).parent.iterdir() if path.suffix in (".h", ".cpp"))
+_OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-pthread")
+_P, _I = ctypes.c_void_p, ctypes.c_int64
+
+
+class NoCompilerError(FileNotFoundError):
+    """There is no C++ compiler, or it failed."""
+
+
+@functools.cache
+def load_library() -> ctypes.CDLL:
+    """The compiled code, built at the first use on a processor and kept in ``~/.cache/torchrl_gn`` (10 s).
+
+    Raises:
+        NoCompilerError: without a working C++ compiler (``CXX``, else c++, g++ or clang++).
+    """
+    compiler = os.environ.get("CXX") or next(filter(shutil.which, ("c++", "g++", "clang++")), None)
+    if compiler is None or shutil.which(compiler) is None:
+        raise NoCompilerError("There is no C++ compiler: install g++ for the native executor.")
+    options = [*_OPTIONS, *instruction_flags(), *os.environ.get("TORCHRL_GN_CXXFLAGS", "").split()]
+    version = _run([compiler, "--version"]).splitlines()[0]
+    text = "\n".join([compiler, version, *options, processor_name(), sys.platform, *(p.read_text() for p in SOURCES)])
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
+    name = f"native-{hashlib.sha256(text.encode()).hexdigest()[:16]}.so"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:  # no home to write to
+        folder = Path(tempfile.mkdtemp(prefix="torchrl_gn-"))
+    file = folder / name
+    if file.exists():
+        with contextlib.suppress(OSError, AttributeError):  # damaged: build again
+            return _declared(ctypes.CDLL(str(file)))
+    print("Building the native executor for this processor, once: about 20 s.", file=sys.stderr)
+    with atomic_path(file) as temporary:
+        source = next(path for path in SOURCES if path.suffix == ".cpp")
+        _run([compiler, *options, str(source), "-o", str(temporary)])
+    return _declared(ctypes.CDLL(str(file)))
+
+
+def instruction_flags() -> list[str]:
+    """Compiler flags for what torch uses of this processor, which ``ATEN_CPU_CAPABILITY`` restricts."""
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return []
+    sets = {"AVX512": ["-march=native"], "AVX2": ["-mavx2", "-mfma"]}
+    return sets.get(torch.backends.cpu.get_cpu_capability(), [])
+
+
+def _run(command: Sequence[str]) -> str:
+    try:
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    except (OSError, subprocess.CalledProcessError) as error:
+        text = getattr(error, "stderr", "") or str(error)
+        raise NoCompilerError(f"The C++ compiler failed: {' '.join(command)}\n{text[-2000:]}") from error
+
+
+class _Array(ctypes.Structure):
+    _fields_ = (("data", _P), ("is_double", _I))
+
+
+class _Tape(ctypes.Structure):
+    _fields_ = (
+        ("instructions", _P),
+        ("constants", _P),
+        ("ends", _P),
+        ("registers", _I),
+        ("groups", _I),
+        ("inputs", _P),
+        ("outputs", _P),
+    )
+
+
+class _Maths(ctypes.Structure):
+    _fields_ = (
+        *((name, _I) for name in ("size", "varying_count", "actions", "outputs", "node_inputs", "edge_inputs")),
+        *((name, _I) for name in ("node_width", "edge_width", "output_width")),
+        *((name, _P) for name in ("varying", "constant", "values")),
+        ("forward", _Tape),
+        ("adjoint", _Tape),
+    )
+
+
+class _Call(ctypes.Structure):
+    _fields_ = (
+        *((name, _I) for name in ("batch", "steps", "tile", "threads")),
+        ("states", _Array),
+        ("state_stride", _I),
+        ("actions", _Array),
+        ("out", _Array),
+        ("with_start", _I),
+        ("grad_state", _Array),
+        ("grad_actions", _Array),
+        ("stored", _P),
+    )
+
+
+def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
+    signatures: dict[str, tuple[Any, list]] = {
+        "gn_network_new": (_P, [_I, _P, _P, _P]),
+        "gn_network_update": (None, [_P, _I, _P, _P]),
+        "gn_network_delete": (None, [_P, _I]),
+        "gn_network_stored": (_I, [_P, _I]),
+        "gn_rollout": (_I, [_P, _I, _P, _P]),
+        "gn_rollout_adjoint": (None, [_P, _I, _P, _P]),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library
+
+
+class NativeNetwork:
+    """A layer list packed for the processor; freed with the object."""
+
+    def __init__(self, layers: LayerList) -> None:
+        self.library = load_library()
+        self.dtype = layers.layers[0].weight.dtype
+        self.is_double = int(self.dtype == torch.float64)
+        self.code = layers.code().contiguous()
+        weights, tables, self._kept = _pointers(layers)
+        self.pointer = self.library.gn_network_new(self.is_double, self.code.data_ptr(), weights, tables)
+        last = layers.layers[-1]
+        # Numbers of a sample and step that its gradient needs: activations' derivatives and the output.
+        self.kept = self.library.gn_network_stored(self.pointer, self.is_double) + last.count * len(last.weight)
+
+    def update(self, layers: LayerList) -> bool:
+        """Take other weights; False if the network is another."""
+        if layers.layers[0].weight.dtype != self.dtype or not torch.equal(layers.code(), self.code):
+            return False
+        weights, tables, self._kept = _pointers(layers)
+        self.library.gn_network_update(self.pointer, self.is_double, weights, tables)
+        return True
+
+    def __del__(self) -> None:
+        if (pointer := getattr(self, "pointer", None)) is not None:
+            self.library.gn_network_delete(pointer, self.is_double)
+
+
+def _pointers(layers: LayerList) -> tuple[Any, Any, Any]:
+    weights, tables = layers.tensors()
+    return (
+        (_P * len(weights))(*(each.data_ptr() for each in weights)),
+        (_P * len(tables))(*(None if each is None else each.data_ptr() for each in tables)),
+        (weights, tables),
+    )
+
+
+class NativeMaths:
+    """State maths of one scene in the form that the C++ code reads."""
+
+    def __init__(self, maths: StateMaths, layers: LayerList) -> None:
+        self.maths = maths
+        last = layers.layers[-1]
+        self._kept: list[Any] = []
+        self.struct = _Maths(
+            size=maths.is_constant.size,
+            varying_count=len(maths.varying),
+            actions=maths.actions,
+            outputs=last.count * len(last.weight),
+            node_inputs=layers.nodes[0] * layers.nodes[1],
+            edge_inputs=layers.edges[0] * layers.edges[1],
+            node_width=layers.nodes[1],
+            edge_width=layers.edges[1],
+            output_width=len(last.weight),
+            varying=maths.varying.ctypes.data,
+            constant=maths.constant.ctypes.data,
+            values=maths.values.ctypes.data,
+            forward=self._tape(maths.forward),
+        )
+        self.reference = ctypes.addressof(self.struct)
+
+    def add_adjoint(self) -> None:
+        """Prepare gradients; once."""
+        if not self.struct.adjoint.instructions:
+            self.struct.adjoint = self._tape(self.maths.adjoint)
+
+    def _tape(self, tape: Tape) -> _Tape:
+        ends = np.array(tape.phases, dtype=np.int32)
+        tables = [(_P * len(part))(*(each.ctypes.data for each in part)) for part in (tape.inputs, tape.outputs)]
+        self._kept += [tape, ends, tables]
+        return _Tape(
+            tape.instructions.ctypes.data,
+            tape.constants.ctypes.data,
+            ends.ctypes.data,
+            tape.registers,
+            len(tape.inputs),
+            *(ctypes.addressof(table) for table in tables),
+        )
+
+
+NOTHING = (None, 0)  # no array
+
+
+def array(tensor: Tensor) -> tuple[int, int]:
+    """A contiguous tensor as the code reads it."""
+    return tensor.data_ptr(), int(tensor.dtype == torch.float64)
+
+
+def rollout(network: NativeNetwork, maths: NativeMaths, call: tuple) -> bool:
+    """Run ``gn_rollout`` on the fields of a call; False if a start state has other constant channels."""
+    reference = ctypes.byref(_Call(*call))
+    return not network.library.gn_rollout(network.pointer, network.is_double, maths.reference, reference)
+
+
+def rollout_adjoint(network: NativeNetwork, maths: NativeMaths, call: tuple) -> None:
+    """Run ``gn_rollout_adjoint`` on the fields of a call."""
+    maths.add_adjoint()
+    reference = ctypes.byref(_Call(*call))
+    network.library.gn_rollout_adjoint(network.pointer, network.is_double, maths.reference, reference)

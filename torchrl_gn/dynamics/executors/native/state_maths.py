@@ -1,0 +1,106 @@
+"""The state maths of a step as tapes: from state and action to network inputs, and from its outputs to the next state."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.executors.native.expressions import Expressions, Scalar, gradient
+from torchrl_gn.dynamics.executors.native.tape import Tape, assemble
+from torchrl_gn.dynamics.executors.native.trace import Array, trace
+from torchrl_gn.dynamics.program import StepProgram
+
+
+class StateMaths:
+    """Tapes of a program for states whose channels ``constant`` are those of ``state`` and stay so.
+
+    Args:
+        program: the step.
+        state: ``[N, C]`` a state.
+        constant: ``[N, C]`` which channels may be taken for constant; those that the step changes are not.
+        outputs: nodes that the network predicts and components of each, ``(P, F_out)``.
+
+    Raises:
+        UntraceableError: if a feature uses an operation without scalar form.
+        TooLongError: if it needs too many registers.
+    """
+
+    def __init__(
+        self, program: StepProgram, state: np.ndarray, constant: np.ndarray, predicted: np.ndarray, width: int
+    ) -> None:
+        while True:
+            graph = Expressions()
+            symbols, actions, outputs, inputs, after = _forward(program, graph, state, constant, predicted, width)
+            stays = np.frompyfunc(lambda a, b: not isinstance(a, Scalar) and abs(a - b) <= 1e-12 * (1 + abs(b)), 2, 1)
+            changed = constant & ~stays(after, state).astype(bool)
+            if not changed.any():
+                break
+            constant = constant & ~changed
+        self.actions, self.is_constant, self.state = len(actions), constant, state
+        flat = constant.ravel()
+        self.varying = np.flatnonzero(~flat).astype(np.int32)  # [L] channels of the flat state [N * C] that change
+        self.constant = np.flatnonzero(flat).astype(np.int32)  # [N * C - L] the others
+        self.values = state.ravel()[flat].astype(np.float64)  # [N * C - L] of these
+        self._graph, self._after, self._inputs = graph, after[~constant].tolist(), inputs
+        self._groups: list[list[Scalar]] = [symbols[~constant].tolist(), actions.tolist(), outputs.tolist()]
+        # Phase 0: network inputs from the varying channels and the action; phase 1: the next varying channels from the
+        # network's output.
+        self.forward = assemble(graph, self._groups, [self._inputs, self._after])
+
+    @functools.cached_property
+    def adjoint(self) -> Tape:
+        """The pull-back of ``forward``.
+
+        Phase 0: gradient of the network's output from that of the next state. Phase 1: gradients of state and action
+        from those of the network's inputs.
+        """
+        graph, (varying, actions, outputs) = self._graph, self._groups
+        of_after, of_inputs = graph.inputs(3, len(varying)), graph.inputs(4, len(self._inputs))
+        last = gradient(graph, self._after, of_after, [*outputs, *varying])
+        first = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
+        of_state = [a + b for a, b in zip(last[len(outputs) :], first, strict=False)]
+        results = [last[: len(outputs)], [*of_state, *first[len(varying) :]]]
+        return assemble(graph, [*self._groups, of_after, of_inputs], results)
+
+
+def may_be_constant(program: StepProgram, state: np.ndarray) -> np.ndarray:
+    """Channels ``[N, C]`` of a state that cannot change, or are zeros of an orientation that turns about one axis."""
+    movable, found = program.movable.numpy(force=True), np.ones_like(state, dtype=bool)
+    for component in program.layout.components:
+        moves = movable[:, program.layout.delta_slices[component.name]]
+        at = program.layout.slices[component.name]
+        if component.kind == "add":
+            found[:, at] = ~moves
+        else:
+            found[:, at] = ~moves.any(1, keepdims=True) | (state[:, at] == 0)
+    return found
+
+
+def _forward(
+    program: StepProgram, graph: Expressions, state: np.ndarray, constant: np.ndarray, predicted: np.ndarray, width: int
+) -> tuple[Array, Array, Array, list[Any], Array]:
+    symbols = np.empty(state.shape, dtype=object)
+    symbols[...] = state.astype(float).astype(object)
+    varying = np.flatnonzero(~constant.ravel())
+    symbols.ravel()[varying] = graph.inputs(0, len(varying))
+    actions = np.array(graph.inputs(1, program.controls.action_low.numel()), dtype=object)
+    outputs = np.array(graph.inputs(2, len(predicted) * width), dtype=object)
+    full = np.full((len(state), width), 0.0, dtype=object)
+    full[predicted] = outputs.reshape(len(predicted), width)
+
+    def before(state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+        canonical = program.canonicalizer(state, program.parameters)
+        nodes, edges = eager.features(program, canonical, action)
+        return program.nodes(nodes, torch.float64), program.edges(edges, torch.float64)
+
+    def after(state: Tensor, predicted: Tensor) -> tuple[Tensor, ...]:
+        canonical = program.canonicalizer(state, program.parameters)
+        return (program.layout.apply(state, eager.change(program, state, canonical, predicted)),)
+
+    inputs = [each for part in trace(before, symbols, actions) for each in part.ravel().tolist()]
+    return symbols, actions, outputs, inputs, trace(after, symbols, full)[0]
