@@ -14,6 +14,7 @@ second, ``[N, B, F]``, so that gathering and aggregating are products with small
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -23,6 +24,7 @@ from torch.nn import functional as F
 from torchrl_gn.networks.core import Columns
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Rows
+from torchrl_gn.networks.layers import EDGES, NODES, Gather, LayerBuilder, LayerList
 from torchrl_gn.networks.linear import linear, product
 
 _CACHED = 2**20  # numbers of activations that a processor's cache holds
@@ -109,6 +111,50 @@ class FoldedGNCore:
         full = out.new_zeros(dynamic.nodes.shape[-2], *out.shape[1:])
         full[self.predicted] = out
         return full.transpose(0, 1).reshape(*batch, *full.shape[::2])
+
+    def layers(self) -> LayerList | None:
+        """The same network as a list; None with dynamic globals or tables for every sample."""
+        factors = (self.first_edge, self.first_node, self.first_global, self.second_edge, self.second_node)
+        if self.second_globals[1].shape[1] or any(each.table.shape[1] > 1 for each in factors):
+            return None
+        count_n, count_e = self.reduce.shape[0] - 1, self.reduce.shape[1]
+        width = self.first_node.weights[1].shape[1]
+        device = self.reduce.device
+        every_edge = torch.arange(count_e, device=device)
+        kept, predicted = every_edge[self.kept], torch.arange(count_n, device=device)[self.predicted]
+        senders, receivers = self.ends.split(count_e)
+        builder = LayerBuilder(self.activation)
+
+        def mlp(factors: Factors, inputs: Sequence[Gather], added: Sequence[Gather] = ()) -> int:
+            weight = torch.cat(factors.weights, 1)
+            first = builder.add(inputs, weight, factors.table.squeeze(1), tuple(added), self.activation)
+            return builder.hidden(first, factors.hidden)
+
+        def ends(edges: Tensor) -> tuple[Gather, ...]:
+            nodes = (Gather.sums(NODES, matrix[edges]) for matrix in (senders, receivers))
+            return *nodes, Gather.picks(EDGES, edges)
+
+        def graph(source: int, count: int) -> Gather:
+            return Gather.picks(source, torch.zeros(count, dtype=torch.int64, device=device))
+
+        everywhere = torch.arange(count_n, device=device)
+        edge = mlp(self.first_edge, ends(every_edge))
+        received = Gather.sums(edge, self.reduce[:-1])
+        node = mlp(self.first_node, (received, Gather.picks(NODES, everywhere)))
+        summed = Gather.sums(node, self.reduce.new_ones(1, count_n)), Gather.sums(edge, self.reduce[-1:])
+        global_ = mlp(self.first_global, summed)
+
+        projected = [builder.linear(node, everywhere, weight) for weight in self.second_ends]
+        added = [Gather.sums(each, side[kept]) for each, side in zip(projected, (senders, receivers), strict=True)]
+        first = torch.zeros(1, dtype=torch.int64, device=device)
+        added.append(graph(builder.linear(global_, first, self.second_globals[0]), len(kept)))
+        edge = mlp(self.second_edge, (Gather.picks(edge, kept), *ends(kept)), added)
+        added = graph(builder.linear(global_, first, self.last_globals[0]), len(predicted))
+        inputs = Gather.sums(edge, self.reduce_last), Gather.picks(NODES, predicted), Gather.picks(node, predicted)
+        hidden = mlp(self.second_node, inputs, (added,))
+        builder.linear(hidden, torch.arange(len(predicted), device=device), *self.out)
+        edge_width = self.first_edge.weights[0].shape[1] - 2 * width
+        return LayerList((count_n, width), (count_e, edge_width), tuple(builder.layers))
 
     def _parts(self, inputs: tuple[Tensor, ...]) -> list[tuple[Tensor, ...]]:
         """Inputs ``[I, B, F]``, on a processor in parts of as many samples as its cache holds activations of."""

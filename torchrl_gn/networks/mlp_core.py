@@ -13,6 +13,7 @@ from torchrl.modules import MLP
 from torchrl_gn.networks.core import Columns, Core, layer_sizes
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
+from torchrl_gn.networks.layers import EDGES, NODES, Gather, LayerBuilder, LayerList
 from torchrl_gn.networks.linear import ACTIVATIONS, activation_class
 
 
@@ -111,6 +112,23 @@ class FoldedMLP:
         out = F.linear(hidden, weight.flatten(0, 1), bias.flatten()).unflatten(-1, bias.shape)
         full = out.new_zeros(*out.shape[:-2], self.counts[0], out.shape[-1])
         return full.index_copy(-2, self.predicted, out)
+
+    def layers(self) -> LayerList | None:
+        """The same network as a list; None with dynamic globals or a table for every sample."""
+        if self.weights[2].shape[1] or self.table[..., 0].numel() > 1:
+            return None
+        device = self.table.device
+        items = [torch.tensor([i], device=device) for i in range(max(self.counts))]
+        sizes = zip((NODES, EDGES), self.counts, strict=True)
+        inputs = [Gather.picks(source, item) for source, count in sizes for item in items[:count]]
+        builder = LayerBuilder(self.activation)
+        weight, table = torch.cat(self.weights, 1), self.table.reshape(1, -1)
+        first = builder.add(inputs, weight, table, activation=self.activation)
+        weight, bias = self.out
+        builder.linear(builder.hidden(first, self.hidden), items[0], weight.flatten(0, 1), bias.flatten())
+        (nodes, edges), widths = self.counts, [each.shape[1] for each in self.weights]
+        buffers = (nodes, widths[0] // nodes), (edges, widths[1] // max(edges, 1))
+        return LayerList(*buffers, tuple(builder.layers))
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> FoldedMLP:
         """This MLP with fewer and rescaled features, see :class:`~torchrl_gn.networks.core.ReducibleCore`."""

@@ -1,0 +1,204 @@
+// Vector kernels of the native network engine: small matrix products and activations.
+//
+// Every output is a sum of fused multiply-adds over k in order, whatever the tile, the batch or the vector length:
+// results are equal bit for bit.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+#include <utility>
+
+namespace gn {
+
+#if defined(__AVX512F__)
+constexpr int kVectorBytes = 64, kAccumulators = 24, kRows = 12;
+#elif defined(__AVX__)
+constexpr int kVectorBytes = 32, kAccumulators = 12, kRows = 6;
+#elif defined(__aarch64__)
+constexpr int kVectorBytes = 16, kAccumulators = 24, kRows = 12;
+#else
+constexpr int kVectorBytes = 16, kAccumulators = 12, kRows = 6;
+#endif
+constexpr int kChunk = 24;   // rows that share a panel of weights in the nearest cache
+constexpr int kDepth = 512;  // columns of a product's left factor that are gathered at once
+constexpr int kStride = kDepth + 16;  // between its rows: not a power of two, which would collide in the cache
+
+template <class T>
+constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
+
+template <class T>
+struct Vector {
+  typedef T type __attribute__((vector_size(kVectorBytes)));
+  typedef T loose __attribute__((vector_size(kVectorBytes), aligned(sizeof(T)), may_alias));  // at any address
+  typedef std::conditional_t<sizeof(T) == 4, int32_t, int64_t> integer;
+  typedef integer integers __attribute__((vector_size(kVectorBytes)));
+
+  static type load(const T* from) { return *reinterpret_cast<const loose*>(from); }
+  static void store(T* to, type value) { *reinterpret_cast<loose*>(to) = value; }
+};
+
+// out[r][v] = init[r][v] + sum_k x[r][k] w[v][k] for R rows and N panels of columns.
+template <class T>
+using Kernel = void (*)(const T* x, const T* w, int64_t depth, int64_t panel, const T* const* init, int64_t column,
+                        T* out, int64_t stride);
+
+template <class T, int R, int N>
+void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64_t panel, const T* const* init,
+              int64_t column, T* out, int64_t stride) {
+  using V = Vector<T>;
+  constexpr int L = kLanes<T>;
+  typename V::type sum[R][N];
+#pragma GCC unroll 12
+  for (int r = 0; r < R; r++)
+#pragma GCC unroll 8
+    for (int v = 0; v < N; v++) sum[r][v] = V::load(init[r] + column + v * L);
+  for (int64_t k = 0; k < depth; k++, w += L, x++) {
+    typename V::type weights[N];
+#pragma GCC unroll 8
+    for (int v = 0; v < N; v++) weights[v] = V::load(w + v * panel);
+#pragma GCC unroll 12
+    for (int r = 0; r < R; r++) {
+#pragma GCC unroll 8
+      for (int v = 0; v < N; v++) sum[r][v] += x[r * kStride] * weights[v];
+    }
+  }
+#pragma GCC unroll 12
+  for (int r = 0; r < R; r++)
+#pragma GCC unroll 8
+    for (int v = 0; v < N; v++) V::store(out + r * stride + column + v * L, sum[r][v]);
+}
+
+template <class T, int N, int... R>
+Kernel<T> kernel_of_rows(int rows, std::integer_sequence<int, R...>) {
+  static constexpr Kernel<T> kernels[] = {multiply<T, R + 1, N>...};
+  return kernels[rows - 1];
+}
+
+template <class T>
+Kernel<T> kernel(int rows, int panels) {
+  if (panels == 8) return kernel_of_rows<T, 8>(rows, std::make_integer_sequence<int, (kAccumulators + 4) / 8>{});
+  if (panels == 4) return kernel_of_rows<T, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
+  if (panels == 2) return kernel_of_rows<T, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
+  return kernel_of_rows<T, 1>(rows, std::make_integer_sequence<int, kRows>{});
+}
+
+// Most panels, a power of two, that a kernel of some rows takes at once.
+inline int most_panels(int rows, int64_t panels) {
+  int most = rows <= (kAccumulators + 4) / 8 ? 8 : rows <= kAccumulators / 4 ? 4 : rows <= kAccumulators / 2 ? 2 : 1;
+  while (most > panels) most /= 2;
+  return most;
+}
+
+// out[rows][panels * L] = init + x[rows][depth] @ weights, packed [panels][full depth][L] and begun at some depth.
+template <class T>
+void product(const T* x, const T* weights, int rows, int64_t panels, int64_t depth, int64_t full,
+             const T* const* init, T* out, int64_t stride) {
+  constexpr int L = kLanes<T>;
+  int blocks = (rows + kRows - 1) / kRows, block = (rows + blocks - 1) / blocks;
+  for (int64_t p = 0; p < panels;) {
+    int taken = most_panels(block, panels - p);
+    for (int r = 0; r < rows; r += block) {
+      int now = rows - r < block ? rows - r : block;
+      kernel<T>(now, taken)(x + r * kStride, weights + p * full * L, depth, full * L, init + r, p * L,
+                            out + r * stride, stride);
+    }
+    p += taken;
+  }
+}
+
+enum Activation : int64_t { kNone, kRelu, kSilu, kGelu, kTanh };
+
+// Logistic function by a polynomial of 2^f, of clamped inputs.
+inline typename Vector<float>::type exp2_fraction(typename Vector<float>::type f) {
+  // Minimax of degree 5, relative error 1e-7.
+  auto p = f * 1.32644535e-3f + 9.67172552e-3f;
+  p = p * f + 5.55073633e-2f;
+  p = p * f + 2.40222388e-1f;
+  p = p * f + 6.93146975e-1f;
+  return p * f + 1.0f;
+}
+
+inline typename Vector<double>::type exp2_fraction(typename Vector<double>::type f) {
+  // Taylor: ln(2)^k / k!, remainder below 1e-17 for |f| <= 1/2.
+  auto p = f * 1.3691488853904128881e-12 + 2.5678435993488205142e-11;
+  p = p * f + 4.4455382718708114976e-10;
+  p = p * f + 7.0549116208011233299e-9;
+  p = p * f + 1.0178086009239699727e-7;
+  p = p * f + 1.3215486790144309489e-6;
+  p = p * f + 1.5252733804059840280e-5;
+  p = p * f + 1.5403530393381609954e-4;
+  p = p * f + 1.3333558146428443423e-3;
+  p = p * f + 9.6181291076284771620e-3;
+  p = p * f + 5.5504108664821579953e-2;
+  p = p * f + 2.4022650695910071233e-1;
+  p = p * f + 6.9314718055994530942e-1;
+  return p * f + 1.0;
+}
+
+template <class T>
+void silu(typename Vector<T>::type& x, typename Vector<T>::type& slope) {
+  using V = typename Vector<T>::type;
+  using I = typename Vector<T>::integers;
+  constexpr bool single = sizeof(T) == 4;
+  constexpr T bound = single ? T(87) : T(708), magic = single ? T(12582912.0) : T(6755399441055744.0);
+  constexpr T high = T(-1.4426950408889634074);  // -log2(e), and the rest of it
+  constexpr T low = T(-1.4426950408889634074L - static_cast<long double>(high));
+  // A NaN fails both comparisons and stays.
+  V limit = V{} - bound, top = V{} + bound;
+  x = limit > x ? limit : x;
+  V c = top < x ? top : x;
+  V shifted = c * high + magic, whole = shifted - magic;
+  V fraction = c * low + (c * high - whole);
+  I bits = reinterpret_cast<I>(exp2_fraction(fraction)) + (reinterpret_cast<I>(shifted) << (single ? 23 : 52));
+  V e = reinterpret_cast<V>(bits), s = T(1) / (T(1) + e);
+  x = x * s;
+  slope = x * (e * s) + s;  // e * s is 1 - s, without cancellation
+}
+
+// Values in place of `count` pre-activations and, if asked for, the slopes at them.
+template <class T>
+void activate(Activation activation, T* values, T* slopes, int64_t count) {
+  using V = Vector<T>;
+  constexpr int L = kLanes<T>;
+  if (activation == kSilu) {
+    int64_t i = 0;
+    typename V::type x, slope;
+    for (; i + L <= count; i += L) {
+      x = V::load(values + i);
+      silu<T>(x, slope);
+      V::store(values + i, x);
+      if (slopes) V::store(slopes + i, slope);
+    }
+    if (i < count) {
+      T rest[L] = {}, rest_slopes[L];
+      std::memcpy(rest, values + i, (count - i) * sizeof(T));
+      x = V::load(rest);
+      silu<T>(x, slope);
+      V::store(rest, x);
+      V::store(rest_slopes, slope);
+      std::memcpy(values + i, rest, (count - i) * sizeof(T));
+      if (slopes) std::memcpy(slopes + i, rest_slopes, (count - i) * sizeof(T));
+    }
+    return;
+  }
+  for (int64_t i = 0; i < count; i++) {
+    T x = values[i], y = x, slope = T(1);
+    if (activation == kRelu) {
+      y = x < T(0) ? T(0) : x;  // NaN stays
+      slope = x <= T(0) ? T(0) : T(1);
+    } else if (activation == kGelu) {
+      T half = T(0.5) * (T(1) + std::erf(x * T(0.70710678118654752440)));
+      y = x * half;
+      slope = half + x * (T(0.39894228040143267794) * std::exp(T(-0.5) * x * x));
+    } else if (activation == kTanh) {
+      y = std::tanh(x);
+      slope = T(1) - y * y;
+    }
+    values[i] = y;
+    if (slopes) slopes[i] = slope;
+  }
+}
+
+}  // namespace gn

@@ -1,0 +1,306 @@
+// Native engine of a folded network: a list of linear layers over items, described as data.
+//
+// The description is that of LayerList.code() in torchrl_gn/networks/layers.py. Buffers are [item][S][width] for a tile
+// of S samples; a layer walks its I * S rows in chunks, gathers their inputs side by side, multiplies and activates.
+#pragma once
+
+#include <algorithm>
+#include <cstdlib>
+#include <memory>
+#include <vector>
+
+#include "kernels.h"
+
+namespace gn {
+
+template <class T>
+class Network {  // T: float or double. Methods touch only ws and stored: several threads may run one network.
+ public:
+  // code: see above; weights[i] row-major [out, K] and tables[i] [I, out] or nullptr, of every layer i.
+  Network(const int64_t* code, const T* const* weights, const T* const* tables) {
+    buffers_ = {{code[0], code[1]}, {code[2], code[3]}};
+    layers_.resize(code[4]);
+    code += 5;
+    for (Layer& layer : layers_) {
+      layer.items = code[0], layer.width = code[1], layer.activation = static_cast<Activation>(code[2]);
+      layer.inputs.resize(code[3]), layer.added.resize(code[4]);
+      code += 5;
+      for (Gather& gather : layer.inputs) {
+        read(code, layer.items, gather);
+        gather.column = layer.depth;
+        layer.depth += gather.width;
+      }
+      for (Gather& gather : layer.added) read(code, layer.items, gather);
+      layer.slopes = stored_;
+      if (layer.activation != kNone) stored_ += layer.items * layer.width;
+      deepest_ = std::max({deepest_, padded(layer.depth), padded(layer.width)});
+      buffers_.push_back({layer.items, layer.width});
+    }
+    plan_gradients();
+    update(weights, tables);
+  }
+
+  // Same shapes, new numbers.
+  void update(const T* const* weights, const T* const* tables) {
+    for (size_t i = 0; i < layers_.size(); i++) {
+      Layer& layer = layers_[i];
+      int64_t out = layer.width, in = layer.depth;
+      layer.forward = pack(weights[i], out, in, in, 1);
+      layer.backward = pack(weights[i], in, out, 1, in);
+      layer.has_table = tables[i] != nullptr;
+      layer.table = block(padded(out) * (layer.has_table ? layer.items : 1));
+      for (int64_t r = 0; r < layer.items && layer.has_table; r++)
+        std::copy_n(tables[i] + r * out, out, layer.table.get() + r * padded(out));
+    }
+    zeros_ = block(deepest_);
+  }
+
+  // Numbers of T, to lie at a 64-byte boundary, that a tile of S samples needs.
+  size_t workspace(int S, bool gradient) const {
+    return scratch() + (gradient ? 2 : 1) * offset(S, buffers_.size()) + kLanes<T>;
+  }
+  // Numbers per sample that backward() needs of forward(): slopes of the activations.
+  size_t stored() const { return stored_; }
+
+  T* nodes(T* ws, int S) const { return values(ws, S, 0); }
+  T* edges(T* ws, int S) const { return values(ws, S, 1); }
+  const T* output(T* ws, int S) const { return values(ws, S, layers_.size() + 1); }
+  T* grad_nodes(T* ws, int S) const { return gradients(ws, S, 0); }
+  T* grad_edges(T* ws, int S) const { return gradients(ws, S, 1); }
+  T* grad_output(T* ws, int S) const { return gradients(ws, S, layers_.size() + 1); }
+
+  // Reads nodes and edges, writes output and, if it is given, the block of S * stored() numbers.
+  void forward(T* ws, int S, T* stored) const {
+    for (size_t i = 0; i < layers_.size(); i++) {
+      const Layer& layer = layers_[i];
+      T* out = values(ws, S, i + 2);
+      chunks(layer.items * S, [&](int64_t start, int rows) {
+        run(layer, ws, S, start, rows, out + start * layer.width);
+        if (layer.activation == kNone) return;
+        T* slopes = stored ? stored + layer.slopes * S + start * layer.width : nullptr;
+        activate(layer.activation, out + start * layer.width, slopes, rows * layer.width);
+      });
+    }
+  }
+
+  // Reads grad_output and what forward() stored, writes grad_nodes and grad_edges.
+  void backward(T* ws, int S, const T* stored) const {
+    for (int64_t b : unread_) clear(ws, S, b);
+    for (size_t i = layers_.size(); i-- > 0;) {
+      const Layer& layer = layers_[i];
+      for (auto* gathers : {&layer.inputs, &layer.added})
+        for (const Gather& gather : *gathers)
+          if (gather.clears) clear(ws, S, gather.source);
+      const T* grad = gradients(ws, S, i + 2);
+      const T* slopes = layer.activation == kNone ? nullptr : stored + layer.slopes * S;
+      chunks(layer.items * S, [&](int64_t start, int rows) {
+        int64_t from = start * layer.width;
+        pull(layer, ws, S, start, rows, grad + from, slopes ? slopes + from : nullptr);
+      });
+    }
+  }
+
+ private:
+  struct Free {
+    void operator()(T* block) const { std::free(block); }
+  };
+  using Block = std::unique_ptr<T[], Free>;
+  struct Buffer {
+    int64_t items, width;
+  };
+  struct Gather {
+    int64_t source, width, column = 0;
+    bool clears = false, writes = false;  // in backward(): zero the source's gradient first; or overwrite it
+    std::vector<int64_t> offsets, items;
+  };
+  struct Layer {
+    int64_t items, width, depth = 0, slopes = 0;
+    Activation activation;
+    std::vector<Gather> inputs, added;
+    bool has_table = false;
+    Block forward, backward, table;  // [out / L][in][L], [in / L][out][L], [I or 1][out], padded
+  };
+
+  static int64_t padded(int64_t width) { return (width + kLanes<T> - 1) / kLanes<T> * kLanes<T>; }
+
+  static Block block(int64_t count) {
+    size_t bytes = (std::max<int64_t>(count, 1) * sizeof(T) + 63) / 64 * 64;
+    T* data = static_cast<T*>(std::aligned_alloc(64, bytes));
+    std::memset(data, 0, bytes);
+    return Block(data);
+  }
+
+  static Block pack(const T* weight, int64_t columns, int64_t depth, int64_t column_step, int64_t depth_step) {
+    constexpr int L = kLanes<T>;
+    Block packed = block(padded(columns) * depth);
+    for (int64_t c = 0; c < columns; c++)
+      for (int64_t k = 0; k < depth; k++)
+        packed[(c / L * depth + k) * L + c % L] = weight[c * column_step + k * depth_step];
+    return packed;
+  }
+
+  void read(const int64_t*& code, int64_t items, Gather& gather) const {
+    gather.source = *code++;
+    gather.width = buffers_[gather.source].width;
+    gather.offsets.assign(code, code + items + 1);
+    code += items + 1;
+    gather.items.assign(code, code + gather.offsets.back());
+    code += gather.offsets.back();
+  }
+
+  // Which gather is the first in backward() to reach its source.
+  void plan_gradients() {
+    std::vector<bool> reached(buffers_.size());
+    reached.back() = true;
+    for (size_t i = layers_.size(); i-- > 0;)
+      for (auto* gathers : {&layers_[i].inputs, &layers_[i].added})
+        for (Gather& gather : *gathers) {
+          if (reached[gather.source]) continue;
+          reached[gather.source] = true;
+          std::vector<int64_t> items = gather.items;
+          std::sort(items.begin(), items.end());
+          bool once = static_cast<int64_t>(items.size()) == buffers_[gather.source].items;
+          for (size_t j = 0; once && j < items.size(); j++) once = items[j] == static_cast<int64_t>(j);
+          (once ? gather.writes : gather.clears) = true;
+        }
+    for (size_t b = 0; b < buffers_.size(); b++)
+      if (!reached[b]) unread_.push_back(b);
+  }
+
+  // Workspace: left factors of a chunk, its results, its added rows; values of all buffers; their gradients.
+  int64_t scratch() const { return kChunk * (kStride + 2 * deepest_); }
+  T* results(T* ws) const { return ws + kChunk * kStride; }
+  T* sums(T* ws) const { return results(ws) + kChunk * deepest_; }
+  int64_t offset(int S, size_t buffer) const {
+    int64_t total = 0;
+    for (size_t b = 0; b < buffer; b++) total += (buffers_[b].items * buffers_[b].width * S + 15) / 16 * 16;
+    return total;
+  }
+  T* values(T* ws, int S, size_t buffer) const { return ws + scratch() + offset(S, buffer); }
+  T* gradients(T* ws, int S, size_t buffer) const { return values(ws, S, buffer) + offset(S, buffers_.size()); }
+  void clear(T* ws, int S, size_t buffer) const {
+    std::fill_n(gradients(ws, S, buffer), buffers_[buffer].items * buffers_[buffer].width * S, T(0));
+  }
+
+  // Calls body(start, rows) for chunks of about the same size.
+  template <class Body>
+  static void chunks(int64_t total, const Body& body) {
+    int64_t count = (total + kChunk - 1) / kChunk, size = count ? (total + count - 1) / count : 0;
+    for (int64_t start = 0; start < total; start += size)
+      body(start, static_cast<int>(std::min(size, total - start)));
+  }
+
+  // Calls body(item, sample, row, rows) for rows of one item; row counts from the chunk's start.
+  template <class Body>
+  static void runs(int S, int64_t start, int rows, const Body& body) {
+    int64_t item = start / S;
+    int sample = static_cast<int>(start % S);
+    for (int row = 0; row < rows; item++, sample = 0) {
+      int now = std::min(rows - row, S - sample);
+      body(item, sample, row, now);
+      row += now;
+    }
+  }
+
+  // Columns [from, to) of gathered rows; up to a vector more is written after each.
+  void gather(const Gather& g, T* ws, int S, int64_t start, int rows, int64_t from, int64_t to, T* x) const {
+    using V = Vector<T>;
+    const T* source = values(ws, S, g.source) + from;
+    runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
+      int64_t first = g.offsets[item], last = g.offsets[item + 1];
+      if (first == last)
+        for (int r = row; r < row + now; r++) std::fill_n(x + r * kStride, to - from, T(0));
+      for (int64_t j = first; j < last; j++) {
+        const T* in = source + (g.items[j] * S + sample) * g.width;
+        T* out = x + row * kStride;
+        for (int r = 0; r < now; r++, in += g.width, out += kStride)
+          for (int64_t c = 0; c < to - from; c += kLanes<T>) {
+            auto value = V::load(in + c);
+            V::store(out + c, j == first ? value : V::load(out + c) + value);
+          }
+      }
+    });
+  }
+
+  // Pre-activations of a chunk.
+  void run(const Layer& layer, T* ws, int S, int64_t start, int rows, T* out) const {
+    int64_t width = padded(layer.width);
+    const T* init[kChunk];
+    runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
+      const T* table = layer.table.get() + (layer.has_table ? item * width : 0);
+      for (int r = 0; r < now; r++) {
+        init[row + r] = table;
+        if (layer.added.empty()) continue;
+        T* sum = sums(ws) + (row + r) * width;
+        init[row + r] = sum;
+        std::copy_n(table, width, sum);
+        for (const Gather& g : layer.added)
+          for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++)
+            add(sum, values(ws, S, g.source) + (g.items[j] * S + sample + r) * g.width, g.width);
+      }
+    });
+    bool direct = width == layer.width;
+    T* to = direct ? out : results(ws);
+    for (int64_t k = 0; k == 0 || k < layer.depth; k += kDepth) {
+      int64_t end = std::min<int64_t>(k + kDepth, layer.depth);
+      for (const Gather& g : layer.inputs) {
+        int64_t from = std::max(k, g.column), last = std::min(end, g.column + g.width);
+        if (from < last) gather(g, ws, S, start, rows, from - g.column, last - g.column, ws + from - k);
+      }
+      product(ws, layer.forward.get() + k * kLanes<T>, rows, width / kLanes<T>, end - k, layer.depth, init, to, width);
+      for (int r = 0; r < rows; r++) init[r] = to + r * width;
+    }
+    for (int r = 0; r < rows && !direct; r++) std::copy_n(to + r * width, layer.width, out + r * layer.width);
+  }
+
+  static void add(T* __restrict to, const T* __restrict from, int64_t count) {
+    for (int64_t c = 0; c < count; c++) to[c] += from[c];
+  }
+
+  // Gradients of a chunk's inputs. Rows come in the order of items, for one order of sums whatever the chunks.
+  void pull(const Layer& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes) const {
+    int64_t width = layer.width, depth = padded(layer.depth);
+    T* results = this->results(ws);
+    const T* init[kChunk];
+    std::fill_n(init, rows, zeros_.get());
+    for (int64_t k = 0; k < width; k += kDepth) {
+      int64_t count = std::min<int64_t>(kDepth, width - k);
+      for (int r = 0; r < rows; r++)
+        for (int64_t c = 0; c < count; c++) {
+          int64_t at = r * width + k + c;
+          ws[r * kStride + c] = slopes ? grad[at] * slopes[at] : grad[at];
+        }
+      product(ws, layer.backward.get() + k * kLanes<T>, rows, depth / kLanes<T>, count, width, init, results, depth);
+      for (int r = 0; r < rows; r++) init[r] = results + r * depth;
+    }
+    runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
+      for (const Gather& g : layer.inputs)
+        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++) {
+          T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
+          const T* from = results + row * depth + g.column;
+          for (int r = 0; r < now; r++, to += g.width, from += depth)
+            if (g.writes)
+              std::copy_n(from, g.width, to);
+            else
+              add(to, from, g.width);
+        }
+      for (const Gather& g : layer.added)
+        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++) {
+          T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
+          const T *dz = grad + row * width, *slope = slopes + row * width;
+          for (int64_t c = 0; c < now * width; c++) {
+            T step = slopes ? dz[c] * slope[c] : dz[c];
+            to[c] = g.writes ? step : to[c] + step;
+          }
+        }
+    });
+  }
+
+  std::vector<Buffer> buffers_;  // nodes, edges, outputs of the layers
+  std::vector<Layer> layers_;
+  std::vector<int64_t> unread_;  // buffers whose gradient is zero
+  Block zeros_;
+  int64_t stored_ = 0, deepest_ = 0;
+};
+
+}  // namespace gn
