@@ -106,6 +106,7 @@ class Executor(Protocol):
 
     program: StepProgram
     fixed_batch: bool  # whether another batch size costs a compilation
+    runs_all: bool  # whether its constructor refuses no program
 
     def update(self, program: StepProgram) -> None:
         """Take another program of the same scene."""

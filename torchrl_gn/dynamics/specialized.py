@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import operator
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -36,7 +38,7 @@ class SpecializedPredictor(Predictor):
     steps the same tensors. No gradient flows to them.
     """
 
-    def __init__(self, predictor: Predictor, *, executor: str = "eager", dtype: torch.dtype | None = None) -> None:
+    def __init__(self, predictor: Predictor, *, executor: str = "native", dtype: torch.dtype | None = None) -> None:
         state_key, action_key = predictor.in_keys[:2]
         with warnings.catch_warnings():  # the predictor has warned
             warnings.simplefilter("ignore", UnseenParameterWarning)
@@ -51,16 +53,15 @@ class SpecializedPredictor(Predictor):
         self.strict, self.executor_name = predictor.strict, executor
         self._dtype = dtype
         self._executor: Executor | None = None
-        self._weights: list[tuple[Any, str, Tensor, int, torch.dtype]] = []
-        self._casts = 0
+        self._weights, self._casts = _Watched([]), 0
         self._given: dict[str, tuple[Tensor, int]] = {}
-        # Refuse now what the executor cannot run, not at the first step; the eager one runs all.
-        if executor != "eager":
+        # Refuse now what the executor cannot run, not at the first step.
+        if not getattr(EXECUTORS[executor], "runs_all", True):
             self.executor()
 
     def __getstate__(self) -> dict:
         # A copy folds and compiles for itself.
-        return {**super().__getstate__(), "_executor": None, "_weights": [], "_given": {}}
+        return {**super().__getstate__(), "_executor": None, "_weights": _Watched([]), "_given": {}}
 
     @property
     def dtype(self) -> torch.dtype:
@@ -73,7 +74,7 @@ class SpecializedPredictor(Predictor):
 
     def refresh(self) -> None:
         """Take a new snapshot of the weights at the next step."""
-        self._weights = []
+        self._weights = _Watched([])
 
     def executor(self, parameters: TensorDictBase | None = None) -> Executor:
         """What runs the step, from a snapshot of the weights as they are now."""
@@ -85,15 +86,10 @@ class SpecializedPredictor(Predictor):
                     self._executor = EXECUTORS[self.executor_name](program)
                 else:
                     self._executor.update(program)
-            owners = [module._parameters for module in self.model.modules()]
-            owners += [module._buffers for module in (*self.model.modules(), self, self.parameter_reader)]
-            tensors = [
-                (owner, name, tensor) for owner in owners for name, tensor in owner.items() if tensor is not None
-            ]
-            # PyTorch counts no changes of tensors made in inference mode: they are never the same.
-            counted = not any(tensor.is_inference() for _, _, tensor in tensors)
-            self._weights = [(*each, each[2]._version, each[2].dtype) for each in tensors] if counted else []
-            self._casts = self.model.casts
+            modules = list(self.model.modules())
+            owners: list[dict[str, Tensor | None]] = [module._parameters for module in modules]
+            owners += [module._buffers for module in (*modules, self, self.parameter_reader)]
+            self._weights, self._casts = _Watched(owners), self.model.casts
             # Views that share the storage keep it alive: no other tensor can come to lie at its address.
             given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
             self._given = {name: (value.detach(), _version(value)) for name, value in given.items()}
@@ -102,11 +98,7 @@ class SpecializedPredictor(Predictor):
     def _is_current(self, parameters: TensorDictBase | None) -> bool:
         given = {} if parameters is None else dict(parameters.items())
         return (
-            bool(self._weights)
-            and all(
-                owner.get(name) is one and one._version == version and one.dtype is dtype
-                for owner, name, one, version, dtype in self._weights
-            )
+            self._weights.unchanged()
             and self.model.casts == self._casts
             and given.keys() == self._given.keys()
             and all(_same(given[name], *kept) for name, kept in self._given.items())
@@ -182,7 +174,9 @@ class SpecializedPredictor(Predictor):
     def __str__(self) -> str:
         """Table of what was skipped."""
         name = str(self.dtype).removeprefix("torch.")
-        lines = [f"Forward model of {self.scene.name}, specialised, {name}, {self.executor_name}"]
+        reason = getattr(self.executor(), "reason", None)
+        how = self.executor_name if reason is None else f"{self.executor_name}, but here by torch: {reason}"
+        lines = [f"Forward model of {self.scene.name}, specialised, {name}, {how}"]
         lines.append(f"  {'':26}{'plain':>10}{'here':>10}")
         for what, (plain, here) in self.skipped().items():
             lines.append(f"  {what:26}{plain:10,.0f}{here:10,.0f}")
@@ -190,7 +184,7 @@ class SpecializedPredictor(Predictor):
 
 
 def specialize(
-    predictor: Predictor, *, executor: str = "eager", dtype: torch.dtype | None = None
+    predictor: Predictor, *, executor: str = "native", dtype: torch.dtype | None = None
 ) -> SpecializedPredictor:
     """Fold everything that a scene does not need out of its forward model.
 
@@ -199,8 +193,10 @@ def specialize(
     :meth:`~torchrl_gn.networks.Core.fold` is evaluated as it is.
 
     Args:
-        executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"compiled"`` compiles at the first call
-            with every new shape: half a minute, minutes for a gradient, and much faster steps of small batches.
+        executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"native"`` runs steps, rollouts and their
+            gradients in C++ that is built once, 20 s, and kept; where it cannot (a GPU, a recurrent core, parameters of
+            each sample, no compiler), as ``"eager"``, and ``print`` says why. ``"compiled"``, for GPUs, compiles at
+            the first call with every new shape: half a minute, minutes for a gradient.
         dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster where the processor
             multiplies it (``torchrl-gn doctor`` tells) and many times slower elsewhere, which warns
             (:class:`~torchrl_gn.processor.SlowDtypeWarning`). States keep their dtype.
@@ -221,6 +217,29 @@ def specialize(
             stacklevel=2,
         )
     return SpecializedPredictor(predictor, executor=executor, dtype=dtype)
+
+
+class _Watched:
+    """Tensors of modules, and how often each was changed; all in C, as small steps take no longer than a Python loop."""
+
+    def __init__(self, owners: Sequence[dict[str, Tensor | None]]) -> None:
+        found = [(owner, name, one) for owner in owners for name, one in owner.items() if one is not None]
+        # PyTorch counts no changes of tensors made in inference mode: they are never the same.
+        found = [] if any(one.is_inference() for _, _, one in found) else found
+        self.owners, self.names, self.tensors = zip(*found, strict=True) if found else ((), (), ())
+        self.states = list(map(_STATE, self.tensors))
+
+    def unchanged(self) -> bool:
+        """Whether they are the same tensors with the same numbers; False without any."""
+        now = map(dict.get, self.owners, self.names)
+        return (
+            bool(self.states)
+            and all(map(operator.is_, now, self.tensors))
+            and list(map(_STATE, self.tensors)) == self.states
+        )
+
+
+_STATE = operator.attrgetter("_version", "dtype")
 
 
 def _version(tensor: Tensor) -> int:

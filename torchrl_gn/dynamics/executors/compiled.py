@@ -31,7 +31,7 @@ class CompiledExecutor:
         TypeError: of a core that is evaluated by message passing.
     """
 
-    fixed_batch = True
+    fixed_batch, runs_all = True, False
 
     def __init__(self, program: StepProgram) -> None:
         check_torch()

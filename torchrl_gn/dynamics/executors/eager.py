@@ -14,7 +14,7 @@ from torchrl_gn.networks.graph import Graph, graph_concat
 class EagerExecutor:
     """Interpret a program operation by operation; differentiable in all that the program is."""
 
-    fixed_batch = False
+    fixed_batch, runs_all = False, True
 
     def __init__(self, program: StepProgram) -> None:
         self.program = program

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from dataclasses import fields
 
 import numpy as np
@@ -37,7 +38,7 @@ class NativeExecutor:
     that a sample is in nor on the number of threads.
     """
 
-    fixed_batch = False
+    fixed_batch, runs_all = False, True
 
     def __init__(self, program: StepProgram) -> None:
         self.program, self.eager = program, EagerExecutor(program)
@@ -91,30 +92,27 @@ class NativeExecutor:
     def _rollout(self, state: Tensor, actions: Tensor, with_start: bool) -> Tensor:
         if torch.is_grad_enabled() and (state.requires_grad or actions.requires_grad):
             return _Differentiable.apply(self, state, actions, with_start)  # pyright: ignore[reportReturnType]
-        return self.run(state.detach().contiguous(), actions.detach().contiguous(), with_start)
-
-    def tile(self, state: Tensor) -> int:
-        """Samples of a tile: enough tiles for all threads."""
-        count = state.shape[:-2].numel()
-        return min(TILE, -(-count // torch.get_num_threads()))
+        return self.run(state.contiguous(), actions.contiguous(), with_start)
 
     def run(self, state: Tensor, actions: Tensor, with_start: bool, stored: Tensor | None = None) -> Tensor:
         """States ``[*B, T (+ 1), N, C]`` of contiguous tensors."""
-        out = state.new_empty(*state.shape[:-2], actions.shape[-2] + with_start, *state.shape[-2:])
-        size = state.shape[-2] * state.shape[-1]
+        *batch, nodes, channels = state.shape
+        count, size, steps, threads = math.prod(batch), nodes * channels, actions.shape[-2], torch.get_num_threads()
+        out = torch.empty((*batch, steps + with_start, nodes, channels), dtype=state.dtype)
         call = (
-            *(state.numel() // size, actions.shape[-2], self.tile(state), torch.get_num_threads()),
-            *(library.array(state), size, library.array(actions), library.array(out), int(with_start)),
+            *(count, steps, _tile(count, threads), threads),
+            *(library.array(state), size, library.array(actions), library.array(out), with_start),
             *(library.NOTHING, library.NOTHING, None if stored is None else stored.data_ptr()),
         )
-        assert self.network is not None
-        while self.maths is None or not library.rollout(self.network, self.maths, call):
+        network = self.network
+        assert network is not None
+        while self.maths is None or not library.rollout(network, self.maths, call):
             self._trace(state)
         return out
 
     def _trace(self, states: Tensor) -> None:
         """Make the state maths for states whose constant channels are those of the first, as far as all have them."""
-        flat = states.reshape(-1, *states.shape[-2:]).double().numpy()
+        flat = states.detach().reshape(-1, *states.shape[-2:]).double().numpy()
         if self.maths is None:
             values, constant = flat[0], may_be_constant(self.program, flat[0])
         else:
@@ -134,8 +132,8 @@ class _Differentiable(torch.autograd.Function):
     @staticmethod
     def forward(ctx, executor: NativeExecutor, state: Tensor, actions: Tensor, with_start: bool) -> Tensor:
         ctx.executor, ctx.version, ctx.with_start = executor, executor.version, with_start
-        ctx.tile = executor.tile(state)
         state, actions = state.detach().contiguous(), actions.detach().contiguous()
+        ctx.threads = torch.get_num_threads()
         network = executor.network
         assert network is not None
         ctx.stored, numbers = None, actions.shape[:-1].numel() * network.kept
@@ -152,7 +150,7 @@ class _Differentiable(torch.autograd.Function):
         executor, (states, actions) = ctx.executor, ctx.saved_tensors
         if ctx.version != executor.version:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
-        size, steps = states.shape[-2] * states.shape[-1], actions.shape[-2]
+        size, steps, count = states.shape[-2] * states.shape[-1], actions.shape[-2], actions.shape[:-2].numel()
         gradient = gradient.contiguous()
         of_state = gradient.new_empty(*actions.shape[:-2], *states.shape[-2:])
         of_actions = torch.empty_like(actions)
@@ -160,7 +158,7 @@ class _Differentiable(torch.autograd.Function):
             executor.network,
             ctx.maths,
             (
-                *(actions.shape[:-2].numel(), steps, ctx.tile, torch.get_num_threads()),
+                *(count, steps, _tile(count, ctx.threads), ctx.threads),
                 *(library.array(states), size * (steps + 1 if ctx.with_start else 1), library.array(actions)),
                 *(library.array(gradient), int(ctx.with_start)),
                 *(library.array(of_state), library.array(of_actions)),
@@ -168,6 +166,11 @@ class _Differentiable(torch.autograd.Function):
             ),
         )
         return None, of_state, of_actions, None
+
+
+def _tile(count: int, threads: int) -> int:
+    """Samples of a tile, such that there are tiles for all threads."""
+    return min(TILE, -(-count // threads))
 
 
 def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
