@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, fx
-from torch._decomp import core_aten_decompositions
-from torch.fx.experimental.proxy_tensor import make_fx
+from torch import Tensor
+from torch._decomp import decomposition_table
+from torch.utils._pytree import tree_map_only
 
 from torchrl_gn.dynamics.executors.native import expressions as ex
-from torchrl_gn.dynamics.executors.native.expressions import Scalar
 
 Array = np.ndarray  # of objects: expressions and numbers
 
@@ -29,31 +27,49 @@ def trace(function: Callable[..., tuple[Tensor, ...]], *inputs: Array) -> list[A
     Raises:
         UntraceableError: names the operation that has no scalar form.
     """
-    examples = [torch.full(each.shape, 0.5, dtype=torch.float64) for each in inputs]  # not random: seeds are the user's
     with torch.no_grad():
-        graph = make_fx(torch.func.functionalize(function), decomposition_table=core_aten_decompositions())(*examples)
-        return [_array(each) for each in _Interpreter(graph).run(*inputs)]
+        return [_array(_unwrapped(each)) for each in function(*map(_Symbolic, inputs))]
 
 
-class _Interpreter(fx.Interpreter):
-    """Run a graph on arrays of expressions; what depends on none is computed by torch."""
+class _Symbolic(Tensor):
+    """Tensor of expressions: operations on it work on the array; what depends on none is computed by torch."""
 
-    def call_function(self, target: Any, args: tuple, kwargs: dict) -> Any:
-        if not _symbolic(args):
-            return super().call_function(target, args, kwargs)
-        name = target.__name__ if target is operator.getitem else target._schema.name.removeprefix("aten::")
-        if name not in _OPERATIONS:
-            raise UntraceableError(f"The operation {target} has no scalar form.")
-        try:
-            return _OPERATIONS[name](*args, **kwargs)
-        except NotImplementedError as error:
-            raise UntraceableError(f"The operation {target} has no scalar form here: {error}.") from error
+    array: Array
+
+    @staticmethod
+    def __new__(cls, array: Array, dtype: torch.dtype = torch.float64) -> _Symbolic:
+        tensor = Tensor._make_wrapper_subclass(cls, array.shape, dtype=dtype)  # pyright: ignore[reportAttributeAccessIssue]
+        tensor.array = array
+        return tensor
+
+    def __init__(self, *args: Any) -> None:
+        pass
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        if function in _PRODUCTS:  # which torch would do by operations in place
+            return _Symbolic(_PRODUCTS[function](*tree_map_only(_Symbolic, _unwrapped, args), **(kwargs or {})))
+        return torch._C._disabled_torch_function_impl(function, types, args, kwargs or {})
+
+    @classmethod
+    def __torch_dispatch__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        kwargs, name = kwargs or {}, function._schema.name.removeprefix("aten::")
+        if name in _OPERATIONS:
+            args, kwargs = tree_map_only(_Symbolic, _unwrapped, (args, kwargs))
+            try:
+                out = _OPERATIONS[name](*args, **kwargs)
+            except NotImplementedError as error:
+                raise UntraceableError(f"The operation {function} has no scalar form here: {error}.") from error
+            dtype = torch.bool if name in ("lt", "gt", "eq") else torch.float64
+            return tree_map_only(np.ndarray, lambda array: _Symbolic(array, dtype), out)
+        out = (decomposition_table.get(function) or function.decompose)(*args, **kwargs)
+        if out is NotImplemented:
+            raise UntraceableError(f"The operation {function} has no scalar form.")
+        return out
 
 
-def _symbolic(value: Any) -> bool:
-    if isinstance(value, (tuple, list)):
-        return any(map(_symbolic, value))
-    return isinstance(value, np.ndarray)
+def _unwrapped(tensor: Any) -> Any:
+    return tensor.array if isinstance(tensor, _Symbolic) else tensor
 
 
 def _array(value: Any) -> Array:
@@ -237,6 +253,18 @@ def _same(a: Array, *args: Any, **kwargs: Any) -> Array:
     return a
 
 
+def _linear(a: Any, weight: Any, bias: Any = None) -> Array:
+    out = _matmul(a, _array(weight).T)
+    return out if bias is None else _object(out + _array(bias))
+
+
+_PRODUCTS: dict[Any, Callable[..., Array]] = {
+    torch.matmul: _matmul,
+    Tensor.matmul: _matmul,
+    Tensor.__matmul__: _matmul,
+    Tensor.__rmatmul__: lambda a, b: _matmul(b, a),
+    torch.nn.functional.linear: _linear,
+}
 _OPERATIONS: dict[str, Callable[..., Any]] = {
     "getitem": operator.getitem,
     "add": _add(1),
@@ -271,7 +299,6 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
     "permute": lambda a, dims: a.transpose(dims),
     "expand": _expand,
     "squeeze": _squeeze,
-    "squeeze_": _squeeze,
     "unsqueeze": _unsqueeze,
     "slice": _slice,
     "select": lambda a, dim, index: _object(np.take(a, index, axis=dim)),
