@@ -1,15 +1,26 @@
 """Run time of the forward model: specialised and reference, the same work in turn.
 
     python recipes/benchmark_speed.py [system=swimmer6] [hidden=[128,128]] [compile=true] [curves=true]
+        [baselines=[jraph,mujoco]]
 
-Times one step, rollouts, gradients through rollouts and a training step of one forward model (random weights, true
-physical parameters), evaluated in several ways: `reference` (PyG message passing, eager: the baseline), `folded` (what
-training uses), `specialised`, and on top of it oneDNN's matrix products (`fast`), bfloat16 products (where this
-processor is fast at them) and `torch.compile`. Each way does each piece of work in turn, several times. The table shows
-medians, speed-ups over `reference`, peak memory, and errors against the reference in float64. The share of the limit
-compares the specialised model's FLOP/s with those of a large matrix product. `curves=true` draws the time of a step
-over links, batch sizes and hidden sizes, and of a rollout's gradient over its length. No figure of the paper. Takes
-about ten minutes, half of it compiling. Results: docs/performance.md.
+Times one step, rollouts, gradients through a step and through rollouts, and a training step of one forward model
+(random weights, true physical parameters), evaluated in several ways: `reference` (PyG message passing, eager),
+`folded` (what training uses), `specialised`, the other executors, and on top of them oneDNN's matrix products (`fast`)
+and bfloat16 products (where this processor is fast at them). Each way does each piece of work in turn, several times,
+short work many times a turn. The table shows medians, speed-ups over `reference` and jraph, peak memory, and errors
+against the reference in float64.
+
+`baselines=[jraph,mujoco]` times others in turn with them. `jraph` is the same network with the same weights as jraph
+users write it, under `jax.jit` in float32: the network alone, from graph features to output nodes, which are checked to
+be ours, and the gradient in node and edge features. Ours go from state to state, with features and projection. The
+process is then kept on as many cores as `threads`, and JAX computes in the calling thread. `mujoco` is the true physics
+in C, on one thread. A baseline has no row where it has no such work.
+
+`bound` is the share that a step reaches of its least time: the larger of its FLOPs at the rate of a large product, and
+of its weights read once at the bandwidth of reading as many bytes again and again. FLOPs and weights are those of the
+specialised network. `curves=true` draws the time of a step over links, batch sizes and hidden sizes, and of a rollout's
+gradient over its length. No figure of the paper. Takes about ten minutes, half of it compiling. Results:
+docs/performance.md.
 
 Writes config.yaml, metrics.json and with curves the figure speed.png to its run folder.
 """
@@ -18,6 +29,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import os
 import statistics
 from typing import cast
 
@@ -27,13 +39,17 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from tqdm import tqdm
 
-from _common import clean_exit, finish_run, open_run, with_help
-from _common.speed_work import Way, Work, gemm_rate, make_works, peak_memory, pull, step_once, timed, train_work
+from _common import as_list, clean_exit, finish_run, open_run, with_help
+from _common.speed_baselines import make_baselines
+from _common.speed_measure import Way, measure, timed
+from _common.speed_table import least_times, report
+from _common.speed_work import make_works, pull, step_once, train_work
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
+from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics.executors import EXECUTORS
 from torchrl_gn.evaluation import plot_loglog
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.processor import product_speeds
+from torchrl_gn.processor import product_speeds, usable_cores
 from torchrl_gn.scenes import load_scene
 
 
@@ -58,57 +74,18 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
         "reference": Way(model.bind(scene, reference=True)),
         "reference, fast": Way(model.bind(scene, reference=True), fast=True),
         "folded, fast": Way(bound, fast=True),
-        "specialised": Way(specialize(bound)),
-        "specialised, fast": Way(specialize(bound), fast=True),
     }
     rounded = product_speeds().pays(torch.bfloat16)
-    if rounded:
-        ways["specialised, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16))
-    if cfg.compile:
-        compiled = specialize(bound, executor="compiled")
-        ways["compiled"] = Way(compiled)
-        ways["compiled, fast"] = Way(compiled, fast=True)
-        if rounded:
-            ways["compiled, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, executor="compiled"))
-    return ways
-
-
-def measure(works: list[Work], ways: dict[str, Way], reference: Predictor | None) -> dict[str, float]:
-    """Time every work in every way, in turn; returns the seconds of first calls of compiled ways."""
-    compile_seconds = {}
-    bar = tqdm(total=sum(work.repeats + 1 for work in works) * len(ways), desc="measuring", leave=False)
-    for work in works:
-        expected = None if reference is None else work.run(Way(reference))
-        for turn in range(work.repeats + 1):
-            for name, way in ways.items():
-                result, seconds = timed(functools.partial(work.run, way), way.fast)
-                bar.update()
-                if turn == 0:  # warms up, compiles
-                    if name == "compiled":
-                        compile_seconds[work.name] = seconds
-                    if result is not None and expected is not None:
-                        work.errors[name] = float((result - expected).norm() / expected.norm())
-                else:
-                    work.milliseconds.setdefault(name, []).append(1e3 * seconds / work.steps)
-        for name, way in ways.items():
-            work.megabytes[name] = peak_memory(functools.partial(timed, functools.partial(work.run, way), way.fast))
-    bar.close()
-    return compile_seconds
-
-
-def limits(cfg: DictConfig, ways: dict[str, Way], work: Work, batch: int) -> dict[str, float]:
-    """Share of the limit that each way reaches: FLOPs of the specialised function at the measured product rate."""
-    shares = {}
-    for name, way in ways.items():
-        if not name.startswith(("specialised", "compiled")):
+    for executor in EXECUTORS:
+        if executor == "compiled" and not cfg.compile:
             continue
-        quick = way.model
-        edges, size = quick.scene.num_edges, cfg.hidden[-1]
-        dtype = torch.bfloat16 if "bfloat16" in name else torch.float32
-        rate = gemm_rate(batch * edges, size, dtype, way.fast, cfg.repeats)
-        flop = 1e3 * quick.skipped()["kFLOP"][1] * batch  # type: ignore[attr-defined]
-        shares[name] = flop / rate / (1e-3 * statistics.median(work.milliseconds[name]))
-    return shares
+        name = "specialised" if executor == "eager" else executor
+        ways[name] = Way(specialize(bound, executor=executor))
+        if executor in ("eager", "compiled"):  # their products are torch's
+            ways[f"{name}, fast"] = Way(ways[name].model, fast=True)
+            if rounded:
+                ways[f"{name}, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, executor=executor))
+    return ways
 
 
 def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float]]]]:
@@ -146,43 +123,22 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    run, tracker = open_run(cfg, "benchmark_speed")
     model, transitions = make_model(cfg, cfg.system, list(cfg.hidden))
-    ways, works = make_ways(cfg, model, cfg.system), make_works(cfg, model, transitions)
+    baselines = make_baselines(cfg, model, load_scene(cfg.system), as_list(cfg.baselines))
+    run, tracker = open_run(cfg, "benchmark_speed")
+    ways, works = make_ways(cfg, model, cfg.system), make_works(cfg, model, transitions, baselines)
     model.requires_grad_(False)
     reference = copy.deepcopy(model).double().bind(load_scene(cfg.system), reference=True)
     compile_seconds = measure(works, ways, reference)
     model.requires_grad_(True)
     training = train_work(cfg, model, transitions)
-    measure([training], {name: way for name, way in ways.items() if "reference" in name or "folded" in name}, None)
+    measure([training], {name: way for name, way in ways.items() if "reference" in name or "folded" in name})
 
-    print(ways["specialised"].model)
-    print(
-        f"\nMilliseconds a step, median of {cfg.repeats}, {cfg.threads} threads; speed-up over reference; most MB of"
-        " memory; error"
-    )
-    metrics: dict[str, float | int] = {"threads": cfg.threads}
-    for work in [*works, training]:
-        print(work.name)
-        baseline = statistics.median(work.milliseconds["reference"])
-        for name, values in work.milliseconds.items():
-            median = statistics.median(values)
-            error = f"{work.errors[name]:11.1e}" if name in work.errors else ""
-            print(f"  {name:24}{median:10.3f}{baseline / median:8.1f}x{work.megabytes[name]:9.1f}{error}")
-            metrics[f"{work.name}/{name}/megabytes"] = work.megabytes[name]
-            metrics[f"{work.name}/{name}/milliseconds"] = median
-            metrics[f"{work.name}/{name}/speedup"] = baseline / median
-            metrics[f"{work.name}/{name}/range"] = (max(values) - min(values)) / median
-            if name in work.errors:
-                metrics[f"{work.name}/{name}/error"] = work.errors[name]
-    batch = max(cfg.batches)
-    widest = next(work for work in works if work.name == f"step, batch {batch}")
-    print(f"Share of the limit, step, batch {batch}")
-    for name, share in limits(cfg, ways, widest, batch).items():
-        print(f"  {name:24}{100 * share:10.0f} %")
-        metrics[f"limit/{name}"] = share
-    for name, seconds in compile_seconds.items():
-        metrics[f"first call/{name}"] = seconds
+    print(f"{ways['specialised'].model}\n\nMilliseconds a step, medians of {cfg.repeats}, {cfg.threads} threads")
+    if "jraph" in baselines:
+        print(f"This process on {usable_cores()} cores, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}")
+    metrics = {"threads": cfg.threads, **report([*works, training], least_times(cfg, works, ways))}
+    metrics |= {f"first call/{name}": seconds for name, seconds in compile_seconds.items()}
     if compile_seconds:
         print("First calls of the compiled model: " + ", ".join(f"{n} {s:.0f} s" for n, s in compile_seconds.items()))
     if cfg.curves:

@@ -2,74 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import functools
-import math
-import statistics
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TypeVar, cast
+from collections.abc import Callable, Mapping
+from typing import cast
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
+from _common.speed_baselines import Baseline
+from _common.speed_measure import Way, Work
 from torchrl_gn.dynamics import ForwardModel, Predictor
-from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training import make_optimizer
-
-R = TypeVar("R")
-
-
-@dataclass(frozen=True)
-class Way:
-    """A way to evaluate the forward model."""
-
-    model: Predictor
-    fast: bool = False
-
-
-@dataclass
-class Work:
-    """Something to time: ``run`` does it with a way and gives a result to compare."""
-
-    name: str
-    run: Callable[[Way], Tensor | None]
-    steps: int = 1
-    repeats: int = 9
-    milliseconds: dict[str, list[float]] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-    megabytes: dict[str, float] = field(default_factory=dict)
-
-
-def peak_memory(run: Callable[[], object]) -> float:
-    """Most memory that ``run`` takes beyond what was taken before, in MB; NaN where Linux does not tell."""
-
-    def resident(name: str) -> int:
-        status = Path("/proc/self/status").read_text()
-        return int(next(line for line in status.splitlines() if line.startswith(name)).split()[1])
-
-    try:
-        ctypes.CDLL(None).malloc_trim(0)  # gives back what is free
-        Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
-    except (OSError, AttributeError):
-        return math.nan
-    before = resident("VmRSS")
-    run()
-    return (resident("VmHWM") - before) / 1024
-
-
-def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
-    """What ``run`` gives, and the seconds it takes, with products that may round if ``fast``."""
-    with fast_matmul(rounding=True) if fast else contextlib.nullcontext():
-        start = time.perf_counter()
-        result = run()
-        return result, time.perf_counter() - start
 
 
 @torch.no_grad()
@@ -86,7 +31,16 @@ def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
     return leaf.grad
 
 
-def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) -> list[Work]:
+def pull_once(model: Predictor, state: Tensor, action: Tensor) -> Tensor:
+    """Gradient of a scalar of the next state to state and action, in one row."""
+    state, action = (tensor.clone().requires_grad_() for tensor in (state, action))
+    loss = model.step(state, action)[0][..., 7:].square().sum()
+    return torch.cat([gradient.flatten() for gradient in torch.autograd.grad(loss, (state, action))])
+
+
+def make_works(
+    cfg: DictConfig, model: ForwardModel, transitions: TensorDict, baselines: Mapping[str, Baseline]
+) -> list[Work]:
     """The work of the table, but for the training step."""
 
     def first(batch: int, horizon: int = 1) -> tuple[Tensor, Tensor]:
@@ -94,13 +48,28 @@ def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
         actions = cast(Tensor, transitions["action"]).repeat(-(-count // len(transitions)), 1)[:count]
         return cast(Tensor, transitions["state"])[:batch], actions.view(batch, horizon, -1)
 
+    def others(kind: str, state: Tensor, actions: Tensor) -> dict[str, Callable[[], object]]:
+        runs = {name: getattr(baseline, kind)(state, actions) for name, baseline in baselines.items()}
+        return {name: run for name, run in runs.items() if run is not None}
+
     def step(batch: int) -> Work:
         state, actions = first(batch)
 
         def run(way: Way) -> Tensor:
             return step_once(way.model, state, actions[:, 0]) - state
 
-        return Work(f"step, batch {batch}", run, repeats=cfg.repeats)
+        return Work(f"step, batch {batch}", run, 1, cfg.repeats, others("step", state, actions[:, 0]))
+
+    def single_steps(batch: int, horizon: int) -> Work:
+        start, actions = first(batch, horizon)
+
+        def run(way: Way) -> Tensor:
+            state = start
+            for action in actions.unbind(1):
+                state = step_once(way.model, state, action)
+            return state - start
+
+        return Work(f"{horizon} single steps, batch {batch}", run, horizon, cfg.repeats)
 
     def rollout(batch: int, horizon: int) -> Work:
         state, actions = first(batch, horizon)
@@ -109,7 +78,17 @@ def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
             with torch.no_grad():
                 return way.model.rollout(state, actions)[0][:, -1] - state
 
-        return Work(f"rollout of {horizon}, batch {batch}", run, horizon, cfg.repeats)
+        return Work(
+            f"rollout of {horizon}, batch {batch}", run, horizon, cfg.repeats, others("rollout", state, actions)
+        )
+
+    def step_gradient(batch: int) -> Work:
+        state, actions = first(batch)
+
+        def run(way: Way) -> Tensor:
+            return pull_once(way.model, state, actions[:, 0])
+
+        return Work(f"gradient of a step, batch {batch}", run, 1, cfg.repeats, others("gradient", state, actions[:, 0]))
 
     def gradient(batch: int, horizon: int) -> Work:
         state, actions = first(batch, horizon)
@@ -121,7 +100,8 @@ def make_works(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
 
     return [
         *(step(batch) for batch in cfg.batches),
-        *(rollout(batch, cfg.horizon) for batch in cfg.rollout_batches),
+        *(make(batch, cfg.horizon) for batch in cfg.rollout_batches for make in (rollout, single_steps)),
+        *(step_gradient(batch) for batch in cfg.step_gradient_batches),
         *(gradient(batch, cfg.gradient_horizon) for batch in cfg.gradient_batches),
     ]
 
@@ -139,10 +119,3 @@ def train_work(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
         optimizer.step(0, 1.0)  # the schedule has ended: the weights stay as they are
 
     return Work(f"training step, batch {cfg.training_batch}", run, repeats=cfg.repeats)
-
-
-def gemm_rate(rows: int, size: int, dtype: torch.dtype, fast: bool, repeats: int) -> float:
-    """Median FLOP/s of a product of ``[rows, size]`` and ``[size, size]`` matrices."""
-    a, b = torch.randn(rows, size).to(dtype), torch.randn(size, size).to(dtype)
-    seconds = [timed(functools.partial(torch.mm, a, b), fast)[1] for _ in range(repeats + 1)]
-    return 2 * rows * size * size / statistics.median(seconds[1:])

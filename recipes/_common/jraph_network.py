@@ -1,0 +1,116 @@
+"""The forward model's network written with jraph, from our weights."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from torchrl_gn.networks import GNCore, Graph
+
+try:
+    import jax  # pyright: ignore[reportMissingImports]
+    import jax.numpy as jnp  # pyright: ignore[reportMissingImports]
+    import jraph  # pyright: ignore[reportMissingImports]
+except ImportError as error:
+    raise ImportError(f"{error}; baselines=[jraph] needs: pip install 'jax[cpu]' jraph") from error
+
+_ACTIVATIONS = {
+    "relu": jax.nn.relu,
+    "silu": jax.nn.silu,
+    "gelu": functools.partial(jax.nn.gelu, approximate=False),
+    "tanh": jnp.tanh,
+}
+
+
+def limit_threads(count: int) -> None:
+    """Keep this process, and so XLA's thread pools, on ``count`` cores: before the first call of JAX.
+
+    Calls run in the calling thread: handing them to another and waiting would take longer on one core.
+    """
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if count == 1:
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false".strip()
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+
+
+class JraphNetwork:
+    """A :class:`~torchrl_gn.networks.GNCore` that pools by sums, as two ``jraph.GraphNetwork`` under ``jax.jit``.
+
+    Float32. Graphs are batched by ``jraph.batch_np``; weights are arguments of the compiled functions.
+    """
+
+    def __init__(self, core: GNCore) -> None:
+        self.weights = {name: _weights(block) for name, block in (("first", core.first), ("second", core.second))}
+        network = functools.partial(_network, _ACTIVATIONS[core.activation])
+
+        def loss(features: Any, weights: Any, graph: Any) -> Any:
+            nodes, edges = features
+            return jnp.square(network(weights, graph._replace(nodes=nodes, edges=edges))).sum()
+
+        self._predict, self._gradient = jax.jit(network), jax.jit(jax.value_and_grad(loss))
+
+    def predict(self, graph: Any) -> Any:
+        """Output nodes ``[B * N, F_out]`` of a batched graph."""
+        return self._predict(self.weights, graph).block_until_ready()
+
+    def gradient(self, graph: Any) -> tuple[Any, tuple[Any, Any]]:
+        """Sum of the squared outputs, and its gradient in the features of nodes and edges."""
+        return jax.block_until_ready(self._gradient((graph.nodes, graph.edges), self.weights, graph))
+
+
+def batched(graph: Graph) -> Any:
+    """The samples of a graph with features ``[B, ...]`` as one ``jraph.GraphsTuple``."""
+    senders, receivers = graph.edge_index.numpy()
+    counts = {"n_node": np.array([graph.nodes.shape[-2]]), "n_edge": np.array([len(senders)])}
+    ends = {"senders": senders, "receivers": receivers}
+    samples = zip(*(part.numpy() for part in graph.features), strict=True)
+    graphs = [jraph.GraphsTuple(nodes=n, edges=e, globals=g[None], **ends, **counts) for n, e, g in samples]
+    return jax.tree_util.tree_map(jnp.asarray, jraph.batch_np(graphs))
+
+
+def _weights(block: nn.Module) -> dict[str, list[tuple[Any, Any]]]:
+    """Weights ``[in, out]`` and biases of a GN block's MLPs."""
+    mlps = {name: getattr(block, f"{name}_mlp") for name in ("edge", "node", "global")}
+    return {name: [_layer(each) for each in mlp if isinstance(each, nn.Linear)] for name, mlp in mlps.items() if mlp}
+
+
+@torch.no_grad()
+def _layer(linear: nn.Linear) -> tuple[Any, Any]:
+    return jnp.asarray(linear.weight.T.numpy()), jnp.asarray(linear.bias.numpy())
+
+
+def _network(activation: Callable, weights: Any, graph: Any) -> Any:
+    first = _block(activation, weights["first"])(graph)
+    both = graph._replace(
+        nodes=jnp.concatenate((graph.nodes, first.nodes), -1),
+        edges=jnp.concatenate((graph.edges, first.edges), -1),
+        globals=jnp.concatenate((graph.globals, first.globals), -1),
+    )
+    return _block(activation, weights["second"])(both).nodes
+
+
+def _block(activation: Callable, weights: Any) -> Callable:
+    def mlp(name: str, *inputs: Any) -> Any:
+        hidden = jnp.concatenate(inputs, -1)
+        *others, (weight, bias) = weights[name]
+        for each, shift in others:
+            hidden = activation(hidden @ each + shift)
+        return hidden @ weight + bias
+
+    def update_edges(edges: Any, sent: Any, received: Any, globals_: Any) -> Any:
+        return mlp("edge", globals_, sent, received, edges)
+
+    def update_nodes(nodes: Any, sent: Any, received: Any, globals_: Any) -> Any:
+        return mlp("node", globals_, nodes, received)
+
+    def update_globals(nodes: Any, edges: Any, globals_: Any) -> Any:
+        return mlp("global", globals_, nodes, edges)
+
+    return jraph.GraphNetwork(update_edges, update_nodes, update_globals if "global" in weights else None)

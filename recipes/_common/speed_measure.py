@@ -1,0 +1,103 @@
+"""Time pieces of work on a forward model, in turn."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from torch import Tensor
+from tqdm import tqdm
+
+from torchrl_gn.dynamics import Predictor
+from torchrl_gn.maths import fast_matmul
+
+R = TypeVar("R")
+
+# Short work is repeated within a turn, as its first call finds the caches full of what others left there.
+_TURN_SECONDS, _MOST_CALLS = 0.02, 50
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to evaluate the forward model."""
+
+    model: Predictor
+    fast: bool = False
+
+
+@dataclass
+class Work:
+    """Something to time: ``run`` does it with a way and gives a result to compare, ``others`` do it without one."""
+
+    name: str
+    run: Callable[[Way], Tensor | None]
+    steps: int = 1
+    repeats: int = 9
+    others: Mapping[str, Callable[[], object]] = field(default_factory=dict)
+    milliseconds: dict[str, list[float]] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+    megabytes: dict[str, float] = field(default_factory=dict)
+
+
+def peak_memory(run: Callable[[], object]) -> float:
+    """Most memory that ``run`` takes beyond what was taken before, in MB; NaN where Linux does not tell."""
+
+    def resident(name: str) -> int:
+        status = Path("/proc/self/status").read_text()
+        return int(next(line for line in status.splitlines() if line.startswith(name)).split()[1])
+
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # gives back what is free
+        Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
+    except (OSError, AttributeError):
+        return math.nan
+    before = resident("VmRSS")
+    run()
+    return (resident("VmHWM") - before) / 1024
+
+
+def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
+    """What ``run`` gives, and the seconds it takes, with products that may round if ``fast``."""
+    with fast_matmul(rounding=True) if fast else contextlib.nullcontext():
+        start = time.perf_counter()
+        result = run()
+        return result, time.perf_counter() - start
+
+
+def measure(works: Sequence[Work], ways: Mapping[str, Way], reference: Predictor | None = None) -> dict[str, float]:
+    """Time every work in every way, in turn; returns the seconds of first calls of compiled ways."""
+    compile_seconds = {}
+    turns = sum((work.repeats + 1) * (len(ways) + len(work.others)) for work in works)
+    bar = tqdm(total=turns, desc="measuring", leave=False)
+    for work in works:
+        expected = None if reference is None else work.run(Way(reference))
+        runs = {
+            name: functools.partial(timed, functools.partial(work.run, way), way.fast) for name, way in ways.items()
+        }
+        runs |= {name: functools.partial(timed, run, False) for name, run in work.others.items()}
+        calls: dict[str, int] = {}
+        for name, run in runs.items():  # warms up, compiles
+            result, seconds = run()
+            bar.update()
+            if name == "compiled":
+                compile_seconds[work.name] = seconds
+            if isinstance(result, Tensor) and expected is not None:
+                work.errors[name] = float((result - expected).norm() / expected.norm())
+            calls[name] = max(1, min(_MOST_CALLS, int(_TURN_SECONDS / run()[1])))
+        for _ in range(work.repeats):
+            for name, run in runs.items():
+                seconds = statistics.median(run()[1] for _ in range(calls[name]))
+                work.milliseconds.setdefault(name, []).append(1e3 * seconds / work.steps)
+                bar.update()
+        for name, run in runs.items():
+            work.megabytes[name] = peak_memory(run)
+    bar.close()
+    return compile_seconds

@@ -1,0 +1,107 @@
+"""The speed benchmark: its ways, baselines and bound."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from _common.speed_baselines import MuJoCoBaseline, make_baselines
+from _common.speed_bound import Bound
+from _common.speed_measure import Way, Work, measure
+from _common.speed_table import report
+from torchrl_gn.data import Simulator, sample_start_states
+from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics.executors import EXECUTORS
+from torchrl_gn.networks import GNCore, Graph, GraphSize
+from torchrl_gn.scenes import load_scene
+
+
+def test_every_executor_is_a_way(load, compose, monkeypatch):
+    recipe = load("benchmark_speed")
+    scene = load_scene("pendulum")
+    model = ForwardModel.for_scene(scene, hidden=4)
+    monkeypatch.setitem(EXECUTORS, "another", EXECUTORS["eager"])
+    ways = recipe.make_ways(compose("benchmark_speed", "compile=false"), model, "pendulum")
+    assert {"reference", "specialised", "specialised, fast", "another"} <= set(ways) and "compiled" not in ways
+    assert ways["another"].model.executor_name == "another" and next(iter(ways)) == "reference"
+
+
+@pytest.mark.parametrize(
+    ("names", "error", "match"),
+    [(["graph"], ValueError, "not known; use any of"), (["jraph"], ImportError, r"pip install 'jax\[cpu\]' jraph")],
+)
+def test_what_baselines_need(compose, monkeypatch, names, error, match):
+    monkeypatch.setitem(sys.modules, "jax", None)
+    monkeypatch.delitem(sys.modules, "_common.jraph_network", raising=False)
+    scene = load_scene("pendulum")
+    with pytest.raises(error, match=match):
+        make_baselines(compose("benchmark_speed"), ForwardModel.for_scene(scene, hidden=4), scene, names)
+
+
+def test_mujoco_baseline_simulates_the_scene():
+    scene = load_scene("pendulum")
+    state, actions = torch.zeros(3, scene.num_nodes, 13), 0.1 * torch.randn(3, 4, scene.num_actions)
+    baseline = MuJoCoBaseline(scene, seed=5)
+    start = sample_start_states(scene, 3, 5)
+    expected = Simulator(scene, num_threads=1).rollout(torch.from_numpy(start), actions)["physics"].numpy()
+    found = baseline.rollout(state, actions)()[0][:, scene.substeps - 1 :: scene.substeps]
+    assert np.array_equal(found[..., 1:], expected[:, 1:, 1:])  # but for the time
+    assert np.array_equal(baseline.step(state, actions[:, 0])()[0][:, -1, 1:], expected[:, 1, 1:])
+
+
+def test_bound_is_the_slower_of_products_and_weights():
+    bound = Bound(flop=1e6, rate=1e9, size=4e6, bandwidth=1e9)
+    assert [bound.milliseconds(batch) for batch in (1, 4, 10)] == pytest.approx([4, 4, 10])
+    scene = load_scene("pendulum")
+    small, large = (
+        Bound.measure(specialize(ForwardModel.for_scene(scene, hidden=hidden).bind(scene)), 1) for hidden in (8, 16)
+    )
+    assert 0 < small.size < large.size < 4 * small.size and small.rate > 0 and small.bandwidth > 0
+
+
+def test_others_are_timed_in_turn_and_compared(capsys, monkeypatch):
+    order = []
+
+    def take(seconds):
+        return lambda *_: (order.append(seconds), seconds)[1]
+
+    monkeypatch.setattr("_common.speed_measure.timed", lambda run, fast: (None, run()))
+    ways = {name: Way(name) for name in ("reference", "way")}  # type: ignore[arg-type]
+    work = Work("step, batch 1", take(0.03), 2, 3, {"jraph": take(0.008)})
+    measure([work], ways)
+    # Two calls each to warm up, three turns, in which the shorter work is called twice, and one for memory.
+    assert order == [0.03] * 4 + [0.008] * 2 + [0.03, 0.03, 0.008, 0.008] * 3 + [0.03, 0.03, 0.008]
+    assert work.milliseconds == {"reference": [15] * 3, "way": [15] * 3, "jraph": [4] * 3}
+    work.milliseconds = {"reference": [8.0], "way": [1.0], "jraph": [4.0]}
+    metrics = report([work], {("step, batch 1", "way"): 0.5})
+    row = {key: metrics[f"step, batch 1/way/{key}"] for key in ("milliseconds", "speedup", "jraph", "bound")}
+    assert row == {"milliseconds": 1, "speedup": 8, "jraph": 4, "bound": 0.5}
+    assert "step, batch 1/jraph/bound" not in metrics and "8.0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("activation", ["relu", "silu", "gelu", "tanh"])
+def test_jraph_network_is_ours(activation):
+    pytest.importorskip("jraph")
+    from _common.jraph_network import JraphNetwork, batched
+
+    torch.manual_seed(0)
+    sizes = {"hidden": [16, 8], "edge_hidden": [12], "latent": 6}
+    core = GNCore(GraphSize(3, 2, 1), GraphSize(2, 4, 3), 5, activation=activation, **sizes)
+    edge_index = torch.tensor([[0, 1, 1, 2, 3], [1, 0, 2, 1, 0]])
+    parts = [torch.randn(6, *shape) for shape in ((4, 5), (5, 6), (4,))]
+    nodes, edges, globals_ = (part.requires_grad_() for part in parts)
+    expected = core(Graph(nodes, edges, globals_, edge_index)).nodes
+    loss = expected.square().sum()
+    loss.backward()
+
+    network = JraphNetwork(core)
+    graph = batched(Graph(nodes.detach(), edges.detach(), globals_.detach(), edge_index))
+    torch.testing.assert_close(torch.from_numpy(np.array(network.predict(graph))).view(6, 4, 5), expected.detach())
+    value, gradients = network.gradient(graph)
+    assert float(value) == pytest.approx(loss.item(), rel=1e-5)
+    for found, wanted in zip(gradients, (nodes.grad, edges.grad), strict=True):
+        assert wanted is not None
+        torch.testing.assert_close(torch.from_numpy(np.array(found)).view_as(wanted), wanted, rtol=1e-4, atol=1e-5)
