@@ -3,9 +3,9 @@
 // Samples are handled in tiles of up to 24, each from its first step to its last by one thread: the state maths by
 // tapes (tape.h, samples as lanes), the network by network.h. Every sample is computed in the same order whatever the
 // batch, the tile and the number of threads, so results do not depend on them.
+#include <algorithm>
 #include <atomic>
 #include <cstdlib>
-#include <memory>
 #include <thread>
 #include <vector>
 
@@ -55,11 +55,31 @@ struct Call {
 
 constexpr double TOLERANCE = 1e-9;
 
-struct Aligned {
-  explicit Aligned(size_t bytes) : data(std::aligned_alloc(64, (bytes + 127) / 64 * 64)) {}
-  ~Aligned() { std::free(data); }
-  Aligned(const Aligned&) = delete;
-  void* data;
+// Memory of one thread that is kept from call to call: fresh pages would cost a small batch more than its steps.
+class Arena {
+ public:
+  ~Arena() { std::free(data_); }
+  // Room for all blocks, which take() then hands out.
+  void reserve(size_t bytes) {
+    if (bytes > size_) {
+      std::free(data_);
+      data_ = static_cast<char*>(std::aligned_alloc(64, bytes));
+      size_ = bytes;
+      std::memset(data_, 0, bytes);
+    }
+    used_ = 0;
+  }
+  template <class N>
+  N* take(size_t count) {
+    N* block = reinterpret_cast<N*>(data_ + used_);
+    used_ += padded(sizeof(N) * count);
+    return block;
+  }
+  static size_t padded(size_t bytes) { return (bytes + 127) / 64 * 64; }
+
+ private:
+  char* data_ = nullptr;
+  size_t size_ = 0, used_ = 0;
 };
 
 template <class T, int W, int C>
@@ -149,9 +169,10 @@ struct Runner {
   }
 
   // Gradient of the varying channels; that of the constant ones is what their copies receive.
-  void adjoint(double* again, T* derivatives) const {
+  // again, derivatives: room for the step that is computed again; gradient: of the varying channels.
+  void adjoint(double* again, T* derivatives, double* gradient) const {
     const int64_t rows = call.steps + call.with_start, A = m.actions, n = m.varying_count;
-    std::vector<double> gradient(n * L, 0.0);
+    std::fill_n(gradient, n * L, 0.0);
     auto incoming = [&](int64_t s, int64_t row, int64_t channel) {
       return call.out.get((s * rows + row) * m.size + channel);
     };
@@ -212,15 +233,20 @@ void run_tiles(const Maths& m, const Network<T>& network, const Call& call, bool
     constexpr int L = W * C;
     const int64_t most = std::max(m.forward.registers, adjoint ? m.adjoint.registers : 0) + m.varying_count;
     const bool again = adjoint && !call.stored;
-    Aligned registers(sizeof(double) * L * most), more(again ? sizeof(double) * L * most : 0);
-    Aligned ws(sizeof(T) * network.workspace(call.tile, adjoint));
-    Aligned derivatives(again ? sizeof(T) * network.stored() * call.tile : 0);
-    std::memset(registers.data, 0, sizeof(double) * L * most);
+    const size_t registers = L * most, ws = network.workspace(call.tile, adjoint);
+    const size_t derivatives = again ? network.stored() * call.tile : 0, gradient = adjoint ? L * m.varying_count : 0;
+    static thread_local Arena arena;
+    arena.reserve((again ? 2 : 1) * Arena::padded(sizeof(double) * registers) + Arena::padded(sizeof(T) * ws) +
+                  Arena::padded(sizeof(T) * derivatives) + Arena::padded(sizeof(double) * gradient));
+    double* const r = arena.take<double>(registers);
+    double* const more = again ? arena.take<double>(registers) : nullptr;
+    T* const scratch = arena.take<T>(ws);
+    T* const kept = arena.take<T>(derivatives);
+    double* const sums = arena.take<double>(gradient);
     for (int64_t tile; (tile = next++) < tiles;) {
       const int64_t first = tile * call.tile, count = std::min(call.tile, call.batch - first);
-      Runner<T, W, C> runner{m, network, call, first, static_cast<int>(count), static_cast<double*>(registers.data),
-                             static_cast<T*>(ws.data)};
-      if (adjoint) runner.adjoint(static_cast<double*>(more.data), static_cast<T*>(derivatives.data));
+      Runner<T, W, C> runner{m, network, call, first, static_cast<int>(count), r, scratch};
+      if (adjoint) runner.adjoint(more, kept, sums);
       else runner.forward();
     }
   };
