@@ -220,7 +220,10 @@ def specialize(
 
 
 class _Watched:
-    """Tensors of modules, and how often each was changed; all in C, as small steps take no longer than a Python loop."""
+    """Tensors of modules, and how often each was changed.
+
+    Read without a Python loop, which would take as long as a step of one state.
+    """
 
     def __init__(self, owners: Sequence[dict[str, Tensor | None]]) -> None:
         found = [(owner, name, one) for owner in owners for name, one in owner.items() if one is not None]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
 from dataclasses import fields
 
 import numpy as np
@@ -23,7 +21,7 @@ from torchrl_gn.networks.snapshot import same
 
 TILE = 24  # samples that stay in a processor's cache from layer to layer
 STORED_BYTES = 2**28  # activations' derivatives are kept for the gradient up to this size, else computed again
-_DTYPES = (torch.float32, torch.float64)
+_DTYPES = {torch.float32: 0, torch.float64: 1}  # as the C++ code tells them apart
 
 
 class _NotTracedError(Exception):
@@ -67,14 +65,18 @@ class NativeExecutor:
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         if self._runs(state, action):
-            with contextlib.suppress(_NotTracedError):
-                return self._rollout(state, action.unsqueeze(-2), False).squeeze(-3), None
+            try:
+                return self._rollout(state, action, False), None
+            except _NotTracedError:
+                pass
         return self.eager.step(state, action, hidden)
 
     def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         if actions.shape[-2] and self._runs(state, actions):
-            with contextlib.suppress(_NotTracedError):
+            try:
                 return self._rollout(state, actions, True), None
+            except _NotTracedError:
+                pass
         return rollout_by_steps(self.eager, state, actions, hidden)
 
     def _runs(self, state: Tensor, action: Tensor) -> bool:
@@ -89,20 +91,26 @@ class NativeExecutor:
             and not torch._C._are_functorch_transforms_active()
         )
 
-    def _rollout(self, state: Tensor, actions: Tensor, with_start: bool) -> Tensor:
-        if torch.is_grad_enabled() and (state.requires_grad or actions.requires_grad):
-            return _Differentiable.apply(self, state, actions, with_start)  # pyright: ignore[reportReturnType]
-        return self.run(state.contiguous(), actions.contiguous(), with_start)
+    def _rollout(self, state: Tensor, actions: Tensor, many: bool) -> Tensor:
+        if (state.requires_grad or actions.requires_grad) and torch.is_grad_enabled():
+            return _Differentiable.apply(self, state, actions, many)  # pyright: ignore[reportReturnType]
+        return self.run(state.contiguous(), actions.contiguous(), many)
 
-    def run(self, state: Tensor, actions: Tensor, with_start: bool, stored: Tensor | None = None) -> Tensor:
-        """States ``[*B, T (+ 1), N, C]`` of contiguous tensors."""
-        *batch, nodes, channels = state.shape
-        count, size, steps, threads = math.prod(batch), nodes * channels, actions.shape[-2], torch.get_num_threads()
-        out = torch.empty((*batch, steps + with_start, nodes, channels), dtype=state.dtype)
+    def run(self, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None) -> Tensor:
+        """The next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``."""
+        shape, threads = state.shape, torch.get_num_threads()
+        size = shape[-2] * shape[-1]
+        count = state.numel() // size
+        if many:
+            steps = actions.shape[-2]
+            out = torch.empty((*shape[:-2], steps + 1, *shape[-2:]), dtype=state.dtype)
+        else:
+            steps, out = 1, torch.empty(shape, dtype=state.dtype)
         call = (
             *(count, steps, _tile(count, threads), threads),
-            *(library.array(state), size, library.array(actions), library.array(out), with_start),
-            *(library.NOTHING, library.NOTHING, None if stored is None else stored.data_ptr()),
+            *((state.data_ptr(), _DTYPES[state.dtype]), size, (actions.data_ptr(), _DTYPES[actions.dtype])),
+            *((out.data_ptr(), _DTYPES[out.dtype]), many, library.NOTHING, library.NOTHING),
+            None if stored is None else stored.data_ptr(),
         )
         network = self.network
         assert network is not None
@@ -130,41 +138,38 @@ class NativeExecutor:
 
 class _Differentiable(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, executor: NativeExecutor, state: Tensor, actions: Tensor, with_start: bool) -> Tensor:
-        ctx.executor, ctx.version, ctx.with_start = executor, executor.version, with_start
-        state, actions = state.detach().contiguous(), actions.detach().contiguous()
-        ctx.threads = torch.get_num_threads()
-        network = executor.network
+    def forward(ctx, executor: NativeExecutor, state: Tensor, actions: Tensor, many: bool) -> Tensor:
+        state, actions, network = state.contiguous(), actions.contiguous(), executor.network
         assert network is not None
-        ctx.stored, numbers = None, actions.shape[:-1].numel() * network.kept
+        steps = actions.shape[-2] if many else 1
+        count = state.shape[:-2].numel()
+        numbers, threads = count * steps * network.kept, torch.get_num_threads()
+        stored = None
         if numbers * network.dtype.itemsize <= STORED_BYTES:
-            ctx.stored = torch.empty(numbers, dtype=network.dtype)
-        out = executor.run(state, actions, with_start, ctx.stored)
-        ctx.save_for_backward(out if with_start else state, actions)
-        ctx.maths = executor.maths
+            stored = torch.empty(numbers, dtype=network.dtype)
+        out = executor.run(state, actions, many, stored)
+        ctx.save_for_backward(out if many else state, actions, stored)
+        ctx.call, ctx.many = (count, steps, _tile(count, threads), threads), many
+        ctx.executor, ctx.version, ctx.maths = executor, executor.version, executor.maths
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        executor, (states, actions) = ctx.executor, ctx.saved_tensors
+        executor, many, (states, actions, stored) = ctx.executor, ctx.many, ctx.saved_tensors
         if ctx.version != executor.version:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
-        size, steps, count = states.shape[-2] * states.shape[-1], actions.shape[-2], actions.shape[:-2].numel()
-        gradient = gradient.contiguous()
-        of_state = gradient.new_empty(*actions.shape[:-2], *states.shape[-2:])
-        of_actions = torch.empty_like(actions)
-        library.rollout_adjoint(
-            executor.network,
-            ctx.maths,
-            (
-                *(count, steps, _tile(count, ctx.threads), ctx.threads),
-                *(library.array(states), size * (steps + 1 if ctx.with_start else 1), library.array(actions)),
-                *(library.array(gradient), int(ctx.with_start)),
-                *(library.array(of_state), library.array(of_actions)),
-                None if ctx.stored is None else ctx.stored.data_ptr(),
-            ),
+        gradient, steps, size = gradient.contiguous(), ctx.call[1], states.shape[-2] * states.shape[-1]
+        shape = (*states.shape[:-3], *states.shape[-2:]) if many else states.shape
+        of_state, of_actions = torch.empty(shape, dtype=states.dtype), torch.empty_like(actions)
+        call = (
+            *ctx.call,
+            *((states.data_ptr(), _DTYPES[states.dtype]), size * (steps + 1 if many else 1)),
+            *((actions.data_ptr(), _DTYPES[actions.dtype]), (gradient.data_ptr(), _DTYPES[gradient.dtype]), many),
+            *((of_state.data_ptr(), _DTYPES[states.dtype]), (of_actions.data_ptr(), _DTYPES[actions.dtype])),
+            None if stored is None else stored.data_ptr(),
         )
+        library.rollout_adjoint(executor.network, ctx.maths, call)
         return None, of_state, of_actions, None
 
 

@@ -188,7 +188,8 @@ def gradient(graph: Expressions, outputs: Sequence[Any], seeds: Sequence[Any], i
         if index in wanted or not depends[index] or index not in found:
             continue
         operation, operands, constant = graph.nodes[index]
-        parts = _PULL[operation](found.pop(index), Scalar(graph, index), constant, *(Scalar(graph, i) for i in operands))
+        pull, arguments = _PULL[operation], (Scalar(graph, each) for each in operands)
+        parts = pull(found.pop(index), Scalar(graph, index), constant, *arguments)
         for operand, part in zip(operands, parts, strict=True):
             if depends[operand] and (isinstance(part, Scalar) or part != 0):
                 add(operand, part)

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
@@ -60,7 +59,7 @@ def load_library() -> ctypes.CDLL:
     if file.exists():
         with contextlib.suppress(OSError, AttributeError):  # damaged: build again
             return _declared(ctypes.CDLL(str(file)))
-    print("Building the native executor for this processor, once: about 20 s.", file=sys.stderr)
+    sys.stderr.write("Building the native executor for this processor, once: about 20 s.\n")
     with atomic_path(file) as temporary:
         source = next(path for path in SOURCES if path.suffix == ".cpp")
         _run([compiler, *options, str(source), "-o", str(temporary)])
@@ -218,11 +217,6 @@ class NativeMaths:
 
 
 NOTHING = (None, 0)  # no array
-
-
-def array(tensor: Tensor) -> tuple[int, int]:
-    """A contiguous tensor as the code reads it."""
-    return tensor.data_ptr(), int(tensor.dtype == torch.float64)
 
 
 def rollout(network: NativeNetwork, maths: NativeMaths, call: tuple) -> bool:

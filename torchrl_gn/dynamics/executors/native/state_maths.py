@@ -1,4 +1,4 @@
-"""The state maths of a step as tapes: from state and action to network inputs, and from its outputs to the next state."""
+"""The state maths of a step as tapes: from state and action to network inputs, from its outputs to the next state."""
 
 from __future__ import annotations
 
