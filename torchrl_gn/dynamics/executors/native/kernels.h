@@ -39,6 +39,43 @@ struct Vector {
   static void store(T* to, type value) { *reinterpret_cast<loose*>(to) = value; }
 };
 
+// Rows to = from, rounded up to whole vectors.
+template <class T>
+void copy_rows(T* to, int64_t to_step, const T* from, int64_t step, int rows, int64_t count) {
+  for (int r = 0; r < rows; r++, to += to_step, from += step)
+    for (int64_t c = 0; c < count; c += kLanes<T>) Vector<T>::store(to + c, Vector<T>::load(from + c));
+}
+
+// Rows to = base + from, rounded up to whole vectors.
+template <class T>
+void add_rows(T* to, int64_t to_step, const T* base, int64_t base_step, const T* from, int64_t step, int rows,
+              int64_t count) {
+  for (int r = 0; r < rows; r++, to += to_step, base += base_step, from += step)
+    for (int64_t c = 0; c < count; c += kLanes<T>)
+      Vector<T>::store(to + c, Vector<T>::load(base + c) + Vector<T>::load(from + c));
+}
+
+// Rows to = from, or to + from; nothing else is written.
+template <class T, bool kAdd>
+void accumulate_rows(T* to, int64_t to_step, const T* from, int64_t step, int rows, int64_t count) {
+  typedef T Short __attribute__((vector_size(16), aligned(sizeof(T)), may_alias));
+  constexpr int L = kLanes<T>, M = 16 / sizeof(T);
+  for (int r = 0; r < rows; r++, to += to_step, from += step) {
+    int64_t c = 0;
+    for (; c + L <= count; c += L) {
+      auto value = Vector<T>::load(from + c);
+      Vector<T>::store(to + c, kAdd ? Vector<T>::load(to + c) + value : value);
+    }
+    for (; c + M <= count; c += M) {
+      Short& out = *reinterpret_cast<Short*>(to + c);
+      const Short& value = *reinterpret_cast<const Short*>(from + c);
+      out = kAdd ? out + value : value;
+    }
+#pragma GCC unroll 1
+    for (; c < count; c++) to[c] = kAdd ? to[c] + from[c] : from[c];
+  }
+}
+
 // out[r][v] = init[r][v] + sum_k x[r][k] w[v][k] for R rows and N panels of columns.
 template <class T>
 using Kernel = void (*)(const T* x, const T* w, int64_t depth, int64_t panel, const T* const* init, int64_t column,
@@ -183,22 +220,30 @@ void activate(Activation activation, T* values, T* slopes, int64_t count) {
     }
     return;
   }
-  for (int64_t i = 0; i < count; i++) {
-    T x = values[i], y = x, slope = T(1);
-    if (activation == kRelu) {
-      y = x < T(0) ? T(0) : x;  // NaN stays
-      slope = x <= T(0) ? T(0) : T(1);
-    } else if (activation == kGelu) {
-      T half = T(0.5) * (T(1) + std::erf(x * T(0.70710678118654752440)));
-      y = x * half;
-      slope = half + x * (T(0.39894228040143267794) * std::exp(T(-0.5) * x * x));
-    } else if (activation == kTanh) {
-      y = std::tanh(x);
-      slope = T(1) - y * y;
+  auto each = [&](auto function) {
+    for (int64_t i = 0; i < count; i++) {
+      T slope = 0;
+      values[i] = function(values[i], slope);
+      if (slopes) slopes[i] = slope;
     }
-    values[i] = y;
-    if (slopes) slopes[i] = slope;
-  }
+  };
+  if (activation == kRelu)
+    each([](T x, T& slope) {
+      slope = x <= T(0) ? T(0) : T(1);
+      return x < T(0) ? T(0) : x;  // NaN stays
+    });
+  else if (activation == kGelu)
+    each([](T x, T& slope) {
+      T half = T(0.5) * (T(1) + std::erf(x * T(0.70710678118654752440)));
+      slope = half + x * (T(0.39894228040143267794) * std::exp(T(-0.5) * x * x));
+      return x * half;
+    });
+  else if (activation == kTanh)
+    each([](T x, T& slope) {
+      T y = std::tanh(x);
+      slope = T(1) - y * y;
+      return y;
+    });
 }
 
 }  // namespace gn

@@ -18,7 +18,8 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
  public:
   // code: see above; weights[i] row-major [out, K] and tables[i] [I, out] or nullptr, of every layer i.
   Network(const int64_t* code, const T* const* weights, const T* const* tables) {
-    buffers_ = {{code[0], code[1]}, {code[2], code[3]}};
+    add_buffer(code[0], code[1]);
+    add_buffer(code[2], code[3]);
     layers_.resize(code[4]);
     code += 5;
     for (Layer& layer : layers_) {
@@ -34,7 +35,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       layer.slopes = stored_;
       if (layer.activation != kNone) stored_ += layer.items * layer.width;
       deepest_ = std::max({deepest_, padded(layer.depth), padded(layer.width)});
-      buffers_.push_back({layer.items, layer.width});
+      add_buffer(layer.items, layer.width);
     }
     plan_gradients();
     update(weights, tables);
@@ -57,7 +58,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
 
   // Numbers of T, to lie at a 64-byte boundary, that a tile of S samples needs.
   size_t workspace(int S, bool gradient) const {
-    return scratch() + (gradient ? 2 : 1) * offset(S, buffers_.size()) + kLanes<T>;
+    return scratch() + (gradient ? 2 : 1) * S * total_ + kLanes<T>;
   }
   // Numbers per sample that backward() needs of forward(): slopes of the activations.
   size_t stored() const { return stored_; }
@@ -106,7 +107,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
   };
   using Block = std::unique_ptr<T[], Free>;
   struct Buffer {
-    int64_t items, width;
+    int64_t items, width, start;  // start: in values of one sample
   };
   struct Gather {
     int64_t source, width, column = 0;
@@ -117,7 +118,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     int64_t items, width, depth = 0, slopes = 0;
     Activation activation;
     std::vector<Gather> inputs, added;
-    bool has_table = false;
+    bool has_table = false, direct = false;  // direct: backward() multiplies into the only input's gradient
     Block forward, backward, table;  // [out / L][in][L], [in / L][out][L], [I or 1][out], padded
   };
 
@@ -137,6 +138,11 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       for (int64_t k = 0; k < depth; k++)
         packed[(c / L * depth + k) * L + c % L] = weight[c * column_step + k * depth_step];
     return packed;
+  }
+
+  void add_buffer(int64_t items, int64_t width) {
+    buffers_.push_back({items, width, total_});
+    total_ += (items * width + 15) / 16 * 16;
   }
 
   void read(const int64_t*& code, int64_t items, Gather& gather) const {
@@ -162,6 +168,9 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
           bool once = static_cast<int64_t>(items.size()) == buffers_[gather.source].items;
           for (size_t j = 0; once && j < items.size(); j++) once = items[j] == static_cast<int64_t>(j);
           (once ? gather.writes : gather.clears) = true;
+          Layer& layer = layers_[i];
+          layer.direct = gather.writes && gathers == &layer.inputs && layer.inputs.size() == 1 && items == gather.items &&
+                         buffers_[gather.source].items == layer.items && padded(layer.depth) == layer.depth;
         }
     for (size_t b = 0; b < buffers_.size(); b++)
       if (!reached[b]) unread_.push_back(b);
@@ -171,13 +180,8 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
   int64_t scratch() const { return kChunk * (kStride + 2 * deepest_); }
   T* results(T* ws) const { return ws + kChunk * kStride; }
   T* sums(T* ws) const { return results(ws) + kChunk * deepest_; }
-  int64_t offset(int S, size_t buffer) const {
-    int64_t total = 0;
-    for (size_t b = 0; b < buffer; b++) total += (buffers_[b].items * buffers_[b].width * S + 15) / 16 * 16;
-    return total;
-  }
-  T* values(T* ws, int S, size_t buffer) const { return ws + scratch() + offset(S, buffer); }
-  T* gradients(T* ws, int S, size_t buffer) const { return values(ws, S, buffer) + offset(S, buffers_.size()); }
+  T* values(T* ws, int S, size_t buffer) const { return ws + scratch() + S * buffers_[buffer].start; }
+  T* gradients(T* ws, int S, size_t buffer) const { return values(ws, S, buffer) + S * total_; }
   void clear(T* ws, int S, size_t buffer) const {
     std::fill_n(gradients(ws, S, buffer), buffers_[buffer].items * buffers_[buffer].width * S, T(0));
   }
@@ -202,23 +206,20 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     }
   }
 
+  const T* rows_of(const Gather& g, int64_t j, T* ws, int S, int sample) const {
+    return values(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
+  }
+
   // Columns [from, to) of gathered rows; up to a vector more is written after each.
   void gather(const Gather& g, T* ws, int S, int64_t start, int rows, int64_t from, int64_t to, T* x) const {
-    using V = Vector<T>;
-    const T* source = values(ws, S, g.source) + from;
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
-      int64_t first = g.offsets[item], last = g.offsets[item + 1];
-      if (first == last)
-        for (int r = row; r < row + now; r++) std::fill_n(x + r * kStride, to - from, T(0));
-      for (int64_t j = first; j < last; j++) {
-        const T* in = source + (g.items[j] * S + sample) * g.width;
-        T* out = x + row * kStride;
-        for (int r = 0; r < now; r++, in += g.width, out += kStride)
-          for (int64_t c = 0; c < to - from; c += kLanes<T>) {
-            auto value = V::load(in + c);
-            V::store(out + c, j == first ? value : V::load(out + c) + value);
-          }
-      }
+      T* out = x + row * kStride;
+      int64_t j = g.offsets[item], last = g.offsets[item + 1];
+      if (j == last) return copy_rows(out, kStride, zeros_.get(), 0, now, to - from);
+      const T* base = rows_of(g, j, ws, S, sample) + from;
+      if (++j == last) return copy_rows(out, kStride, base, g.width, now, to - from);
+      for (int64_t step = g.width; j < last; j++, base = out, step = kStride)
+        add_rows(out, kStride, base, step, rows_of(g, j, ws, S, sample) + from, g.width, now, to - from);
     });
   }
 
@@ -227,17 +228,13 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     int64_t width = padded(layer.width);
     const T* init[kChunk];
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
-      const T* table = layer.table.get() + (layer.has_table ? item * width : 0);
-      for (int r = 0; r < now; r++) {
-        init[row + r] = table;
-        if (layer.added.empty()) continue;
-        T* sum = sums(ws) + (row + r) * width;
-        init[row + r] = sum;
-        std::copy_n(table, width, sum);
-        for (const Gather& g : layer.added)
-          for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++)
-            add(sum, values(ws, S, g.source) + (g.items[j] * S + sample + r) * g.width, g.width);
-      }
+      const T* base = layer.table.get() + (layer.has_table ? item * width : 0);
+      T* sum = sums(ws) + row * width;
+      int64_t step = 0;
+      for (const Gather& g : layer.added)
+        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++, base = sum, step = width)
+          add_rows(sum, width, base, step, rows_of(g, j, ws, S, sample), g.width, now, width);
+      for (int r = 0; r < now; r++, base += step) init[row + r] = base;
     });
     bool direct = width == layer.width;
     T* to = direct ? out : results(ws);
@@ -253,14 +250,10 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     for (int r = 0; r < rows && !direct; r++) std::copy_n(to + r * width, layer.width, out + r * layer.width);
   }
 
-  static void add(T* __restrict to, const T* __restrict from, int64_t count) {
-    for (int64_t c = 0; c < count; c++) to[c] += from[c];
-  }
-
   // Gradients of a chunk's inputs. Rows come in the order of items, for one order of sums whatever the chunks.
   void pull(const Layer& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes) const {
     int64_t width = layer.width, depth = padded(layer.depth);
-    T* results = this->results(ws);
+    T* results = layer.direct ? gradients(ws, S, layer.inputs[0].source) + start * depth : this->results(ws);
     const T* init[kChunk];
     std::fill_n(init, rows, zeros_.get());
     for (int64_t k = 0; k < width; k += kDepth) {
@@ -275,14 +268,13 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     }
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
       for (const Gather& g : layer.inputs)
-        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++) {
+        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1] && !layer.direct; j++) {
           T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
           const T* from = results + row * depth + g.column;
-          for (int r = 0; r < now; r++, to += g.width, from += depth)
-            if (g.writes)
-              std::copy_n(from, g.width, to);
-            else
-              add(to, from, g.width);
+          if (g.writes)
+            accumulate_rows<T, false>(to, g.width, from, depth, now, g.width);
+          else
+            accumulate_rows<T, true>(to, g.width, from, depth, now, g.width);
         }
       for (const Gather& g : layer.added)
         for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++) {
@@ -300,7 +292,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
   std::vector<Layer> layers_;
   std::vector<int64_t> unread_;  // buffers whose gradient is zero
   Block zeros_;
-  int64_t stored_ = 0, deepest_ = 0;
+  int64_t total_ = 0, stored_ = 0, deepest_ = 0;
 };
 
 }  // namespace gn
