@@ -76,29 +76,31 @@ void accumulate_rows(T* to, int64_t to_step, const T* from, int64_t step, int ro
   }
 }
 
-// out[r][v] = init[r][v] + sum_k x[r][k] w[v][k] for R rows and N panels of columns.
+// out[r][column] = init[r][column] + sum_k x[r][k] w[k][column] for R rows and N panels of columns, begun at one.
+// Rows of x and panels of w lie apart as kernels of two kinds know: forward, x is [r][kStride] and w packed
+// [panel][depth][L]; in sums over rows, of gradients of weights, x is [k][kStride] and so is w.
 template <class T>
 using Kernel = void (*)(const T* x, const T* w, int64_t depth, int64_t panel, const T* const* init, int64_t column,
                         T* out, int64_t stride);
 
-template <class T, int R, int N>
+template <class T, bool kOverRows, int R, int N>
 void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64_t panel, const T* const* init,
               int64_t column, T* out, int64_t stride) {
   using V = Vector<T>;
-  constexpr int L = kLanes<T>;
+  constexpr int L = kLanes<T>, row = kOverRows ? 1 : kStride;
   typename V::type sum[R][N];
 #pragma GCC unroll 12
   for (int r = 0; r < R; r++)
 #pragma GCC unroll 8
     for (int v = 0; v < N; v++) sum[r][v] = V::load(init[r] + column + v * L);
-  for (int64_t k = 0; k < depth; k++, w += L, x++) {
+  for (int64_t k = 0; k < depth; k++, w += kOverRows ? kStride : L, x += kOverRows ? kStride : 1) {
     typename V::type weights[N];
 #pragma GCC unroll 8
-    for (int v = 0; v < N; v++) weights[v] = V::load(w + v * panel);
+    for (int v = 0; v < N; v++) weights[v] = V::load(w + v * (kOverRows ? L : panel));
 #pragma GCC unroll 12
     for (int r = 0; r < R; r++) {
 #pragma GCC unroll 8
-      for (int v = 0; v < N; v++) sum[r][v] += x[r * kStride] * weights[v];
+      for (int v = 0; v < N; v++) sum[r][v] += x[r * row] * weights[v];
     }
   }
 #pragma GCC unroll 12
@@ -107,40 +109,36 @@ void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64
     for (int v = 0; v < N; v++) V::store(out + r * stride + column + v * L, sum[r][v]);
 }
 
-template <class T, int N, int... R>
+template <class T, bool kOverRows, int N, int... R>
 Kernel<T> kernel_of_rows(int rows, std::integer_sequence<int, R...>) {
-  static constexpr Kernel<T> kernels[] = {multiply<T, R + 1, N>...};
+  static constexpr Kernel<T> kernels[] = {multiply<T, kOverRows, R + 1, N>...};
   return kernels[rows - 1];
 }
 
-template <class T>
+template <class T, bool kOverRows>
 Kernel<T> kernel(int rows, int panels) {
-  if (panels == 8) return kernel_of_rows<T, 8>(rows, std::make_integer_sequence<int, (kAccumulators + 4) / 8>{});
-  if (panels == 4) return kernel_of_rows<T, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
-  if (panels == 2) return kernel_of_rows<T, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
-  return kernel_of_rows<T, 1>(rows, std::make_integer_sequence<int, kRows>{});
+  if constexpr (!kOverRows) {  // few rows are worth more panels at once: sums that do not wait for each other
+    if (panels == 8) return kernel_of_rows<T, false, 8>(rows, std::make_integer_sequence<int, kAccumulators / 8>{});
+    if (panels == 4) return kernel_of_rows<T, false, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
+  }
+  if (panels == 2) return kernel_of_rows<T, kOverRows, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
+  return kernel_of_rows<T, kOverRows, 1>(rows, std::make_integer_sequence<int, kRows>{});
 }
 
-// Most panels, a power of two, that a kernel of some rows takes at once.
-inline int most_panels(int rows, int64_t panels) {
-  int most = rows <= (kAccumulators + 4) / 8 ? 8 : rows <= kAccumulators / 4 ? 4 : rows <= kAccumulators / 2 ? 2 : 1;
-  while (most > panels) most /= 2;
-  return most;
-}
-
-// out[rows][panels * L] = init + x[rows][depth] @ weights, packed [panels][full depth][L] and begun at some depth.
-template <class T>
-void product(const T* x, const T* weights, int rows, int64_t panels, int64_t depth, int64_t full,
-             const T* const* init, T* out, int64_t stride) {
-  constexpr int L = kLanes<T>;
+// out[rows][panels * L] = init + x @ w, with panels of w some numbers apart.
+template <class T, bool kOverRows = false>
+void product(const T* x, const T* w, int rows, int64_t panels, int64_t depth, int64_t panel, const T* const* init,
+             T* out, int64_t stride) {
   int blocks = (rows + kRows - 1) / kRows, block = (rows + blocks - 1) / blocks;
+  int most = 2;
+  while (!kOverRows && most < 8 && block <= kAccumulators / (2 * most)) most *= 2;
   for (int64_t p = 0; p < panels;) {
-    int taken = most_panels(block, panels - p);
-    for (int r = 0; r < rows; r += block) {
-      int now = rows - r < block ? rows - r : block;
-      kernel<T>(now, taken)(x + r * kStride, weights + p * full * L, depth, full * L, init + r, p * L,
-                            out + r * stride, stride);
-    }
+    int taken = most;
+    while (taken > panels - p) taken /= 2;
+    for (int r = 0; r < rows; r += block)
+      kernel<T, kOverRows>(rows - r < block ? rows - r : block, taken)(
+          x + r * (kOverRows ? 1 : kStride), w + p * panel, depth, panel, init + r, p * kLanes<T>, out + r * stride,
+          stride);
     p += taken;
   }
 }

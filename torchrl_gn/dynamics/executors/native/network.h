@@ -37,6 +37,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       deepest_ = std::max({deepest_, padded(layer.depth), padded(layer.width)});
       add_buffer(layer.items, layer.width);
     }
+    zeros_ = block(deepest_);
     plan_gradients();
     update(weights, tables);
   }
@@ -53,7 +54,6 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       for (int64_t r = 0; r < layer.items && layer.has_table; r++)
         std::copy_n(tables[i] + r * out, out, layer.table.get() + r * padded(out));
     }
-    zeros_ = block(deepest_);
   }
 
   // Numbers of T, to lie at a 64-byte boundary, that a tile of S samples needs.
@@ -92,13 +92,19 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       for (auto* gathers : {&layer.inputs, &layer.added})
         for (const Gather& gather : *gathers)
           if (gather.clears) clear(ws, S, gather.source);
-      const T* grad = gradients(ws, S, i + 2);
-      const T* slopes = layer.activation == kNone ? nullptr : stored + layer.slopes * S;
-      chunks(layer.items * S, [&](int64_t start, int rows) {
-        int64_t from = start * layer.width;
-        pull(layer, ws, S, start, rows, grad + from, slopes ? slopes + from : nullptr);
+      pre_activations(i, ws, S, stored, [&](int64_t start, int rows, const T* grad, const T* slopes) {
+        pull(layer, ws, S, start, rows, grad, slopes);
       });
     }
+  }
+
+  // Adds sums over samples to gradients of weights and, if not nullptr, tables, shaped as these. After forward() and
+  // backward() of the same samples in the same workspace.
+  void weight_gradients(T* ws, int S, const T* stored, T* const* grad_weights, T* const* grad_tables) const {
+    for (size_t i = 0; i < layers_.size(); i++)
+      pre_activations(i, ws, S, stored, [&](int64_t start, int rows, const T* grad, const T* slopes) {
+        add_gradients(layers_[i], ws, S, start, rows, grad, slopes, grad_weights[i], grad_tables[i]);
+      });
   }
 
  private:
@@ -176,9 +182,10 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       if (!reached[b]) unread_.push_back(b);
   }
 
-  // Workspace: left factors of a chunk, its results, its added rows; values of all buffers; their gradients.
-  int64_t scratch() const { return kChunk * (kStride + 2 * deepest_); }
-  T* results(T* ws) const { return ws + kChunk * kStride; }
+  // Workspace: two left factors of a chunk, its results, its added rows; values of all buffers; their gradients.
+  int64_t scratch() const { return kChunk * (2 * kStride + 2 * deepest_); }
+  T* factors(T* ws) const { return ws + kChunk * kStride; }
+  T* results(T* ws) const { return factors(ws) + kChunk * kStride; }
   T* sums(T* ws) const { return results(ws) + kChunk * deepest_; }
   T* values(T* ws, int S, size_t buffer) const { return ws + scratch() + S * buffers_[buffer].start; }
   T* gradients(T* ws, int S, size_t buffer) const { return values(ws, S, buffer) + S * total_; }
@@ -192,6 +199,18 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     int64_t count = (total + kChunk - 1) / kChunk, size = count ? (total + count - 1) / count : 0;
     for (int64_t start = 0; start < total; start += size)
       body(start, static_cast<int>(std::min(size, total - start)));
+  }
+
+  // Calls body(start, rows, gradient, slopes or nullptr) for chunks of a layer's outputs.
+  template <class Body>
+  void pre_activations(size_t i, T* ws, int S, const T* stored, const Body& body) const {
+    const Layer& layer = layers_[i];
+    const T* grad = gradients(ws, S, i + 2);
+    const T* slopes = layer.activation == kNone ? nullptr : stored + layer.slopes * S;
+    chunks(layer.items * S, [&](int64_t start, int rows) {
+      int64_t from = start * layer.width;
+      body(start, rows, grad + from, slopes ? slopes + from : nullptr);
+    });
   }
 
   // Calls body(item, sample, row, rows) for rows of one item; row counts from the chunk's start.
@@ -223,6 +242,14 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     });
   }
 
+  // Columns [begin, end) of a chunk's left factor.
+  void gather(const Layer& layer, T* ws, int S, int64_t start, int rows, int64_t begin, int64_t end) const {
+    for (const Gather& g : layer.inputs) {
+      int64_t from = std::max(begin, g.column), to = std::min(end, g.column + g.width);
+      if (from < to) gather(g, ws, S, start, rows, from - g.column, to - g.column, ws + from - begin);
+    }
+  }
+
   // Pre-activations of a chunk.
   void run(const Layer& layer, T* ws, int S, int64_t start, int rows, T* out) const {
     int64_t width = padded(layer.width);
@@ -240,14 +267,46 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     T* to = direct ? out : results(ws);
     for (int64_t k = 0; k == 0 || k < layer.depth; k += kDepth) {
       int64_t end = std::min<int64_t>(k + kDepth, layer.depth);
-      for (const Gather& g : layer.inputs) {
-        int64_t from = std::max(k, g.column), last = std::min(end, g.column + g.width);
-        if (from < last) gather(g, ws, S, start, rows, from - g.column, last - g.column, ws + from - k);
-      }
-      product(ws, layer.forward.get() + k * kLanes<T>, rows, width / kLanes<T>, end - k, layer.depth, init, to, width);
+      gather(layer, ws, S, start, rows, k, end);
+      product(ws, layer.forward.get() + k * kLanes<T>, rows, width / kLanes<T>, end - k, layer.depth * kLanes<T>, init,
+              to, width);
       for (int r = 0; r < rows; r++) init[r] = to + r * width;
     }
     for (int r = 0; r < rows && !direct; r++) std::copy_n(to + r * width, layer.width, out + r * layer.width);
+  }
+
+  // Gradients of a chunk's pre-activations, some columns.
+  static void multiply_slopes(const T* grad, const T* slopes, int64_t width, int rows, int64_t count, T* x) {
+    for (int r = 0; r < rows; r++, x += kStride)
+      for (int64_t c = 0; c < count; c++) x[c] = slopes ? grad[r * width + c] * slopes[r * width + c] : grad[r * width + c];
+  }
+
+  // Adds a chunk's gradients of weight and table.
+  void add_gradients(const Layer& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes,
+                     T* weight, T* table) const {
+    int64_t width = layer.width, depth = layer.depth;
+    T* dz = factors(ws);
+    for (int64_t o = 0; o < width; o += kDepth) {
+      int64_t count = std::min<int64_t>(kDepth, width - o);
+      multiply_slopes(grad + o, slopes ? slopes + o : nullptr, width, rows, count, dz);
+      runs(S, start, rows, [&](int64_t item, int, int row, int now) {
+        if (table) accumulate_rows<T, true>(table + item * width + o, 0, dz + row * kStride, kStride, now, count);
+      });
+      for (int64_t k = 0; k < depth; k += kDepth) {
+        int64_t columns = std::min<int64_t>(kDepth, depth - k), stride = padded(columns);
+        bool whole = stride == columns;
+        gather(layer, ws, S, start, rows, k, k + columns);
+        for (int64_t p = 0; p < count; p += kChunk) {
+          int outputs = static_cast<int>(std::min<int64_t>(kChunk, count - p));
+          T* to = weight + (o + p) * depth + k;
+          const T* init[kChunk];
+          for (int r = 0; r < outputs; r++) init[r] = whole ? to + r * depth : zeros_.get();
+          product<T, true>(dz + p, ws, outputs, stride / kLanes<T>, rows, kLanes<T>, init, whole ? to : results(ws),
+                           whole ? depth : stride);
+          if (!whole) accumulate_rows<T, true>(to, depth, results(ws), stride, outputs, columns);
+        }
+      }
+    }
   }
 
   // Gradients of a chunk's inputs. Rows come in the order of items, for one order of sums whatever the chunks.
@@ -258,12 +317,9 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     std::fill_n(init, rows, zeros_.get());
     for (int64_t k = 0; k < width; k += kDepth) {
       int64_t count = std::min<int64_t>(kDepth, width - k);
-      for (int r = 0; r < rows; r++)
-        for (int64_t c = 0; c < count; c++) {
-          int64_t at = r * width + k + c;
-          ws[r * kStride + c] = slopes ? grad[at] * slopes[at] : grad[at];
-        }
-      product(ws, layer.backward.get() + k * kLanes<T>, rows, depth / kLanes<T>, count, width, init, results, depth);
+      multiply_slopes(grad + k, slopes ? slopes + k : nullptr, width, rows, count, ws);
+      product(ws, layer.backward.get() + k * kLanes<T>, rows, depth / kLanes<T>, count, width * kLanes<T>, init,
+              results, depth);
       for (int r = 0; r < rows; r++) init[r] = results + r * depth;
     }
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
