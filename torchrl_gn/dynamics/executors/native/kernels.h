@@ -10,7 +10,7 @@
 #include <type_traits>
 #include <utility>
 
-namespace gn {
+namespace gn __attribute__((visibility("hidden"))) {  // libraries built for other processors may be loaded beside
 
 #if defined(__AVX512F__)
 constexpr int kVectorBytes = 64, kAccumulators = 24, kRows = 12;

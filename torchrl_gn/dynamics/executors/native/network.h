@@ -11,7 +11,7 @@
 
 #include "kernels.h"
 
-namespace gn {
+namespace gn __attribute__((visibility("hidden"))) {
 
 template <class T>
 class Network {  // T: float or double. Methods touch only ws and stored: several threads may run one network.
@@ -175,8 +175,9 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
           for (size_t j = 0; once && j < items.size(); j++) once = items[j] == static_cast<int64_t>(j);
           (once ? gather.writes : gather.clears) = true;
           Layer& layer = layers_[i];
-          layer.direct = gather.writes && gathers == &layer.inputs && layer.inputs.size() == 1 && items == gather.items &&
-                         buffers_[gather.source].items == layer.items && padded(layer.depth) == layer.depth;
+          bool only = gathers == &layer.inputs && layer.inputs.size() == 1;
+          layer.direct = gather.writes && only && items == gather.items && padded(layer.depth) == layer.depth &&
+                         buffers_[gather.source].items == layer.items;
         }
     for (size_t b = 0; b < buffers_.size(); b++)
       if (!reached[b]) unread_.push_back(b);
@@ -277,8 +278,8 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
 
   // Gradients of a chunk's pre-activations, some columns.
   static void multiply_slopes(const T* grad, const T* slopes, int64_t width, int rows, int64_t count, T* x) {
-    for (int r = 0; r < rows; r++, x += kStride)
-      for (int64_t c = 0; c < count; c++) x[c] = slopes ? grad[r * width + c] * slopes[r * width + c] : grad[r * width + c];
+    for (int r = 0; r < rows; r++, x += kStride, grad += width)
+      for (int64_t c = 0; c < count; c++) x[c] = slopes ? grad[c] * slopes[r * width + c] : grad[c];
   }
 
   // Adds a chunk's gradients of weight and table.
