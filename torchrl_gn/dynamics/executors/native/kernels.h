@@ -10,7 +10,7 @@
 #include <type_traits>
 #include <utility>
 
-namespace gn {
+namespace gn __attribute__((visibility("hidden"))) {  // libraries built for other processors may be loaded beside
 
 #if defined(__AVX512F__)
 constexpr int kVectorBytes = 64, kAccumulators = 24, kRows = 12;
@@ -39,29 +39,68 @@ struct Vector {
   static void store(T* to, type value) { *reinterpret_cast<loose*>(to) = value; }
 };
 
-// out[r][v] = init[r][v] + sum_k x[r][k] w[v][k] for R rows and N panels of columns.
+// Rows to = from, rounded up to whole vectors.
+template <class T>
+void copy_rows(T* to, int64_t to_step, const T* from, int64_t step, int rows, int64_t count) {
+  for (int r = 0; r < rows; r++, to += to_step, from += step)
+    for (int64_t c = 0; c < count; c += kLanes<T>) Vector<T>::store(to + c, Vector<T>::load(from + c));
+}
+
+// Rows to = base + from, rounded up to whole vectors.
+template <class T>
+void add_rows(T* to, int64_t to_step, const T* base, int64_t base_step, const T* from, int64_t step, int rows,
+              int64_t count) {
+  for (int r = 0; r < rows; r++, to += to_step, base += base_step, from += step)
+    for (int64_t c = 0; c < count; c += kLanes<T>)
+      Vector<T>::store(to + c, Vector<T>::load(base + c) + Vector<T>::load(from + c));
+}
+
+// Rows to = from, or to + from; nothing else is written.
+template <class T, bool kAdd>
+void accumulate_rows(T* to, int64_t to_step, const T* from, int64_t step, int rows, int64_t count) {
+  typedef T Short __attribute__((vector_size(16), aligned(sizeof(T)), may_alias));
+  constexpr int L = kLanes<T>, M = 16 / sizeof(T);
+  for (int r = 0; r < rows; r++, to += to_step, from += step) {
+    int64_t c = 0;
+    for (; c + L <= count; c += L) {
+      auto value = Vector<T>::load(from + c);
+      Vector<T>::store(to + c, kAdd ? Vector<T>::load(to + c) + value : value);
+    }
+    for (; c + M <= count; c += M) {
+      Short& out = *reinterpret_cast<Short*>(to + c);
+      const Short& value = *reinterpret_cast<const Short*>(from + c);
+      out = kAdd ? out + value : value;
+    }
+#pragma GCC unroll 1
+    for (; c < count; c++) to[c] = kAdd ? to[c] + from[c] : from[c];
+  }
+}
+
+// out[r][column] = init[r][column] + sum_k x[r][k] w[k][column] for R rows and N panels of columns, begun at one.
+// Rows of x and panels of w lie apart as kernels of two kinds know: forward, x is [r][kStride] and w packed
+// [panel][depth][L]; in sums over rows, of gradients of weights, x is [k][kStride] and so is w.
 template <class T>
 using Kernel = void (*)(const T* x, const T* w, int64_t depth, int64_t panel, const T* const* init, int64_t column,
                         T* out, int64_t stride);
 
-template <class T, int R, int N>
+template <class T, bool kOverRows, int R, int N>
 void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64_t panel, const T* const* init,
               int64_t column, T* out, int64_t stride) {
   using V = Vector<T>;
-  constexpr int L = kLanes<T>;
+  constexpr int L = kLanes<T>, row = kOverRows ? 1 : kStride;
   typename V::type sum[R][N];
 #pragma GCC unroll 12
   for (int r = 0; r < R; r++)
 #pragma GCC unroll 8
     for (int v = 0; v < N; v++) sum[r][v] = V::load(init[r] + column + v * L);
-  for (int64_t k = 0; k < depth; k++, w += L, x++) {
+  for (int64_t k = 0; k < depth; k++, w += kOverRows ? kStride : L, x += kOverRows ? kStride : 1) {
     typename V::type weights[N];
 #pragma GCC unroll 8
-    for (int v = 0; v < N; v++) weights[v] = V::load(w + v * panel);
+    for (int v = 0; v < N; v++) weights[v] = V::load(w + v * (kOverRows ? L : panel));
 #pragma GCC unroll 12
     for (int r = 0; r < R; r++) {
 #pragma GCC unroll 8
-      for (int v = 0; v < N; v++) sum[r][v] += x[r * kStride] * weights[v];
+      for (int v = 0; v < N; v++) sum[r][v] += x[r * row] * weights[v];
     }
   }
 #pragma GCC unroll 12
@@ -70,40 +109,36 @@ void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64
     for (int v = 0; v < N; v++) V::store(out + r * stride + column + v * L, sum[r][v]);
 }
 
-template <class T, int N, int... R>
+template <class T, bool kOverRows, int N, int... R>
 Kernel<T> kernel_of_rows(int rows, std::integer_sequence<int, R...>) {
-  static constexpr Kernel<T> kernels[] = {multiply<T, R + 1, N>...};
+  static constexpr Kernel<T> kernels[] = {multiply<T, kOverRows, R + 1, N>...};
   return kernels[rows - 1];
 }
 
-template <class T>
+template <class T, bool kOverRows>
 Kernel<T> kernel(int rows, int panels) {
-  if (panels == 8) return kernel_of_rows<T, 8>(rows, std::make_integer_sequence<int, (kAccumulators + 4) / 8>{});
-  if (panels == 4) return kernel_of_rows<T, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
-  if (panels == 2) return kernel_of_rows<T, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
-  return kernel_of_rows<T, 1>(rows, std::make_integer_sequence<int, kRows>{});
+  if constexpr (!kOverRows) {  // few rows are worth more panels at once: sums that do not wait for each other
+    if (panels == 8) return kernel_of_rows<T, false, 8>(rows, std::make_integer_sequence<int, kAccumulators / 8>{});
+    if (panels == 4) return kernel_of_rows<T, false, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
+  }
+  if (panels == 2) return kernel_of_rows<T, kOverRows, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
+  return kernel_of_rows<T, kOverRows, 1>(rows, std::make_integer_sequence<int, kRows>{});
 }
 
-// Most panels, a power of two, that a kernel of some rows takes at once.
-inline int most_panels(int rows, int64_t panels) {
-  int most = rows <= (kAccumulators + 4) / 8 ? 8 : rows <= kAccumulators / 4 ? 4 : rows <= kAccumulators / 2 ? 2 : 1;
-  while (most > panels) most /= 2;
-  return most;
-}
-
-// out[rows][panels * L] = init + x[rows][depth] @ weights, packed [panels][full depth][L] and begun at some depth.
-template <class T>
-void product(const T* x, const T* weights, int rows, int64_t panels, int64_t depth, int64_t full,
-             const T* const* init, T* out, int64_t stride) {
-  constexpr int L = kLanes<T>;
+// out[rows][panels * L] = init + x @ w, with panels of w some numbers apart.
+template <class T, bool kOverRows = false>
+void product(const T* x, const T* w, int rows, int64_t panels, int64_t depth, int64_t panel, const T* const* init,
+             T* out, int64_t stride) {
   int blocks = (rows + kRows - 1) / kRows, block = (rows + blocks - 1) / blocks;
+  int most = 2;
+  while (!kOverRows && most < 8 && block <= kAccumulators / (2 * most)) most *= 2;
   for (int64_t p = 0; p < panels;) {
-    int taken = most_panels(block, panels - p);
-    for (int r = 0; r < rows; r += block) {
-      int now = rows - r < block ? rows - r : block;
-      kernel<T>(now, taken)(x + r * kStride, weights + p * full * L, depth, full * L, init + r, p * L,
-                            out + r * stride, stride);
-    }
+    int taken = most;
+    while (taken > panels - p) taken /= 2;
+    for (int r = 0; r < rows; r += block)
+      kernel<T, kOverRows>(rows - r < block ? rows - r : block, taken)(
+          x + r * (kOverRows ? 1 : kStride), w + p * panel, depth, panel, init + r, p * kLanes<T>, out + r * stride,
+          stride);
     p += taken;
   }
 }
@@ -183,22 +218,30 @@ void activate(Activation activation, T* values, T* slopes, int64_t count) {
     }
     return;
   }
-  for (int64_t i = 0; i < count; i++) {
-    T x = values[i], y = x, slope = T(1);
-    if (activation == kRelu) {
-      y = x < T(0) ? T(0) : x;  // NaN stays
-      slope = x <= T(0) ? T(0) : T(1);
-    } else if (activation == kGelu) {
-      T half = T(0.5) * (T(1) + std::erf(x * T(0.70710678118654752440)));
-      y = x * half;
-      slope = half + x * (T(0.39894228040143267794) * std::exp(T(-0.5) * x * x));
-    } else if (activation == kTanh) {
-      y = std::tanh(x);
-      slope = T(1) - y * y;
+  auto each = [&](auto function) {
+    for (int64_t i = 0; i < count; i++) {
+      T slope = 0;
+      values[i] = function(values[i], slope);
+      if (slopes) slopes[i] = slope;
     }
-    values[i] = y;
-    if (slopes) slopes[i] = slope;
-  }
+  };
+  if (activation == kRelu)
+    each([](T x, T& slope) {
+      slope = x <= T(0) ? T(0) : T(1);
+      return x < T(0) ? T(0) : x;  // NaN stays
+    });
+  else if (activation == kGelu)
+    each([](T x, T& slope) {
+      T half = T(0.5) * (T(1) + std::erf(x * T(0.70710678118654752440)));
+      slope = half + x * (T(0.39894228040143267794) * std::exp(T(-0.5) * x * x));
+      return x * half;
+    });
+  else if (activation == kTanh)
+    each([](T x, T& slope) {
+      T y = std::tanh(x);
+      slope = T(1) - y * y;
+      return y;
+    });
 }
 
 }  // namespace gn

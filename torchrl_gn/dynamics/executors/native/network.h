@@ -11,14 +11,15 @@
 
 #include "kernels.h"
 
-namespace gn {
+namespace gn __attribute__((visibility("hidden"))) {
 
 template <class T>
 class Network {  // T: float or double. Methods touch only ws and stored: several threads may run one network.
  public:
   // code: see above; weights[i] row-major [out, K] and tables[i] [I, out] or nullptr, of every layer i.
   Network(const int64_t* code, const T* const* weights, const T* const* tables) {
-    buffers_ = {{code[0], code[1]}, {code[2], code[3]}};
+    add_buffer(code[0], code[1]);
+    add_buffer(code[2], code[3]);
     layers_.resize(code[4]);
     code += 5;
     for (Layer& layer : layers_) {
@@ -34,8 +35,9 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       layer.slopes = stored_;
       if (layer.activation != kNone) stored_ += layer.items * layer.width;
       deepest_ = std::max({deepest_, padded(layer.depth), padded(layer.width)});
-      buffers_.push_back({layer.items, layer.width});
+      add_buffer(layer.items, layer.width);
     }
+    zeros_ = block(deepest_);
     plan_gradients();
     update(weights, tables);
   }
@@ -52,12 +54,11 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       for (int64_t r = 0; r < layer.items && layer.has_table; r++)
         std::copy_n(tables[i] + r * out, out, layer.table.get() + r * padded(out));
     }
-    zeros_ = block(deepest_);
   }
 
   // Numbers of T, to lie at a 64-byte boundary, that a tile of S samples needs.
   size_t workspace(int S, bool gradient) const {
-    return scratch() + (gradient ? 2 : 1) * offset(S, buffers_.size()) + kLanes<T>;
+    return scratch() + (gradient ? 2 : 1) * S * total_ + kLanes<T>;
   }
   // Numbers per sample that backward() needs of forward(): slopes of the activations.
   size_t stored() const { return stored_; }
@@ -91,13 +92,19 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       for (auto* gathers : {&layer.inputs, &layer.added})
         for (const Gather& gather : *gathers)
           if (gather.clears) clear(ws, S, gather.source);
-      const T* grad = gradients(ws, S, i + 2);
-      const T* slopes = layer.activation == kNone ? nullptr : stored + layer.slopes * S;
-      chunks(layer.items * S, [&](int64_t start, int rows) {
-        int64_t from = start * layer.width;
-        pull(layer, ws, S, start, rows, grad + from, slopes ? slopes + from : nullptr);
+      pre_activations(i, ws, S, stored, [&](int64_t start, int rows, const T* grad, const T* slopes) {
+        pull(layer, ws, S, start, rows, grad, slopes);
       });
     }
+  }
+
+  // Adds sums over samples to gradients of weights and, if not nullptr, tables, shaped as these. After forward() and
+  // backward() of the same samples in the same workspace.
+  void weight_gradients(T* ws, int S, const T* stored, T* const* grad_weights, T* const* grad_tables) const {
+    for (size_t i = 0; i < layers_.size(); i++)
+      pre_activations(i, ws, S, stored, [&](int64_t start, int rows, const T* grad, const T* slopes) {
+        add_gradients(layers_[i], ws, S, start, rows, grad, slopes, grad_weights[i], grad_tables[i]);
+      });
   }
 
  private:
@@ -106,7 +113,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
   };
   using Block = std::unique_ptr<T[], Free>;
   struct Buffer {
-    int64_t items, width;
+    int64_t items, width, start;  // start: in values of one sample
   };
   struct Gather {
     int64_t source, width, column = 0;
@@ -117,7 +124,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     int64_t items, width, depth = 0, slopes = 0;
     Activation activation;
     std::vector<Gather> inputs, added;
-    bool has_table = false;
+    bool has_table = false, direct = false;  // direct: backward() multiplies into the only input's gradient
     Block forward, backward, table;  // [out / L][in][L], [in / L][out][L], [I or 1][out], padded
   };
 
@@ -137,6 +144,11 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       for (int64_t k = 0; k < depth; k++)
         packed[(c / L * depth + k) * L + c % L] = weight[c * column_step + k * depth_step];
     return packed;
+  }
+
+  void add_buffer(int64_t items, int64_t width) {
+    buffers_.push_back({items, width, total_});
+    total_ += (items * width + 15) / 16 * 16;
   }
 
   void read(const int64_t*& code, int64_t items, Gather& gather) const {
@@ -162,22 +174,22 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
           bool once = static_cast<int64_t>(items.size()) == buffers_[gather.source].items;
           for (size_t j = 0; once && j < items.size(); j++) once = items[j] == static_cast<int64_t>(j);
           (once ? gather.writes : gather.clears) = true;
+          Layer& layer = layers_[i];
+          bool only = gathers == &layer.inputs && layer.inputs.size() == 1;
+          layer.direct = gather.writes && only && items == gather.items && padded(layer.depth) == layer.depth &&
+                         buffers_[gather.source].items == layer.items;
         }
     for (size_t b = 0; b < buffers_.size(); b++)
       if (!reached[b]) unread_.push_back(b);
   }
 
-  // Workspace: left factors of a chunk, its results, its added rows; values of all buffers; their gradients.
-  int64_t scratch() const { return kChunk * (kStride + 2 * deepest_); }
-  T* results(T* ws) const { return ws + kChunk * kStride; }
+  // Workspace: two left factors of a chunk, its results, its added rows; values of all buffers; their gradients.
+  int64_t scratch() const { return kChunk * (2 * kStride + 2 * deepest_); }
+  T* factors(T* ws) const { return ws + kChunk * kStride; }
+  T* results(T* ws) const { return factors(ws) + kChunk * kStride; }
   T* sums(T* ws) const { return results(ws) + kChunk * deepest_; }
-  int64_t offset(int S, size_t buffer) const {
-    int64_t total = 0;
-    for (size_t b = 0; b < buffer; b++) total += (buffers_[b].items * buffers_[b].width * S + 15) / 16 * 16;
-    return total;
-  }
-  T* values(T* ws, int S, size_t buffer) const { return ws + scratch() + offset(S, buffer); }
-  T* gradients(T* ws, int S, size_t buffer) const { return values(ws, S, buffer) + offset(S, buffers_.size()); }
+  T* values(T* ws, int S, size_t buffer) const { return ws + scratch() + S * buffers_[buffer].start; }
+  T* gradients(T* ws, int S, size_t buffer) const { return values(ws, S, buffer) + S * total_; }
   void clear(T* ws, int S, size_t buffer) const {
     std::fill_n(gradients(ws, S, buffer), buffers_[buffer].items * buffers_[buffer].width * S, T(0));
   }
@@ -188,6 +200,18 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     int64_t count = (total + kChunk - 1) / kChunk, size = count ? (total + count - 1) / count : 0;
     for (int64_t start = 0; start < total; start += size)
       body(start, static_cast<int>(std::min(size, total - start)));
+  }
+
+  // Calls body(start, rows, gradient, slopes or nullptr) for chunks of a layer's outputs.
+  template <class Body>
+  void pre_activations(size_t i, T* ws, int S, const T* stored, const Body& body) const {
+    const Layer& layer = layers_[i];
+    const T* grad = gradients(ws, S, i + 2);
+    const T* slopes = layer.activation == kNone ? nullptr : stored + layer.slopes * S;
+    chunks(layer.items * S, [&](int64_t start, int rows) {
+      int64_t from = start * layer.width;
+      body(start, rows, grad + from, slopes ? slopes + from : nullptr);
+    });
   }
 
   // Calls body(item, sample, row, rows) for rows of one item; row counts from the chunk's start.
@@ -202,24 +226,29 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     }
   }
 
+  const T* rows_of(const Gather& g, int64_t j, T* ws, int S, int sample) const {
+    return values(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
+  }
+
   // Columns [from, to) of gathered rows; up to a vector more is written after each.
   void gather(const Gather& g, T* ws, int S, int64_t start, int rows, int64_t from, int64_t to, T* x) const {
-    using V = Vector<T>;
-    const T* source = values(ws, S, g.source) + from;
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
-      int64_t first = g.offsets[item], last = g.offsets[item + 1];
-      if (first == last)
-        for (int r = row; r < row + now; r++) std::fill_n(x + r * kStride, to - from, T(0));
-      for (int64_t j = first; j < last; j++) {
-        const T* in = source + (g.items[j] * S + sample) * g.width;
-        T* out = x + row * kStride;
-        for (int r = 0; r < now; r++, in += g.width, out += kStride)
-          for (int64_t c = 0; c < to - from; c += kLanes<T>) {
-            auto value = V::load(in + c);
-            V::store(out + c, j == first ? value : V::load(out + c) + value);
-          }
-      }
+      T* out = x + row * kStride;
+      int64_t j = g.offsets[item], last = g.offsets[item + 1];
+      if (j == last) return copy_rows(out, kStride, zeros_.get(), 0, now, to - from);
+      const T* base = rows_of(g, j, ws, S, sample) + from;
+      if (++j == last) return copy_rows(out, kStride, base, g.width, now, to - from);
+      for (int64_t step = g.width; j < last; j++, base = out, step = kStride)
+        add_rows(out, kStride, base, step, rows_of(g, j, ws, S, sample) + from, g.width, now, to - from);
     });
+  }
+
+  // Columns [begin, end) of a chunk's left factor.
+  void gather(const Layer& layer, T* ws, int S, int64_t start, int rows, int64_t begin, int64_t end) const {
+    for (const Gather& g : layer.inputs) {
+      int64_t from = std::max(begin, g.column), to = std::min(end, g.column + g.width);
+      if (from < to) gather(g, ws, S, start, rows, from - g.column, to - g.column, ws + from - begin);
+    }
   }
 
   // Pre-activations of a chunk.
@@ -227,62 +256,82 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     int64_t width = padded(layer.width);
     const T* init[kChunk];
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
-      const T* table = layer.table.get() + (layer.has_table ? item * width : 0);
-      for (int r = 0; r < now; r++) {
-        init[row + r] = table;
-        if (layer.added.empty()) continue;
-        T* sum = sums(ws) + (row + r) * width;
-        init[row + r] = sum;
-        std::copy_n(table, width, sum);
-        for (const Gather& g : layer.added)
-          for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++)
-            add(sum, values(ws, S, g.source) + (g.items[j] * S + sample + r) * g.width, g.width);
-      }
+      const T* base = layer.table.get() + (layer.has_table ? item * width : 0);
+      T* sum = sums(ws) + row * width;
+      int64_t step = 0;
+      for (const Gather& g : layer.added)
+        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++, base = sum, step = width)
+          add_rows(sum, width, base, step, rows_of(g, j, ws, S, sample), g.width, now, width);
+      for (int r = 0; r < now; r++, base += step) init[row + r] = base;
     });
     bool direct = width == layer.width;
     T* to = direct ? out : results(ws);
     for (int64_t k = 0; k == 0 || k < layer.depth; k += kDepth) {
       int64_t end = std::min<int64_t>(k + kDepth, layer.depth);
-      for (const Gather& g : layer.inputs) {
-        int64_t from = std::max(k, g.column), last = std::min(end, g.column + g.width);
-        if (from < last) gather(g, ws, S, start, rows, from - g.column, last - g.column, ws + from - k);
-      }
-      product(ws, layer.forward.get() + k * kLanes<T>, rows, width / kLanes<T>, end - k, layer.depth, init, to, width);
+      gather(layer, ws, S, start, rows, k, end);
+      product(ws, layer.forward.get() + k * kLanes<T>, rows, width / kLanes<T>, end - k, layer.depth * kLanes<T>, init,
+              to, width);
       for (int r = 0; r < rows; r++) init[r] = to + r * width;
     }
     for (int r = 0; r < rows && !direct; r++) std::copy_n(to + r * width, layer.width, out + r * layer.width);
   }
 
-  static void add(T* __restrict to, const T* __restrict from, int64_t count) {
-    for (int64_t c = 0; c < count; c++) to[c] += from[c];
+  // Gradients of a chunk's pre-activations, some columns.
+  static void multiply_slopes(const T* grad, const T* slopes, int64_t width, int rows, int64_t count, T* x) {
+    for (int r = 0; r < rows; r++, x += kStride, grad += width)
+      for (int64_t c = 0; c < count; c++) x[c] = slopes ? grad[c] * slopes[r * width + c] : grad[c];
+  }
+
+  // Adds a chunk's gradients of weight and table.
+  void add_gradients(const Layer& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes,
+                     T* weight, T* table) const {
+    int64_t width = layer.width, depth = layer.depth;
+    T* dz = factors(ws);
+    for (int64_t o = 0; o < width; o += kDepth) {
+      int64_t count = std::min<int64_t>(kDepth, width - o);
+      multiply_slopes(grad + o, slopes ? slopes + o : nullptr, width, rows, count, dz);
+      runs(S, start, rows, [&](int64_t item, int, int row, int now) {
+        if (table) accumulate_rows<T, true>(table + item * width + o, 0, dz + row * kStride, kStride, now, count);
+      });
+      for (int64_t k = 0; k < depth; k += kDepth) {
+        int64_t columns = std::min<int64_t>(kDepth, depth - k), stride = padded(columns);
+        bool whole = stride == columns;
+        gather(layer, ws, S, start, rows, k, k + columns);
+        for (int64_t p = 0; p < count; p += kChunk) {
+          int outputs = static_cast<int>(std::min<int64_t>(kChunk, count - p));
+          T* to = weight + (o + p) * depth + k;
+          const T* init[kChunk];
+          for (int r = 0; r < outputs; r++) init[r] = whole ? to + r * depth : zeros_.get();
+          product<T, true>(dz + p, ws, outputs, stride / kLanes<T>, rows, kLanes<T>, init, whole ? to : results(ws),
+                           whole ? depth : stride);
+          if (!whole) accumulate_rows<T, true>(to, depth, results(ws), stride, outputs, columns);
+        }
+      }
+    }
   }
 
   // Gradients of a chunk's inputs. Rows come in the order of items, for one order of sums whatever the chunks.
   void pull(const Layer& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes) const {
     int64_t width = layer.width, depth = padded(layer.depth);
-    T* results = this->results(ws);
+    T* results = layer.direct ? gradients(ws, S, layer.inputs[0].source) + start * depth : this->results(ws);
     const T* init[kChunk];
     std::fill_n(init, rows, zeros_.get());
     for (int64_t k = 0; k < width; k += kDepth) {
       int64_t count = std::min<int64_t>(kDepth, width - k);
-      for (int r = 0; r < rows; r++)
-        for (int64_t c = 0; c < count; c++) {
-          int64_t at = r * width + k + c;
-          ws[r * kStride + c] = slopes ? grad[at] * slopes[at] : grad[at];
-        }
-      product(ws, layer.backward.get() + k * kLanes<T>, rows, depth / kLanes<T>, count, width, init, results, depth);
+      multiply_slopes(grad + k, slopes ? slopes + k : nullptr, width, rows, count, ws);
+      product(ws, layer.backward.get() + k * kLanes<T>, rows, depth / kLanes<T>, count, width * kLanes<T>, init,
+              results, depth);
       for (int r = 0; r < rows; r++) init[r] = results + r * depth;
     }
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
       for (const Gather& g : layer.inputs)
-        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++) {
+        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1] && !layer.direct; j++) {
           T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
           const T* from = results + row * depth + g.column;
-          for (int r = 0; r < now; r++, to += g.width, from += depth)
-            if (g.writes)
-              std::copy_n(from, g.width, to);
-            else
-              add(to, from, g.width);
+          if (g.writes)
+            accumulate_rows<T, false>(to, g.width, from, depth, now, g.width);
+          else
+            accumulate_rows<T, true>(to, g.width, from, depth, now, g.width);
         }
       for (const Gather& g : layer.added)
         for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++) {
@@ -300,7 +349,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
   std::vector<Layer> layers_;
   std::vector<int64_t> unread_;  // buffers whose gradient is zero
   Block zeros_;
-  int64_t stored_ = 0, deepest_ = 0;
+  int64_t total_ = 0, stored_ = 0, deepest_ = 0;
 };
 
 }  // namespace gn
