@@ -26,7 +26,7 @@ from torchrl_gn.networks.layers import LayerList
 from torchrl_gn.processor import processor_name
 
 SOURCES = sorted(path for path in Path(__file__).parent.iterdir() if path.suffix in (".h", ".cpp"))
-_OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-pthread")
+_OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno", "-pthread")
 _P, _I = ctypes.c_void_p, ctypes.c_int64
 
 

@@ -12,14 +12,6 @@ struct Instruction {
   uint32_t k;
 };
 
-// In the order of OPERATIONS in expressions.py.
-enum Operation : uint16_t {
-  CONSTANT, INPUT,
-  ADD_C, SUB_C, MUL_C, DIV_C, SQRT, SIN, COS, ABS, MAX_C, MIN_C, LESS_C, GREATER_C, EQUAL_C,
-  ADD, SUB, MUL, DIV, ATAN2, MAX, MIN, LESS, MADD_C,
-  WHERE, MADD, NMADD,
-};
-
 template <int W>
 struct Lanes {
   typedef double Double __attribute__((vector_size(W * sizeof(double))));
@@ -37,14 +29,17 @@ inline V each_lane(V x, F function) {
   return x;
 }
 
-// sin(x + quarter * pi / 2), to an ulp or two for |x| < 1e5; beyond, by libm.
+template <class V, class F>
+inline V each_pair(V y, V x, F function) {
+  for (unsigned i = 0; i < sizeof(V) / sizeof(double); ++i) y[i] = function(y[i], x[i]);
+  return y;
+}
+
+// sin(x + quarter * pi / 2): to an ulp or two for |x| < 1e5, less and less exact beyond, and within [-1, 1].
 template <int W>
 inline typename Lanes<W>::Double sine(typename Lanes<W>::Double x, int64_t quarter) {
   using V = typename Lanes<W>::Double;
   using I = typename Lanes<W>::Int;
-  for (int i = 0; i < W; ++i)
-    if (!(x[i] < 1e5 && x[i] > -1e5))
-      return each_lane(x, [quarter](double one) { return quarter ? std::cos(one) : std::sin(one); });
   // Adding and subtracting 1.5 * 2^52 rounds to the nearest integer, which then lies in the low bits.
   const V magic = V{} + 6755399441055744.0;
   V shifted = x * 0.63661977236758134308 + magic;
@@ -69,7 +64,9 @@ inline typename Lanes<W>::Double sine(typename Lanes<W>::Double x, int64_t quart
   c = c * z + 4.16666666666665929218e-02;
   c = 1.0 - 0.5 * z + z * z * c;
   V out = select<V>((quadrant & 1) != 0, c, s);
-  return select<V>((quadrant & 2) != 0, -out, out);
+  out = select<V>((quadrant & 2) != 0, -out, out);
+  out = select<V>(out > 1, V{} + 1.0, out);
+  return select<V>(out < -1, V{} - 1.0, out);
 }
 
 struct Tape {
@@ -89,53 +86,57 @@ void run_tape(const Tape& tape, int phase, double* registers) {
   V* const r = reinterpret_cast<V*>(registers);
   const Instruction* at = tape.instructions + (phase ? tape.ends[phase - 1] : 0);
   const Instruction* const end = tape.instructions + tape.ends[phase];
-  for (; at != end; ++at) {
-    V* const out = r + C * at->out;
-    const V* const a = r + C * at->a;
-    const V* const b = r + C * at->b;
-    const V* const c = r + C * at->c;
-    const double k = tape.constants[at->k];
-    const V kk = V{} + k;
-#define EACH(expression)                        \
-  for (int i = 0; i < C; ++i) out[i] = expression; \
-  break
-    switch (at->code) {
-      case CONSTANT: EACH(kk);
-      case INPUT: break;
-      case ADD_C: EACH(a[i] + kk);
-      case SUB_C: EACH(kk - a[i]);
-      case MUL_C: EACH(a[i] * kk);
-      case DIV_C: EACH(kk / a[i]);
-      case SQRT: EACH(each_lane(a[i], [](double x) { return __builtin_sqrt(x); }));
-      case SIN: EACH(sine<W>(a[i], 0));
-      case COS: EACH(sine<W>(a[i], 1));
-      case ABS: EACH(select<V>(a[i] < 0, -a[i], a[i]));
-      case MAX_C: EACH(select<V>(a[i] < kk, kk, a[i]));
-      case MIN_C: EACH(select<V>(a[i] > kk, kk, a[i]));
-      case LESS_C: EACH(select<V>(a[i] < kk, V{} + 1.0, V{}));
-      case GREATER_C: EACH(select<V>(a[i] > kk, V{} + 1.0, V{}));
-      case EQUAL_C: EACH(select<V>(a[i] == kk, V{} + 1.0, V{}));
-      case ADD: EACH(a[i] + b[i]);
-      case SUB: EACH(a[i] - b[i]);
-      case MUL: EACH(a[i] * b[i]);
-      case DIV: EACH(a[i] / b[i]);
-      case ATAN2:
-        for (int i = 0; i < C; ++i) {
-          V y = a[i], x = b[i];
-          for (int lane = 0; lane < W; ++lane) y[lane] = std::atan2(y[lane], x[lane]);
-          out[i] = y;
-        }
-        break;
-      case MAX: EACH(select<V>(a[i] < b[i], b[i], a[i]));
-      case MIN: EACH(select<V>(b[i] < a[i], b[i], a[i]));
-      case LESS: EACH(select<V>(a[i] < b[i], V{} + 1.0, V{}));
-      case MADD_C: EACH(a[i] * kk + b[i]);
-      case WHERE: EACH(select<V>(a[i] != 0, b[i], c[i]));
-      case MADD: EACH(a[i] * b[i] + c[i]);
-      case NMADD: EACH(c[i] - a[i] * b[i]);
-    }
-#undef EACH
+  // In the order of OPERATIONS in expressions.py. A jump at the end of every instruction: the processor learns what follows which.
+  static const void* const labels[] = {
+      &&CONSTANT, &&INPUT, &&ADD_C, &&SUB_C, &&MUL_C, &&DIV_C, &&SQRT, &&SIN, &&COS, &&ABS, &&MAX_C, &&MIN_C, &&LESS_C,
+      &&GREATER_C, &&EQUAL_C, &&ADD, &&SUB, &&MUL, &&DIV, &&ATAN2, &&MAX, &&MIN, &&LESS, &&MADD_C, &&WHERE, &&MADD, &&NMADD,
+  };
+#define NEXT                   \
+  if (at == end) return;       \
+  goto* labels[at->code]
+#define INSTRUCTION(name, expression)                 \
+  name : {                                            \
+    V* const out = r + C * at->out;                   \
+    const V* const a = r + C * at->a;                 \
+    const V* const b = r + C * at->b;                 \
+    const V* const c = r + C * at->c;                 \
+    const V k = V{} + tape.constants[at->k];          \
+    (void)a, (void)b, (void)c, (void)k;               \
+    ++at;                                             \
+    for (int i = 0; i < C; ++i) out[i] = expression;  \
+    NEXT;                                             \
   }
+  const V one = V{} + 1.0, zero = V{};
+  NEXT;
+  INSTRUCTION(CONSTANT, k)
+  INSTRUCTION(INPUT, out[i])
+  INSTRUCTION(ADD_C, a[i] + k)
+  INSTRUCTION(SUB_C, k - a[i])
+  INSTRUCTION(MUL_C, a[i] * k)
+  INSTRUCTION(DIV_C, k / a[i])
+  INSTRUCTION(SQRT, each_lane(a[i], [](double x) { return __builtin_sqrt(x); }))
+  INSTRUCTION(SIN, sine<W>(a[i], 0))
+  INSTRUCTION(COS, sine<W>(a[i], 1))
+  INSTRUCTION(ABS, select<V>(a[i] < 0, -a[i], a[i]))
+  INSTRUCTION(MAX_C, select<V>(a[i] < k, k, a[i]))
+  INSTRUCTION(MIN_C, select<V>(a[i] > k, k, a[i]))
+  INSTRUCTION(LESS_C, select<V>(a[i] < k, one, zero))
+  INSTRUCTION(GREATER_C, select<V>(a[i] > k, one, zero))
+  INSTRUCTION(EQUAL_C, select<V>(a[i] == k, one, zero))
+  INSTRUCTION(ADD, a[i] + b[i])
+  INSTRUCTION(SUB, a[i] - b[i])
+  INSTRUCTION(MUL, a[i] * b[i])
+  INSTRUCTION(DIV, a[i] / b[i])
+  INSTRUCTION(ATAN2, (each_pair(a[i], b[i], [](double y, double x) { return std::atan2(y, x); })))
+  INSTRUCTION(MAX, select<V>(a[i] < b[i], b[i], a[i]))
+  INSTRUCTION(MIN, select<V>(b[i] < a[i], b[i], a[i]))
+  INSTRUCTION(LESS, select<V>(a[i] < b[i], one, zero))
+  INSTRUCTION(MADD_C, a[i] * k + b[i])
+  INSTRUCTION(WHERE, select<V>(a[i] != 0, b[i], c[i]))
+  INSTRUCTION(MADD, a[i] * b[i] + c[i])
+  INSTRUCTION(NMADD, c[i] - a[i] * b[i])
+#undef INSTRUCTION
+#undef NEXT
 }
 
 }  // namespace gn
