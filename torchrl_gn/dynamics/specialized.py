@@ -88,7 +88,7 @@ class SpecializedPredictor(Predictor):
                     self._executor.update(program)
             modules = list(self.model.modules())
             owners: list[dict[str, Tensor | None]] = [module._parameters for module in modules]
-            owners += [module._buffers for module in (*modules, self, self.parameter_reader)]
+            owners += [module._buffers for module in modules]
             self._weights, self._casts = _Watched(owners), self.model.casts
             # Views that share the storage keep it alive: no other tensor can come to lie at its address.
             given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
@@ -227,6 +227,7 @@ class _Watched:
 
     def __init__(self, owners: Sequence[dict[str, Tensor | None]]) -> None:
         found = [(owner, name, one) for owner in owners for name, one in owner.items() if one is not None]
+        found = [each for each in found if each[1] not in _FOLLOWING]
         # PyTorch counts no changes of tensors made in inference mode: they are never the same.
         found = [] if any(one.is_inference() for _, _, one in found) else found
         self.owners, self.names, self.tensors = zip(*found, strict=True) if found else ((), (), ())
@@ -242,6 +243,7 @@ class _Watched:
         )
 
 
+_FOLLOWING = ("count", "m2", "inverse_std")  # statistics that change with a normaliser's mean and deviation
 _STATE = operator.attrgetter("_version", "dtype")
 
 
