@@ -13,8 +13,15 @@
 
 namespace gn __attribute__((visibility("hidden"))) {
 
-template <class T>
-class Network {  // T: float or double. Methods touch only ws and stored: several threads may run one network.
+// T: float or double. kBfloat16: factors of the products are rounded, sums stay float32; for float, if the compiler
+// defines __AVX512BF16__. Methods touch only ws and stored: several threads may run one network.
+template <class T, bool kBfloat16 = false>
+class Network {
+#ifndef __AVX512BF16__
+  static_assert(!kBfloat16, "bfloat16 needs -mavx512bf16");
+#endif
+  static_assert(!kBfloat16 || sizeof(T) == 4, "bfloat16 is summed in float");
+
  public:
   // code: see above; weights[i] row-major [out, K] and tables[i] [I, out] or nullptr, of every layer i.
   Network(const int64_t* code, const T* const* weights, const T* const* tables) {
@@ -130,6 +137,9 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
 
   static int64_t padded(int64_t width) { return (width + kLanes<T> - 1) / kLanes<T> * kLanes<T>; }
 
+  // Numbers of T that hold a row of a product's factors.
+  static int64_t steps(int64_t depth) { return kBfloat16 ? (depth + 1) / 2 : depth; }
+
   static Block block(int64_t count) {
     size_t bytes = (std::max<int64_t>(count, 1) * sizeof(T) + 63) / 64 * 64;
     T* data = static_cast<T*>(std::aligned_alloc(64, bytes));
@@ -139,10 +149,18 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
 
   static Block pack(const T* weight, int64_t columns, int64_t depth, int64_t column_step, int64_t depth_step) {
     constexpr int L = kLanes<T>;
-    Block packed = block(padded(columns) * depth);
+    Block packed = block(padded(columns) * steps(depth));
     for (int64_t c = 0; c < columns; c++)
-      for (int64_t k = 0; k < depth; k++)
-        packed[(c / L * depth + k) * L + c % L] = weight[c * column_step + k * depth_step];
+      for (int64_t k = 0; k < depth; k++) {
+        T value = weight[c * column_step + k * depth_step];
+        T& to = packed[(c / L * steps(depth) + steps(k + 1) - 1) * L + c % L];
+        if constexpr (kBfloat16) {
+          uint16_t half = bfloat16(value);
+          std::memcpy(reinterpret_cast<char*>(&to) + 2 * (k % 2), &half, 2);
+        } else {
+          to = value;
+        }
+      }
     return packed;
   }
 
@@ -251,6 +269,15 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     }
   }
 
+  // Adds the product of a chunk's left factor, columns [k, k + count) of depth, and packed weights to init.
+  static void multiply(const T* packed, T* x, int rows, int64_t k, int64_t count, int64_t depth, int64_t width,
+                       const T* const* init, T* out) {
+    constexpr int L = kLanes<T>;
+    if constexpr (kBfloat16) pair_up(x, rows, count);
+    product<T, kBfloat16 ? kPairs : kPlain>(x, packed + steps(k) * L, rows, width / L, steps(count), steps(depth) * L,
+                                            init, out, width);
+  }
+
   // Pre-activations of a chunk.
   void run(const Layer& layer, T* ws, int S, int64_t start, int rows, T* out) const {
     int64_t width = padded(layer.width);
@@ -269,8 +296,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     for (int64_t k = 0; k == 0 || k < layer.depth; k += kDepth) {
       int64_t end = std::min<int64_t>(k + kDepth, layer.depth);
       gather(layer, ws, S, start, rows, k, end);
-      product(ws, layer.forward.get() + k * kLanes<T>, rows, width / kLanes<T>, end - k, layer.depth * kLanes<T>, init,
-              to, width);
+      multiply(layer.forward.get(), ws, rows, k, end - k, layer.depth, width, init, to);
       for (int r = 0; r < rows; r++) init[r] = to + r * width;
     }
     for (int r = 0; r < rows && !direct; r++) std::copy_n(to + r * width, layer.width, out + r * layer.width);
@@ -302,8 +328,8 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
           T* to = weight + (o + p) * depth + k;
           const T* init[kChunk];
           for (int r = 0; r < outputs; r++) init[r] = whole ? to + r * depth : zeros_.get();
-          product<T, true>(dz + p, ws, outputs, stride / kLanes<T>, rows, kLanes<T>, init, whole ? to : results(ws),
-                           whole ? depth : stride);
+          product<T, kOverRows>(dz + p, ws, outputs, stride / kLanes<T>, rows, kLanes<T>, init,
+                                whole ? to : results(ws), whole ? depth : stride);
           if (!whole) accumulate_rows<T, true>(to, depth, results(ws), stride, outputs, columns);
         }
       }
@@ -319,8 +345,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     for (int64_t k = 0; k < width; k += kDepth) {
       int64_t count = std::min<int64_t>(kDepth, width - k);
       multiply_slopes(grad + k, slopes ? slopes + k : nullptr, width, rows, count, ws);
-      product(ws, layer.backward.get() + k * kLanes<T>, rows, depth / kLanes<T>, count, width * kLanes<T>, init,
-              results, depth);
+      multiply(layer.backward.get(), ws, rows, k, count, width, depth, init, results);
       for (int r = 0; r < rows; r++) init[r] = results + r * depth;
     }
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
