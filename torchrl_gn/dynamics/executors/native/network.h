@@ -124,7 +124,9 @@ class Network {
   };
   struct Gather {
     int64_t source, width, column = 0;
+    bool in_order = true;                 // row i is one item, items[0] + i
     bool clears = false, writes = false;  // in backward(): zero the source's gradient first; or overwrite it
+    bool apart = true;                    // no other gather of the layer has its source
     std::vector<int64_t> offsets, items;
   };
   struct Layer {
@@ -132,6 +134,12 @@ class Network {
     Activation activation;
     std::vector<Gather> inputs, added;
     bool has_table = false, direct = false;  // direct: backward() multiplies into the only input's gradient
+    int64_t reads(int64_t source) const {
+      int64_t count = 0;
+      for (auto* gathers : {&inputs, &added})
+        for (const Gather& gather : *gathers) count += gather.source == source;
+      return count;
+    }
     Block forward, backward, table;  // [out / L][in][L], [in / L][out][L], [I or 1][out], padded
   };
 
@@ -176,6 +184,8 @@ class Network {
     code += items + 1;
     gather.items.assign(code, code + gather.offsets.back());
     code += gather.offsets.back();
+    for (int64_t i = 0; i < items && gather.in_order; i++)
+      gather.in_order = gather.offsets[i + 1] == i + 1 && gather.items[i] == gather.items[0] + i;
   }
 
   // Which gather is the first in backward() to reach its source.
@@ -185,17 +195,17 @@ class Network {
     for (size_t i = layers_.size(); i-- > 0;)
       for (auto* gathers : {&layers_[i].inputs, &layers_[i].added})
         for (Gather& gather : *gathers) {
+          gather.apart = layers_[i].reads(gather.source) == 1;
           if (reached[gather.source]) continue;
           reached[gather.source] = true;
           std::vector<int64_t> items = gather.items;
           std::sort(items.begin(), items.end());
-          bool once = static_cast<int64_t>(items.size()) == buffers_[gather.source].items;
+          bool once = gather.apart && static_cast<int64_t>(items.size()) == buffers_[gather.source].items;
           for (size_t j = 0; once && j < items.size(); j++) once = items[j] == static_cast<int64_t>(j);
           (once ? gather.writes : gather.clears) = true;
           Layer& layer = layers_[i];
-          bool only = gathers == &layer.inputs && layer.inputs.size() == 1;
-          layer.direct = gather.writes && only && items == gather.items && padded(layer.depth) == layer.depth &&
-                         buffers_[gather.source].items == layer.items;
+          bool only = gathers == &layer.inputs && layer.inputs.size() == 1 && layer.added.empty();
+          layer.direct = only && once && gather.in_order && padded(layer.depth) == layer.depth;
         }
     for (size_t b = 0; b < buffers_.size(); b++)
       if (!reached[b]) unread_.push_back(b);
@@ -244,12 +254,14 @@ class Network {
     }
   }
 
-  const T* rows_of(const Gather& g, int64_t j, T* ws, int S, int sample) const {
+  const T* rows_of(const Gather& g, int64_t j, T* ws, int S, int64_t sample) const {
     return values(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
   }
 
   // Columns [from, to) of gathered rows; up to a vector more is written after each.
   void gather(const Gather& g, T* ws, int S, int64_t start, int rows, int64_t from, int64_t to, T* x) const {
+    if (g.in_order)
+      return copy_rows(x, kStride, rows_of(g, 0, ws, S, start) + from, g.width, rows, to - from);
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
       T* out = x + row * kStride;
       int64_t j = g.offsets[item], last = g.offsets[item + 1];
@@ -348,16 +360,18 @@ class Network {
       multiply(layer.backward.get(), ws, rows, k, count, width, depth, init, results);
       for (int r = 0; r < rows; r++) init[r] = results + r * depth;
     }
+    if (layer.direct) return;
+    auto scatter = [&](const Gather& g, int64_t j, int64_t sample, int row, int now) {
+      T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
+      const T* from = results + row * depth + g.column;
+      (g.writes ? accumulate_rows<T, false> : accumulate_rows<T, true>)(to, g.width, from, depth, now, g.width);
+    };
+    for (const Gather& g : layer.inputs)
+      if (g.in_order && g.apart) scatter(g, 0, start, 0, rows);
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
       for (const Gather& g : layer.inputs)
-        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1] && !layer.direct; j++) {
-          T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
-          const T* from = results + row * depth + g.column;
-          if (g.writes)
-            accumulate_rows<T, false>(to, g.width, from, depth, now, g.width);
-          else
-            accumulate_rows<T, true>(to, g.width, from, depth, now, g.width);
-        }
+        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1] && !(g.in_order && g.apart); j++)
+          scatter(g, j, sample, row, now);
       for (const Gather& g : layer.added)
         for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++) {
           T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
