@@ -122,7 +122,7 @@ class FoldedGNCore:
         device = self.reduce.device
         every_edge = torch.arange(count_e, device=device)
         kept, predicted = every_edge[self.kept], torch.arange(count_n, device=device)[self.predicted]
-        senders, receivers = self.ends.split(count_e)
+        senders, receivers = self.ends[:count_e], self.ends[count_e:]
         builder = LayerBuilder(self.activation)
 
         def mlp(factors: Factors, inputs: Sequence[Gather], added: Sequence[Gather] = ()) -> int:
