@@ -16,6 +16,7 @@ from torchrl_gn.dynamics.checks import check_scene, check_shapes, warn_of_unseen
 from torchrl_gn.dynamics.constraints import make_projection
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.eager import EagerExecutor
+from torchrl_gn.dynamics.executors.native import NativeDelta
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.normalization import in_range, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
@@ -73,6 +74,7 @@ class Predictor(TensorDictModuleBase):
         check_scene(model, scene)
         self.model, self.scene, self.layout = model, scene, model.layout
         self.strict, self.reference = strict, reference
+        self._trainer: NativeDelta | None = None
 
         ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
         self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
@@ -232,6 +234,17 @@ class Predictor(TensorDictModuleBase):
         """What runs the step, for one or many steps of the same samples."""
         return EagerExecutor(self.program(parameters))
 
+    def training_executor(self, parameters: TensorDictBase | None = None) -> EagerExecutor | NativeDelta:
+        """What predicts changes by its ``delta``, differentiable in states, actions and weights."""
+        if torch.compiler.is_compiling():  # which cannot ask which features vary
+            return EagerExecutor(self.program(parameters))
+        program = self.program(parameters, reduced=True)
+        if self._trainer is None:
+            self._trainer = NativeDelta(program)
+        else:
+            self._trainer.update(program)
+        return self._trainer
+
     def step(
         self,
         state: Tensor,
@@ -295,6 +308,9 @@ class Predictor(TensorDictModuleBase):
             return None
         nodes, edges, globals_ = (hidden_state[part] for part in ("nodes", "edges", "globals_"))
         return Graph(nodes, edges, globals_, self.incidence.edge_index)
+
+    def __getstate__(self) -> dict:
+        return {**super().__getstate__(), "_trainer": None}  # a copy packs for itself
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"

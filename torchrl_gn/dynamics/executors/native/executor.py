@@ -21,11 +21,11 @@ from torchrl_gn.networks.snapshot import same
 
 TILE = 24  # samples that stay in a processor's cache from layer to layer
 STORED_BYTES = 2**28  # activations' derivatives are kept for the gradient up to this size, else computed again
-_DTYPES = {torch.float32: 0, torch.float64: 1}  # as the C++ code tells them apart
+DTYPES = {torch.float32: 0, torch.float64: 1}  # as the C++ code tells them apart
 
 
-class _NotTracedError(Exception):
-    pass
+class NotTracedError(Exception):
+    """The state maths have no scalar form; the executor's ``reason`` says why."""
 
 
 class NativeExecutor:
@@ -37,12 +37,14 @@ class NativeExecutor:
     """
 
     fixed_batch, runs_all = False, True
+    change = False  # whether the result is a change instead of the next state
 
     def __init__(self, program: StepProgram) -> None:
         self.program, self.eager = program, EagerExecutor(program)
         self.network: library.NativeNetwork | None = None
         self.maths: library.NativeMaths | None = None
         self.reason: str | None = None  # why it runs by torch operations
+        self._untraceable: str | None = None  # why its state maths has no tape
         self.version = 0
         self.update(program)
 
@@ -50,24 +52,30 @@ class NativeExecutor:
         """Take another program of the same scene: its state maths are traced again only if they differ."""
         self.version += 1
         if not same(_maths_of(self.program), _maths_of(program)):
-            self.maths = None
+            self.maths = self._untraceable = None
         self.program, self.eager = program, EagerExecutor(program)
-        layers, self.reason = _layers(program)
+        layers, self.reason = _layers(program) if self._untraceable is None else (None, self._untraceable)
         self.layers = layers
         if layers is None:
             self.network = None
-        elif self.network is None or not self.network.update(layers):
-            self.maths = None
-            try:
-                self.network = library.NativeNetwork(layers)
-            except library.NoCompilerError as error:
-                self.network, self.reason = None, str(error)
+            return
+        # Numbers of a sample and step that its gradient needs: slopes of the activations, and the output.
+        sizes = [layer.count * len(layer.weight) for layer in layers.layers]
+        slopes = [size for size, layer in zip(sizes, layers.layers, strict=True) if layer.activation is not None]
+        self.kept = sum(slopes) + sizes[-1]
+        if self.network is not None and self.network.update(layers, program.dtype):
+            return
+        self.maths = None
+        try:
+            self.network = library.NativeNetwork(layers, program.dtype)
+        except (library.NoCompilerError, TypeError) as error:
+            self.network, self.reason = None, str(error)
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         if self._runs(state, action):
             try:
                 return self._rollout(state, action, False), None
-            except _NotTracedError:
+            except NotTracedError:
                 pass
         return self.eager.step(state, action, hidden)
 
@@ -75,15 +83,15 @@ class NativeExecutor:
         if actions.shape[-2] and self._runs(state, actions):
             try:
                 return self._rollout(state, actions, True), None
-            except _NotTracedError:
+            except NotTracedError:
                 pass
         return rollout_by_steps(self.eager, state, actions, hidden)
 
     def _runs(self, state: Tensor, action: Tensor) -> bool:
         return (
             self.network is not None
-            and state.dtype in _DTYPES
-            and action.dtype in _DTYPES
+            and state.dtype in DTYPES
+            and action.dtype in DTYPES
             and state.is_cpu
             and action.is_cpu
             and state.numel() > 0
@@ -107,18 +115,23 @@ class NativeExecutor:
         else:
             steps, out = 1, torch.empty(shape, dtype=state.dtype)
         call = (
-            *(count, steps, _tile(count, threads), threads),
-            *((state.data_ptr(), _DTYPES[state.dtype]), size, (actions.data_ptr(), _DTYPES[actions.dtype])),
-            *((out.data_ptr(), _DTYPES[out.dtype]), many, library.NOTHING, library.NOTHING),
-            None if stored is None else stored.data_ptr(),
+            *(count, steps, tile_of(count, threads), threads),
+            *((state.data_ptr(), DTYPES[state.dtype]), size, (actions.data_ptr(), DTYPES[actions.dtype])),
+            *((out.data_ptr(), DTYPES[out.dtype]), many, library.NOTHING, library.NOTHING),
+            *(None if stored is None else stored.data_ptr(), 0, None, None),
         )
         network = self.network
         assert network is not None
         while self.maths is None or not library.rollout(network, self.maths, call):
-            self._trace(state)
+            self.trace(state)
         return out
 
-    def _trace(self, states: Tensor) -> None:
+    def prepare(self, states: Tensor) -> None:
+        """Trace the state maths, unless they are."""
+        if self.maths is None:
+            self.trace(states)
+
+    def trace(self, states: Tensor) -> None:
         """Make the state maths for states whose constant channels are those of the first, as far as all have them."""
         flat = states.detach().reshape(-1, *states.shape[-2:]).double().numpy()
         if self.maths is None:
@@ -129,10 +142,12 @@ class NativeExecutor:
         core = self.program.core
         assert isinstance(core, ListedCore) and self.layers is not None
         try:
-            maths = StateMaths(self.program, np.where(constant, values, 0.0), constant, *_outputs(core, self.layers))
+            kept, outputs = np.where(constant, values, 0.0), _outputs(core, self.layers)
+            maths = StateMaths(self.program, kept, constant, *outputs, self.change)
         except (UntraceableError, TooLongError) as error:
             self.network, self.reason = None, str(error)
-            raise _NotTracedError from error
+            self._untraceable = self.reason
+            raise NotTracedError from error
         self.maths = library.NativeMaths(maths, self.layers)
 
 
@@ -143,13 +158,13 @@ class _Differentiable(torch.autograd.Function):
         assert network is not None
         steps = actions.shape[-2] if many else 1
         count = state.shape[:-2].numel()
-        numbers, threads = count * steps * network.kept, torch.get_num_threads()
-        stored = None
-        if numbers * network.dtype.itemsize <= STORED_BYTES:
-            stored = torch.empty(numbers, dtype=network.dtype)
+        threads = torch.get_num_threads()
+        numbers, stored = count * steps * executor.kept, None
+        if numbers * network.number.itemsize <= STORED_BYTES:
+            stored = torch.empty(numbers, dtype=network.number)
         out = executor.run(state, actions, many, stored)
         ctx.save_for_backward(out if many else state, actions, stored)
-        ctx.call, ctx.many = (count, steps, _tile(count, threads), threads), many
+        ctx.call, ctx.many = (count, steps, tile_of(count, threads), threads), many
         ctx.executor, ctx.version, ctx.maths = executor, executor.version, executor.maths
         return out
 
@@ -164,16 +179,16 @@ class _Differentiable(torch.autograd.Function):
         of_state, of_actions = torch.empty(shape, dtype=states.dtype), torch.empty_like(actions)
         call = (
             *ctx.call,
-            *((states.data_ptr(), _DTYPES[states.dtype]), size * (steps + 1 if many else 1)),
-            *((actions.data_ptr(), _DTYPES[actions.dtype]), (gradient.data_ptr(), _DTYPES[gradient.dtype]), many),
-            *((of_state.data_ptr(), _DTYPES[states.dtype]), (of_actions.data_ptr(), _DTYPES[actions.dtype])),
-            None if stored is None else stored.data_ptr(),
+            *((states.data_ptr(), DTYPES[states.dtype]), size * (steps + 1 if many else 1)),
+            *((actions.data_ptr(), DTYPES[actions.dtype]), (gradient.data_ptr(), DTYPES[gradient.dtype]), many),
+            *((of_state.data_ptr(), DTYPES[states.dtype]), (of_actions.data_ptr(), DTYPES[actions.dtype])),
+            *(None if stored is None else stored.data_ptr(), 0, None, None),
         )
         library.rollout_adjoint(executor.network, ctx.maths, call)
         return None, of_state, of_actions, None
 
 
-def _tile(count: int, threads: int) -> int:
+def tile_of(count: int, threads: int) -> int:
     """Samples of a tile, such that there are tiles for all threads."""
     return min(TILE, -(-count // threads))
 
@@ -185,7 +200,7 @@ def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
         return None, "a recurrent model runs by torch operations"
     if program.movable.device.type != "cpu":
         return None, f"on {program.movable.device.type}, it runs by torch operations"
-    if program.dtype not in _DTYPES:
+    if program.dtype not in (*DTYPES, torch.bfloat16):
         return None, f"{str(program.dtype).removeprefix('torch.')} products run by torch operations"
     layers = core.layers() if isinstance(core, ListedCore) else None
     if layers is None:

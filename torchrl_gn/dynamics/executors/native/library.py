@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
@@ -100,9 +101,9 @@ class _Tape(ctypes.Structure):
 
 class _Maths(ctypes.Structure):
     _fields_ = (
-        *((name, _I) for name in ("size", "varying_count", "actions", "outputs", "node_inputs", "edge_inputs")),
-        *((name, _I) for name in ("node_width", "edge_width", "output_width")),
-        *((name, _P) for name in ("varying", "constant", "values")),
+        *((name, _I) for name in ("size", "varying_count", "result_size", "result_count", "is_state", "actions")),
+        *((name, _I) for name in ("outputs", "node_inputs", "edge_inputs", "node_width", "edge_width", "output_width")),
+        *((name, _P) for name in ("varying", "constant", "values", "results")),
         ("forward", _Tape),
         ("adjoint", _Tape),
     )
@@ -119,6 +120,9 @@ class _Call(ctypes.Structure):
         ("grad_state", _Array),
         ("grad_actions", _Array),
         ("stored", _P),
+        ("train", _I),
+        ("grad_weights", _P),
+        ("grad_tables", _P),
     )
 
 
@@ -127,7 +131,8 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
         "gn_network_new": (_P, [_I, _P, _P, _P]),
         "gn_network_update": (None, [_P, _I, _P, _P]),
         "gn_network_delete": (None, [_P, _I]),
-        "gn_network_stored": (_I, [_P, _I]),
+        "gn_has_bfloat16": (_I, []),
+        "gn_stored": (_I, [_P, _I, _P, _P]),
         "gn_rollout": (_I, [_P, _I, _P, _P]),
         "gn_rollout_adjoint": (None, [_P, _I, _P, _P]),
     }
@@ -138,39 +143,48 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
 
 
 class NativeNetwork:
-    """A layer list packed for the processor; freed with the object."""
+    """A layer list packed for the processor; freed with the object.
 
-    def __init__(self, layers: LayerList) -> None:
-        self.library = load_library()
-        self.dtype = layers.layers[0].weight.dtype
-        self.is_double = int(self.dtype == torch.float64)
+    TypeError for bfloat16 on a processor that does not multiply it.
+    """
+
+    def __init__(self, layers: LayerList, dtype: torch.dtype) -> None:
+        self.library, self.dtype = load_library(), dtype
+        self.kind = {torch.float32: 0, torch.float64: 1, torch.bfloat16: 2}[dtype]
+        if self.kind == 2 and not self.library.gn_has_bfloat16():
+            raise TypeError("the native executor multiplies no bfloat16 on this processor")
         self.code = layers.code().contiguous()
-        weights, tables, self._kept = _pointers(layers)
-        self.pointer = self.library.gn_network_new(self.is_double, self.code.data_ptr(), weights, tables)
-        last = layers.layers[-1]
-        # Numbers of a sample and step that its gradient needs: activations' derivatives and the output.
-        self.kept = self.library.gn_network_stored(self.pointer, self.is_double) + last.count * len(last.weight)
+        self.kept = _pointers(layers, self.number)
+        self.pointer = self.library.gn_network_new(self.kind, self.code.data_ptr(), *self.kept[:2])
 
-    def update(self, layers: LayerList) -> bool:
+    @property
+    def number(self) -> torch.dtype:
+        """Dtype of sums, weights and tables."""
+        return torch.float64 if self.kind == 1 else torch.float32
+
+    def update(self, layers: LayerList, dtype: torch.dtype) -> bool:
         """Take other weights; False if the network is another."""
-        if layers.layers[0].weight.dtype != self.dtype or not torch.equal(layers.code(), self.code):
+        if dtype != self.dtype or not torch.equal(layers.code(), self.code):
             return False
-        weights, tables, self._kept = _pointers(layers)
-        self.library.gn_network_update(self.pointer, self.is_double, weights, tables)
+        self.kept = _pointers(layers, self.number)
+        self.library.gn_network_update(self.pointer, self.kind, *self.kept[:2])
         return True
 
     def __del__(self) -> None:
         if (pointer := getattr(self, "pointer", None)) is not None:
-            self.library.gn_network_delete(pointer, self.is_double)
+            self.library.gn_network_delete(pointer, self.kind)
 
 
-def _pointers(layers: LayerList) -> tuple[Any, Any, Any]:
+def _pointers(layers: LayerList, dtype: torch.dtype) -> tuple[Any, Any, Any]:
     weights, tables = layers.tensors()
-    return (
-        (_P * len(weights))(*(each.data_ptr() for each in weights)),
-        (_P * len(tables))(*(None if each is None else each.data_ptr() for each in tables)),
-        (weights, tables),
-    )
+    weights = [each.detach().to(dtype) for each in weights]
+    tables = [None if each is None else each.detach().to(dtype) for each in tables]
+    return pointers(weights), pointers(tables), (weights, tables)
+
+
+def pointers(tensors: Sequence[Tensor | None]) -> Any:
+    """Addresses of contiguous tensors."""
+    return (_P * len(tensors))(*(None if each is None else each.data_ptr() for each in tensors))
 
 
 class NativeMaths:
@@ -183,6 +197,9 @@ class NativeMaths:
         self.struct = _Maths(
             size=maths.is_constant.size,
             varying_count=len(maths.varying),
+            result_size=maths.result_size,
+            result_count=len(maths.results),
+            is_state=not maths.change,
             actions=maths.actions,
             outputs=last.count * len(last.weight),
             node_inputs=layers.nodes[0] * layers.nodes[1],
@@ -193,6 +210,7 @@ class NativeMaths:
             varying=maths.varying.ctypes.data,
             constant=maths.constant.ctypes.data,
             values=maths.values.ctypes.data,
+            results=maths.results.ctypes.data,
             forward=self._tape(maths.forward),
         )
         self.reference = ctypes.addressof(self.struct)
@@ -219,14 +237,20 @@ class NativeMaths:
 NOTHING = (None, 0)  # no array
 
 
+def stored(network: NativeNetwork, maths: NativeMaths, call: tuple) -> Tensor:
+    """Room for what a call keeps for its adjoint."""
+    count = network.library.gn_stored(network.pointer, network.kind, maths.reference, ctypes.byref(_Call(*call)))
+    return torch.empty(count, dtype=network.number)
+
+
 def rollout(network: NativeNetwork, maths: NativeMaths, call: tuple) -> bool:
     """Run ``gn_rollout`` on the fields of a call; False if a start state has other constant channels."""
     reference = ctypes.byref(_Call(*call))
-    return not network.library.gn_rollout(network.pointer, network.is_double, maths.reference, reference)
+    return not network.library.gn_rollout(network.pointer, network.kind, maths.reference, reference)
 
 
 def rollout_adjoint(network: NativeNetwork, maths: NativeMaths, call: tuple) -> None:
     """Run ``gn_rollout_adjoint`` on the fields of a call."""
     maths.add_adjoint()
     reference = ctypes.byref(_Call(*call))
-    network.library.gn_rollout_adjoint(network.pointer, network.is_double, maths.reference, reference)
+    network.library.gn_rollout_adjoint(network.pointer, network.kind, maths.reference, reference)

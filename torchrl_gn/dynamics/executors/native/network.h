@@ -23,6 +23,8 @@ class Network {
   static_assert(!kBfloat16 || sizeof(T) == 4, "bfloat16 is summed in float");
 
  public:
+  using Number = T;
+
   // code: see above; weights[i] row-major [out, K] and tables[i] [I, out] or nullptr, of every layer i.
   Network(const int64_t* code, const T* const* weights, const T* const* tables) {
     add_buffer(code[0], code[1]);
@@ -66,6 +68,17 @@ class Network {
   // Numbers of T, to lie at a 64-byte boundary, that a tile of S samples needs.
   size_t workspace(int S, bool gradient) const {
     return scratch() + (gradient ? 2 : 1) * S * total_ + kLanes<T>;
+  }
+  // Numbers of every layer's weight and table; 0 of a table that is not there.
+  std::vector<int64_t> weight_sizes() const {
+    std::vector<int64_t> sizes;
+    for (const Layer& layer : layers_) sizes.push_back(layer.width * layer.depth);
+    return sizes;
+  }
+  std::vector<int64_t> table_sizes() const {
+    std::vector<int64_t> sizes;
+    for (const Layer& layer : layers_) sizes.push_back(layer.has_table ? layer.items * layer.width : 0);
+    return sizes;
   }
   // Numbers per sample that backward() needs of forward(): slopes of the activations.
   size_t stored() const { return stored_; }
