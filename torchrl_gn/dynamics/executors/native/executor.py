@@ -45,7 +45,7 @@ class NativeExecutor:
         self.maths: library.NativeMaths | None = None
         self.reason: str | None = None  # why it runs by torch operations
         self._untraceable: str | None = None  # why its state maths has no tape
-        self.version = 0
+        self.version, self.pool = 0, library.Pool()
         self.update(program)
 
     def update(self, program: StepProgram) -> None:

@@ -237,10 +237,28 @@ class NativeMaths:
 NOTHING = (None, 0)  # no array
 
 
-def stored(network: NativeNetwork, maths: NativeMaths, call: tuple) -> Tensor:
-    """Room for what a call keeps for its adjoint."""
-    count = network.library.gn_stored(network.pointer, network.kind, maths.reference, ctypes.byref(_Call(*call)))
-    return torch.empty(count, dtype=network.number)
+def stored_count(network: NativeNetwork, maths: NativeMaths, call: tuple) -> int:
+    """Numbers that a call keeps for its adjoint."""
+    return network.library.gn_stored(network.pointer, network.kind, maths.reference, ctypes.byref(_Call(*call)))
+
+
+class Pool:
+    """Buffers that are used again: fresh pages cost as much as filling them."""
+
+    def __init__(self) -> None:
+        self.free: list[Tensor] = []
+
+    def take(self, count: int, dtype: torch.dtype) -> Tensor:
+        """A buffer of at least ``count`` numbers."""
+        for index, buffer in enumerate(self.free):
+            if count <= buffer.numel() <= 2 * count and buffer.dtype == dtype:
+                return self.free.pop(index)
+        self.free.clear()  # other batches are coming
+        return torch.empty(count, dtype=dtype)
+
+    def give(self, buffer: Tensor) -> None:
+        """Give back a buffer that nobody reads any more."""
+        self.free = [*self.free[-1:], buffer]
 
 
 def rollout(network: NativeNetwork, maths: NativeMaths, call: tuple) -> bool:

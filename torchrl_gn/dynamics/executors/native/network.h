@@ -69,6 +69,9 @@ class Network {
   size_t workspace(int S, bool gradient) const {
     return scratch() + (gradient ? 2 : 1) * S * total_ + kLanes<T>;
   }
+  // The activations of a tile of S samples, which weight_gradients() reads: they may be moved to another ws.
+  T* activations(T* ws) const { return ws + scratch(); }
+  int64_t activation_count(int S) const { return S * total_; }
   // Numbers of every layer's weight and table; 0 of a table that is not there.
   std::vector<int64_t> weight_sizes() const {
     std::vector<int64_t> sizes;

@@ -102,7 +102,7 @@ struct Runner {
   int count;  // samples of this tile
   double* r;
   T* ws;
-  T* slopes;  // of the step in ws, if all is stored
+  T* whole;  // where the only step keeps its slopes and activations; null: as stored() says
 
   int64_t sample(int lane) const { return first + (lane < count ? lane : count - 1); }
 
@@ -135,7 +135,7 @@ struct Runner {
   }
 
   T* stored(int64_t step) const {
-    if (!call.stored || slopes) return slopes;
+    if (!call.stored || whole) return whole;
     const int64_t block = network.stored() + m.outputs;
     return static_cast<T*>(call.stored) + (first * call.steps + step * count) * block;
   }
@@ -161,8 +161,10 @@ struct Runner {
       T* derivatives = stored(t);
       predict(m.forward, derivatives);
       const T* output = network.output(ws, count);
-      if (derivatives && !slopes)
-        std::memcpy(derivatives + count * network.stored(), output, sizeof(T) * count * m.outputs);
+      if (whole)
+        std::copy_n(network.activations(ws), network.activation_count(count), whole + count * network.stored());
+      else if (derivatives)
+        std::copy_n(output, count * m.outputs, derivatives + count * network.stored());
       from_network(m.forward, 2, 0, m.outputs, m.output_width, output);
       run_tape<W, C>(m.forward, 1, r);
       for (int lane = 0; lane < count; ++lane) {
@@ -199,9 +201,11 @@ struct Runner {
       auto action = [&](int64_t s, int, int64_t i) { return call.actions.get((s * call.steps + t) * A + i); };
       const T* kept = stored(t);
       const T* output = network.output(ws, count);
-      if (kept && !slopes) {
+      if (whole) {
+        std::copy_n(kept + count * network.stored(), network.activation_count(count), network.activations(ws));
+      } else if (kept) {
         output = kept + count * network.stored();
-      } else if (!kept) {
+      } else {
         Runner forward{m, network, call, first, count, again, ws, nullptr};
         forward.load(m.forward, 0, n, state);
         forward.load(m.forward, 1, A, action);
@@ -244,7 +248,7 @@ struct Runner {
 template <class Net>
 int64_t tile_store(const Maths& m, const Net& network, const Call& call) {
   if (!call.train) return (network.stored() + m.outputs) * call.tile * call.steps;
-  return (network.workspace(call.tile, true) + network.stored() * call.tile + 15) / 16 * 16;
+  return network.stored() * call.tile + network.activation_count(call.tile);
 }
 
 // Gradients of the weights, added up in as many parts as do not depend on the threads.
@@ -298,7 +302,7 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
     constexpr int L = W * C;
     const int64_t most = std::max(m.forward.registers, adjoint ? m.adjoint.registers : 0) + m.varying_count;
     const bool again = adjoint && !call.stored;
-    const size_t registers = L * most, ws = call.train ? 0 : network.workspace(call.tile, adjoint);
+    const size_t registers = L * most, ws = network.workspace(call.tile, adjoint);
     const size_t derivatives = again ? network.stored() * call.tile : 0, gradient = adjoint ? L * m.varying_count : 0;
     static thread_local Arena arena;
     arena.reserve((again ? 2 : 1) * Arena::padded(sizeof(double) * registers) + Arena::padded(sizeof(T) * ws) +
@@ -311,9 +315,9 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
     for (int64_t part; (part = next++) < parts;)
       for (int64_t tile = part; tile < tiles; tile += parts) {
         const int64_t first = tile * call.tile, count = std::min(call.tile, call.batch - first);
-        T* const own = call.train ? static_cast<T*>(call.stored) + tile * tile_store(m, network, call) : scratch;
-        T* const slopes = call.train ? own + network.workspace(call.tile, true) : nullptr;
-        Runner<Net, W, C> runner{m, network, call, first, static_cast<int>(count), r, own, slopes};
+        T* const whole =
+            call.train ? static_cast<T*>(call.stored) + tile * tile_store(m, network, call) : nullptr;
+        Runner<Net, W, C> runner{m, network, call, first, static_cast<int>(count), r, scratch, whole};
         if (!adjoint) runner.forward();
         else if (!call.train) runner.adjoint(more, kept, sums, nullptr, nullptr);
         else runner.adjoint(more, kept, sums, gradients.of_weights[part].data(), gradients.of_tables[part].data());

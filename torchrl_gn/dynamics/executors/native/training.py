@@ -48,19 +48,30 @@ class _Trained(torch.autograd.Function):
             maths = executor.maths
             assert maths is not None
             call = (*start, _array(out), 0, library.NOTHING, library.NOTHING)
-            stored = library.stored(network, maths, (*call, None, 1, None, None))
+            size = library.stored_count(network, maths, (*call, None, 1, None, None))
+            stored = executor.pool.take(size, network.number)
             if library.rollout(network, maths, (*call, stored.data_ptr(), 1, None, None)):
                 break
             executor.trace(state)
-        ctx.save_for_backward(state, action, stored)
-        ctx.executor, ctx.start, ctx.maths, ctx.network, ctx.packed = executor, start, maths, network, network.kept
+        ctx.save_for_backward(state, action)
+        ctx.stored, ctx.executor, ctx.start, ctx.maths, ctx.network, ctx.packed = (
+            stored,
+            executor,
+            start,
+            maths,
+            network,
+            network.kept,
+        )
         ctx.needed = any(tensor is not None and tensor.requires_grad for tensor in tensors)
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        network, (state, action, stored) = ctx.network, ctx.saved_tensors
+        network, stored, (state, action) = ctx.network, ctx.stored, ctx.saved_tensors
+        if stored is None:
+            raise RuntimeError("The gradient of a native prediction can be computed once; predict again.")
+        ctx.stored = None
         if network.kept is not ctx.packed:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
         gradient = gradient.contiguous()
@@ -73,6 +84,7 @@ class _Trained(torch.autograd.Function):
             *(stored.data_ptr(), 1, *map(ctypes.addressof, addresses)),
         )
         library.rollout_adjoint(network, ctx.maths, call)
+        ctx.executor.pool.give(stored)
         return None, of_state, of_action, *weights, *tables
 
 
