@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -38,8 +40,8 @@ def core(kind: str, sizes: tuple[GraphSize, GraphSize], counts: tuple[int, int],
     torch.manual_seed(0)
     if kind == "mlp":
         return MLPCore(*sizes, 5, counts=counts, hidden=[6] * depth, activation="tanh").double()
-    hidden = {"edge_hidden": [7] * depth, "node_hidden": [6] * depth, "global_hidden": [4] * depth}
-    return GNCore(*sizes, 5, latent=3, **hidden).double()
+    hidden: dict[str, Any] = {"edge_hidden": [7] * depth, "node_hidden": [6] * depth, "global_hidden": [4] * depth}
+    return GNCore(sizes[0], sizes[1], 5, latent=3, **hidden).double()
 
 
 @pytest.mark.parametrize("depth", [1, 3])
