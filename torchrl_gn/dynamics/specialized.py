@@ -9,10 +9,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from torchrl_gn.dynamics import operators
 from torchrl_gn.dynamics.checks import UnseenParameterWarning
 from torchrl_gn.dynamics.executors import EXECUTORS
 from torchrl_gn.dynamics.normalization import static_graph
@@ -54,6 +55,7 @@ class SpecializedPredictor(Predictor):
         self._executor: Executor | None = None
         self._weights, self._casts = _Watched([]), 0
         self._given: dict[str, tuple[Tensor, int]] = {}
+        self._number = operators.register(self)
         # Refuse now what the executor cannot run, not at the first step.
         if not getattr(EXECUTORS[executor], "runs_all", True):
             self.executor()
@@ -61,6 +63,10 @@ class SpecializedPredictor(Predictor):
     def __getstate__(self) -> dict:
         # A copy folds and compiles for itself.
         return {**super().__getstate__(), "_executor": None, "_weights": _Watched([]), "_given": {}}
+
+    def __setstate__(self, state: dict) -> None:
+        super().__setstate__(state)
+        self._number = operators.register(self)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -102,6 +108,32 @@ class SpecializedPredictor(Predictor):
             and given.keys() == self._given.keys()
             and all(_same(given[name], *kept) for name, kept in self._given.items())
         )
+
+    def step(
+        self,
+        state: Tensor,
+        action: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDict | None]:
+        if self._is_operator(parameters):
+            return torch.ops.torchrl_gn.rollout(state, action, self._number, False), None
+        return super().step(state, action, parameters, hidden_state)
+
+    def rollout(
+        self,
+        state: Tensor,
+        actions: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDict | None]:
+        if self._is_operator(parameters):
+            return torch.ops.torchrl_gn.rollout(state, actions, self._number, True), None
+        return super().rollout(state, actions, parameters, hidden_state)
+
+    def _is_operator(self, parameters: TensorDictBase | None) -> bool:
+        """Whether a compiler must not look inside: into the check whether the weights changed, and C++."""
+        return torch.compiler.is_compiling() and parameters is None and not self.recurrent
 
     def program(
         self, parameters: TensorDictBase | None = None, *, reference: bool = False, reduced: bool = True

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import library
-from torchrl_gn.dynamics.executors.native.executor import DTYPES, NativeExecutor, NotTracedError, tile_of
+from torchrl_gn.dynamics.executors.native.executor import DTYPES, TILE, NativeExecutor, NotTracedError
 from torchrl_gn.networks.graph import Graph
 
 
@@ -43,7 +43,7 @@ class _Trained(torch.autograd.Function):
         count, threads, size = state.shape[:-2].numel(), torch.get_num_threads(), state.shape[-2] * state.shape[-1]
         out = torch.empty((*state.shape[:-1], executor.program.layout.delta_size), dtype=state.dtype)
         executor.prepare(state)
-        start = (count, 1, tile_of(count, threads), threads, _array(state), size, _array(action))
+        start = (count, 1, min(TILE, count), threads, _array(state), size, _array(action))
         while True:
             maths = executor.maths
             assert maths is not None
