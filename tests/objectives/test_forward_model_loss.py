@@ -384,3 +384,17 @@ def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
     own = evaluate_errors(model.bind(data.scene_of("train", 0)), data.train[:1].exclude("parameters"), horizons=(4,))
     for error in ("one_step_error", "rollout_error_4"):
         assert table[error].total == pytest.approx(own[error].total, rel=1e-9)
+
+
+def test_leaving_out_what_never_varies_changes_neither_loss_nor_gradient(make_loss, windows, monkeypatch):
+    loss = make_loss()
+    network, whole = loss.trained.core, type(loss.model).program
+    results = []
+    for _ in range(2):
+        network.zero_grad()
+        value = loss(windows["swimmer6"])["loss_forward_model"]
+        value.backward()
+        results.append((value.detach(), *(weight.grad.clone() for weight in network.parameters())))
+        monkeypatch.setattr(type(loss.model), "program", lambda self, parameters, reduced: whole(self, parameters))
+    for reduced, full in zip(*results, strict=True):
+        torch.testing.assert_close(reduced, full, rtol=1e-9, atol=1e-12)

@@ -20,7 +20,7 @@ from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.normalization import in_range, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.program import Executor, InputScaling, OutputScaling, StepProgram
-from torchrl_gn.networks.core import UnfoldedCore
+from torchrl_gn.networks.core import FoldedCore, ReducibleCore, UnfoldedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
@@ -170,22 +170,54 @@ class Predictor(TensorDictModuleBase):
         tensordict.set(self.out_keys[0], after)
         return tensordict if hidden is None else tensordict.set(self.out_keys[1], hidden)
 
-    def program(self, parameters: TensorDictBase | None = None, *, reference: bool = False) -> StepProgram:
-        """The step as it is now, differentiable in the weights; the ``reference`` does not fold the core."""
+    def program(
+        self, parameters: TensorDictBase | None = None, *, reference: bool = False, reduced: bool = False
+    ) -> StepProgram:
+        """The step as it is now, differentiable in the weights.
+
+        The ``reference`` does not fold the core; ``reduced`` leaves out features that never vary.
+        """
         model, values = self.model, self.parameter_reader.read(parameters)
         static, unfolded = static_graph(self, values), self.reference or reference
+        core = UnfoldedCore(model.core, static) if unfolded else model.core.fold(self.incidence, static)
+        # All components: a loss of weights that are not finite is not finite.
+        rows = torch.arange(model.residual_normalizer.size, device=self.movable.device) if reduced else None
+        core, nodes, edges, output = self.scaled(core, rows)
         return StepProgram(
             **self.constants(),
             parameters=values,
-            nodes=InputScaling.of(model.node_normalizer),
-            edges=InputScaling.of(model.edge_normalizer),
+            nodes=nodes,
+            edges=edges,
             recurrent=model.core if self.recurrent else None,
             static=static if self.recurrent else None,
-            core=UnfoldedCore(model.core, static) if unfolded else model.core.fold(self.incidence, static),
-            output=OutputScaling.of(model.residual_normalizer),
+            core=core,
+            output=output,
             change_std=model.delta_normalizer.std,
             dtype=self.dtype,
         )
+
+    def scaled(
+        self, core: FoldedCore, rows: Tensor | None
+    ) -> tuple[FoldedCore, InputScaling, InputScaling, OutputScaling]:
+        """A folded core with the scaling of its nodes, edges and output.
+
+        With ``rows``, the components to predict, the core takes the scaling in and drops features that never vary, if
+        it can.
+        """
+        node, edge = self.model.node_normalizer, self.model.edge_normalizer
+        residual = self.model.residual_normalizer
+        # A hidden state is updated from all features.
+        if rows is None or self.recurrent or not isinstance(core, ReducibleCore):
+            return core, InputScaling.of(node), InputScaling.of(edge), OutputScaling.of(residual)
+        nodes, edges = InputScaling.folded(node), InputScaling.folded(edge)
+        assert nodes.columns is not None and edges.columns is not None
+        core = core.reduced(
+            (nodes.columns, node.inverse_std[nodes.columns]),
+            (edges.columns, edge.inverse_std[edges.columns]),
+            (rows, residual.std[rows]),
+            residual.mean[rows],
+        )
+        return core, nodes, edges, OutputScaling.folded(residual, rows)
 
     def constants(self) -> dict:
         """Those parts of a program that follow from the scene alone."""

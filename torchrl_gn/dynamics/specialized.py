@@ -15,8 +15,7 @@ from torchrl_gn.dynamics.checks import UnseenParameterWarning
 from torchrl_gn.dynamics.executors import EXECUTORS
 from torchrl_gn.dynamics.normalization import static_graph
 from torchrl_gn.dynamics.predictor import Predictor
-from torchrl_gn.dynamics.program import Executor, InputScaling, OutputScaling, StepProgram
-from torchrl_gn.networks.core import Columns, ReducibleCore
+from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
 from torchrl_gn.networks.snapshot import snapshot
@@ -112,29 +111,18 @@ class SpecializedPredictor(Predictor):
             and all(_same(given[name], *kept) for name, kept in self._given.items())
         )
 
-    def program(self, parameters: TensorDictBase | None = None, *, reference: bool = False) -> StepProgram:
+    def program(
+        self, parameters: TensorDictBase | None = None, *, reference: bool = False, reduced: bool = True
+    ) -> StepProgram:
         """Snapshot of the step, without features and components that never vary; whole as the ``reference``."""
         if reference:
             return super().program(parameters, reference=True)
-        model = self.model
         values = PhysicalParameters(*(value.detach().clone() for value in self.parameter_reader.read(parameters)))
-        nodes, edges = InputScaling.of(model.node_normalizer), InputScaling.of(model.edge_normalizer)
-        output = OutputScaling.of(model.residual_normalizer)
         # In float64, so that folding loses nothing.
-        core = copy.deepcopy(model.core).double()
+        core = copy.deepcopy(self.model.core).double()
         folded = core.fold(self.incidence, static_graph(self, values, torch.float64))
-        # A hidden state is updated from all features.
-        if isinstance(folded, ReducibleCore) and not core.recurrent:
-            residual = model.residual_normalizer
-            nodes, edges = InputScaling.folded(model.node_normalizer), InputScaling.folded(model.edge_normalizer)
-            rows = (self.movable.any(0) & ~residual.constant).nonzero().flatten()
-            output = OutputScaling.folded(residual, rows)
-            folded = folded.reduced(
-                _scaled(nodes, model.node_normalizer.inverse_std),
-                _scaled(edges, model.edge_normalizer.inverse_std),
-                (rows, residual.std[rows]),
-                residual.mean[rows],
-            )
+        rows = (self.movable.any(0) & ~self.model.residual_normalizer.constant).nonzero().flatten()
+        folded, nodes, edges, output = self.scaled(folded, rows if reduced else None)
         return StepProgram(
             **self.constants(),
             parameters=values,
@@ -144,7 +132,7 @@ class SpecializedPredictor(Predictor):
             static=static_graph(self, values, self.dtype) if core.recurrent else None,
             core=snapshot(folded, self.dtype),
             output=_copied(output),
-            change_std=model.delta_normalizer.std.clone(),
+            change_std=self.model.delta_normalizer.std.clone(),
             dtype=self.dtype,
         )
 
@@ -236,11 +224,6 @@ def _same(now: Tensor, kept: Tensor, version: int) -> bool:
         and _version(now) == version
         and (now.shape, now.stride(), now.dtype) == (kept.shape, kept.stride(), kept.dtype)
     )
-
-
-def _scaled(inputs: InputScaling, scale: Tensor) -> Columns:
-    assert inputs.columns is not None
-    return inputs.columns, scale[inputs.columns]
 
 
 def _width(inputs: InputScaling, full: int) -> int:

@@ -162,7 +162,9 @@ class ForwardModelLoss(LossModule):
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
         layout, steps = self.model.layout, state.shape[1]
         current, hidden = self.perturb(state[:, 0]), None
-        errors, program = state.new_zeros(len(layout.components)), self.model.program(parameters)
+        errors = state.new_zeros(len(layout.components))
+        # Which features vary is a question about values, which compiled code cannot ask.
+        program = self.model.program(parameters, reduced=not torch.compiler.is_compiling())
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
             delta, hidden = eager.delta(program, current, action[:, step], hidden)
