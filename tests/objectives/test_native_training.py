@@ -10,7 +10,7 @@ from torchrl_gn.dynamics.executors import EagerExecutor
 from torchrl_gn.objectives import ForwardModelLoss
 
 
-@pytest.mark.parametrize("name", ["pendulum", "swimmer6", "jaco"])
+@pytest.mark.parametrize("name", ["pendulum", "swimmer6", "cheetah"])
 @pytest.mark.parametrize("core", ["gn", "mlp"])
 @pytest.mark.parametrize("steps", [1, 3])
 def test_losses_and_gradients_of_weights_are_those_of_torch(

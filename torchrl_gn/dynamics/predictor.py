@@ -18,10 +18,10 @@ from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.eager import EagerExecutor
 from torchrl_gn.dynamics.executors.native import NativeDelta
 from torchrl_gn.dynamics.features.controls import ControlInputs
-from torchrl_gn.dynamics.normalization import in_range, static_graph
+from torchrl_gn.dynamics.normalization import in_range, scaled, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
-from torchrl_gn.dynamics.program import Executor, InputScaling, OutputScaling, StepProgram
-from torchrl_gn.networks.core import FoldedCore, ReducibleCore, UnfoldedCore
+from torchrl_gn.dynamics.program import Executor, StepProgram
+from torchrl_gn.networks.core import UnfoldedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
@@ -177,12 +177,14 @@ class Predictor(TensorDictModuleBase):
     ) -> StepProgram:
         """The step as it is now, differentiable in the weights.
 
-        The ``reference`` does not fold the core; ``reduced`` leaves out features and components that never vary.
+        The ``reference`` does not fold the core; ``reduced`` leaves out features that never vary.
         """
         model, values = self.model, self.parameter_reader.read(parameters)
         static, unfolded = static_graph(self, values), self.reference or reference
         core = UnfoldedCore(model.core, static) if unfolded else model.core.fold(self.incidence, static)
-        core, nodes, edges, output = self.scaled(core, reduced=reduced)
+        # All components: a loss of weights that are not finite is not finite.
+        rows = torch.arange(model.residual_normalizer.size, device=self.movable.device) if reduced else None
+        core, nodes, edges, output = scaled(self, core, rows)
         return StepProgram(
             **self.constants(),
             parameters=values,
@@ -195,26 +197,6 @@ class Predictor(TensorDictModuleBase):
             change_std=model.delta_normalizer.std,
             dtype=self.dtype,
         )
-
-    def scaled(
-        self, core: FoldedCore, *, reduced: bool
-    ) -> tuple[FoldedCore, InputScaling, InputScaling, OutputScaling]:
-        """A folded core with the scaling of its nodes, edges and output, which go into it if it can be ``reduced``."""
-        node, edge = self.model.node_normalizer, self.model.edge_normalizer
-        residual = self.model.residual_normalizer
-        # A hidden state is updated from all features.
-        if not reduced or self.recurrent or not isinstance(core, ReducibleCore):
-            return core, InputScaling.of(node), InputScaling.of(edge), OutputScaling.of(residual)
-        nodes, edges = InputScaling.folded(node), InputScaling.folded(edge)
-        assert nodes.columns is not None and edges.columns is not None
-        rows = (self.movable.any(0) & ~residual.constant).nonzero().flatten()
-        core = core.reduced(
-            (nodes.columns, node.inverse_std[nodes.columns]),
-            (edges.columns, edge.inverse_std[edges.columns]),
-            (rows, residual.std[rows]),
-            residual.mean[rows],
-        )
-        return core, nodes, edges, OutputScaling.folded(residual, rows)
 
     def constants(self) -> dict:
         """Those parts of a program that follow from the scene alone."""

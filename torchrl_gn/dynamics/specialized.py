@@ -16,7 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from torchrl_gn.dynamics import operators
 from torchrl_gn.dynamics.checks import UnseenParameterWarning
 from torchrl_gn.dynamics.executors import EXECUTORS
-from torchrl_gn.dynamics.normalization import static_graph
+from torchrl_gn.dynamics.normalization import scaled, static_graph
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
@@ -145,7 +145,8 @@ class SpecializedPredictor(Predictor):
         # In float64, so that folding loses nothing.
         core = copy.deepcopy(self.model.core).double()
         folded = core.fold(self.incidence, static_graph(self, values, torch.float64))
-        folded, nodes, edges, output = self.scaled(folded, reduced=reduced)
+        rows = (self.movable.any(0) & ~self.model.residual_normalizer.constant).nonzero().flatten()
+        folded, nodes, edges, output = scaled(self, folded, rows if reduced else None)
         return StepProgram(
             **self.constants(),
             parameters=values,
