@@ -10,10 +10,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_gn.data import create_dataset, trajectory_buffer
-from torchrl_gn.dynamics import Canonicalizer, ForwardModel
-from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics import Canonicalizer, ForwardModel, Predictor
+from torchrl_gn.dynamics.executors import EagerExecutor
 from torchrl_gn.dynamics.normalization import dynamic_graph
-from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
@@ -31,11 +30,12 @@ def predict(monkeypatch) -> Callable[[Callable], list[Tensor]]:
     def predict(delta: Callable) -> list[Tensor]:
         fed: list[Tensor] = []
 
-        def stub(program: StepProgram, state: Tensor, action: Tensor, hidden: None) -> tuple[Tensor, None]:
-            fed.append(state)
-            return delta(state, action) * program.movable, hidden
+        class Stub(EagerExecutor):
+            def delta(self, state: Tensor, action: Tensor, hidden: None) -> tuple[Tensor, None]:
+                fed.append(state)
+                return delta(state, action) * self.program.movable, hidden
 
-        monkeypatch.setattr(eager, "delta", stub)
+        monkeypatch.setattr(Predictor, "training_executor", lambda self, parameters: Stub(self.program(parameters)))
         return fed
 
     return predict

@@ -63,13 +63,19 @@ class NativeExecutor:
         sizes = [layer.count * len(layer.weight) for layer in layers.layers]
         slopes = [size for size, layer in zip(sizes, layers.layers, strict=True) if layer.activation is not None]
         self.kept = sum(slopes) + sizes[-1]
-        if self.network is not None and self.network.update(layers, program.dtype):
+        if self.network is not None and self.network.fits(layers, program.dtype):
+            self.network = self._packed(self.network, layers)
             return
         self.maths = None
         try:
             self.network = library.NativeNetwork(layers, program.dtype)
         except (library.NoCompilerError, TypeError) as error:
             self.network, self.reason = None, str(error)
+
+    def _packed(self, network: library.NativeNetwork, layers: LayerList) -> library.NativeNetwork:
+        """The network with other weights."""
+        network.update(layers)
+        return network
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         if self._runs(state, action):
@@ -161,9 +167,10 @@ class _Differentiable(torch.autograd.Function):
         threads = torch.get_num_threads()
         numbers, stored = count * steps * executor.kept, None
         if numbers * network.number.itemsize <= STORED_BYTES:
-            stored = torch.empty(numbers, dtype=network.number)
-        out = executor.run(state, actions, many, stored)
-        ctx.save_for_backward(out if many else state, actions, stored)
+            stored = executor.pool.take(numbers, network.number)
+        out = executor.run(state, actions, many, None if stored is None else stored.tensor)
+        ctx.save_for_backward(out if many else state, actions)
+        ctx.stored = stored
         ctx.call, ctx.many = (count, steps, tile_of(count, threads), threads), many
         ctx.executor, ctx.version, ctx.maths = executor, executor.version, executor.maths
         return out
@@ -171,7 +178,7 @@ class _Differentiable(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        executor, many, (states, actions, stored) = ctx.executor, ctx.many, ctx.saved_tensors
+        executor, many, (states, actions) = ctx.executor, ctx.many, ctx.saved_tensors
         if ctx.version != executor.version:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
         gradient, steps, size = gradient.contiguous(), ctx.call[1], states.shape[-2] * states.shape[-1]
@@ -182,7 +189,7 @@ class _Differentiable(torch.autograd.Function):
             *((states.data_ptr(), DTYPES[states.dtype]), size * (steps + 1 if many else 1)),
             *((actions.data_ptr(), DTYPES[actions.dtype]), (gradient.data_ptr(), DTYPES[gradient.dtype]), many),
             *((of_state.data_ptr(), DTYPES[states.dtype]), (of_actions.data_ptr(), DTYPES[actions.dtype])),
-            *(None if stored is None else stored.data_ptr(), 0, None, None),
+            *(None if ctx.stored is None else ctx.stored.tensor.data_ptr(), 0, None, None),
         )
         library.rollout_adjoint(executor.network, ctx.maths, call)
         return None, of_state, of_actions, None

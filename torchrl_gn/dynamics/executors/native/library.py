@@ -162,13 +162,14 @@ class NativeNetwork:
         """Dtype of sums, weights and tables."""
         return torch.float64 if self.kind == 1 else torch.float32
 
-    def update(self, layers: LayerList, dtype: torch.dtype) -> bool:
-        """Take other weights; False if the network is another."""
-        if dtype != self.dtype or not torch.equal(layers.code(), self.code):
-            return False
+    def fits(self, layers: LayerList, dtype: torch.dtype) -> bool:
+        """Whether the network differs in its weights alone."""
+        return dtype == self.dtype and torch.equal(layers.code(), self.code)
+
+    def update(self, layers: LayerList) -> None:
+        """Take other weights; no call may be running."""
         self.kept = _pointers(layers, self.number)
         self.library.gn_network_update(self.pointer, self.kind, *self.kept[:2])
-        return True
 
     def __del__(self) -> None:
         if (pointer := getattr(self, "pointer", None)) is not None:
@@ -248,17 +249,23 @@ class Pool:
     def __init__(self) -> None:
         self.free: list[Tensor] = []
 
-    def take(self, count: int, dtype: torch.dtype) -> Tensor:
+    def take(self, count: int, dtype: torch.dtype) -> Lease:
         """A buffer of at least ``count`` numbers."""
         for index, buffer in enumerate(self.free):
             if count <= buffer.numel() <= 2 * count and buffer.dtype == dtype:
-                return self.free.pop(index)
+                return Lease(self, self.free.pop(index))
         self.free.clear()  # other batches are coming
-        return torch.empty(count, dtype=dtype)
+        return Lease(self, torch.empty(count, dtype=dtype))
 
-    def give(self, buffer: Tensor) -> None:
-        """Give back a buffer that nobody reads any more."""
-        self.free = [*self.free[-1:], buffer]
+
+class Lease:
+    """A buffer that goes back to its pool with this object."""
+
+    def __init__(self, pool: Pool, tensor: Tensor) -> None:
+        self.pool, self.tensor = pool, tensor
+
+    def __del__(self) -> None:
+        self.pool.free = [*self.pool.free[-1:], self.tensor]
 
 
 def rollout(network: NativeNetwork, maths: NativeMaths, call: tuple) -> bool:

@@ -12,6 +12,7 @@ from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import library
 from torchrl_gn.dynamics.executors.native.executor import DTYPES, TILE, NativeExecutor, NotTracedError
 from torchrl_gn.networks.graph import Graph
+from torchrl_gn.networks.layers import LayerList
 
 
 class NativeDelta(NativeExecutor):
@@ -22,6 +23,14 @@ class NativeDelta(NativeExecutor):
     """
 
     change = True
+
+    def _packed(self, network: library.NativeNetwork, layers: LayerList) -> library.NativeNetwork:
+        # Gradients of earlier predictions, with other weights, may be asked for later: leave their network as it is.
+        for kept, tensors in zip(network.kept[2], layers.tensors(), strict=True):
+            for before, now in zip(kept, tensors, strict=True):
+                if before is not None and not torch.equal(before, now):  # pyright: ignore[reportArgumentType]
+                    return library.NativeNetwork(layers, network.dtype)
+        return network
 
     def delta(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         """Predicted change ``[*B, N, 12]``, as :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
@@ -50,30 +59,17 @@ class _Trained(torch.autograd.Function):
             call = (*start, _array(out), 0, library.NOTHING, library.NOTHING)
             size = library.stored_count(network, maths, (*call, None, 1, None, None))
             stored = executor.pool.take(size, network.number)
-            if library.rollout(network, maths, (*call, stored.data_ptr(), 1, None, None)):
+            if library.rollout(network, maths, (*call, stored.tensor.data_ptr(), 1, None, None)):
                 break
             executor.trace(state)
         ctx.save_for_backward(state, action)
-        ctx.stored, ctx.executor, ctx.start, ctx.maths, ctx.network, ctx.packed = (
-            stored,
-            executor,
-            start,
-            maths,
-            network,
-            network.kept,
-        )
-        ctx.needed = any(tensor is not None and tensor.requires_grad for tensor in tensors)
+        ctx.start, ctx.maths, ctx.network, ctx.stored = start, maths, network, stored
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        network, stored, (state, action) = ctx.network, ctx.stored, ctx.saved_tensors
-        if stored is None:
-            raise RuntimeError("The gradient of a native prediction can be computed once; predict again.")
-        ctx.stored = None
-        if network.kept is not ctx.packed:
-            raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
+        network, (state, action) = ctx.network, ctx.saved_tensors
         gradient = gradient.contiguous()
         of_state, of_action = torch.empty_like(state), torch.empty_like(action)
         packed = network.kept[2]
@@ -81,10 +77,9 @@ class _Trained(torch.autograd.Function):
         addresses = library.pointers(weights), library.pointers(tables)
         call = (
             *(*ctx.start, _array(gradient), 0, _array(of_state), _array(of_action)),
-            *(stored.data_ptr(), 1, *map(ctypes.addressof, addresses)),
+            *(ctx.stored.tensor.data_ptr(), 1, *map(ctypes.addressof, addresses)),
         )
         library.rollout_adjoint(network, ctx.maths, call)
-        ctx.executor.pool.give(stored)
         return None, of_state, of_action, *weights, *tables
 
 
