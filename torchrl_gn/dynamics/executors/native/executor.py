@@ -52,7 +52,7 @@ class NativeExecutor:
         if not same(_maths_of(self.program), _maths_of(program)):
             self.maths = None
         self.program, self.eager = program, EagerExecutor(program)
-        layers, self.reason = _layers(program)
+        layers, self.reason = list_layers(program)
         self.layers = layers
         if layers is None:
             self.network = None
@@ -120,16 +120,9 @@ class NativeExecutor:
 
     def _trace(self, states: Tensor) -> None:
         """Make the state maths for states whose constant channels are those of the first, as far as all have them."""
-        flat = states.detach().reshape(-1, *states.shape[-2:]).double().numpy()
-        if self.maths is None:
-            values, constant = flat[0], may_be_constant(self.program, flat[0])
-        else:
-            values, constant = self.maths.maths.state, self.maths.maths.is_constant
-        constant = constant & (np.abs(flat - values) <= 1e-10 * (1 + np.abs(values))).all(0)
-        core = self.program.core
-        assert isinstance(core, ListedCore) and self.layers is not None
+        assert self.layers is not None
         try:
-            maths = StateMaths(self.program, np.where(constant, values, 0.0), constant, *_outputs(core, self.layers))
+            maths = trace_states(self.program, self.layers, states, None if self.maths is None else self.maths.maths)
         except (UntraceableError, TooLongError) as error:
             self.network, self.reason = None, str(error)
             raise _NotTracedError from error
@@ -178,7 +171,7 @@ def _tile(count: int, threads: int) -> int:
     return min(TILE, -(-count // threads))
 
 
-def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
+def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     """The network as a list of layers, or why it cannot be one."""
     core = program.core
     if program.recurrent is not None:
@@ -193,11 +186,28 @@ def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     return layers, None
 
 
-def _outputs(core: ListedCore, layers: LayerList) -> tuple[np.ndarray, int]:
-    """Nodes that the network predicts, and components of each."""
-    last = layers.layers[-1]
+def trace_states(
+    program: StepProgram, layers: LayerList, states: Tensor, known: StateMaths | None = None
+) -> StateMaths:
+    """State maths for states ``[*B, N, C]``: channels are constant that cannot change and are equal in all of them.
+
+    With ``known``, those of its constant channels that have their values in all of ``states``.
+
+    Raises:
+        UntraceableError: if a feature uses an operation without scalar form.
+        TooLongError: if it needs too many registers.
+    """
+    flat = states.detach().reshape(-1, *states.shape[-2:]).double().numpy()
+    if known is None:
+        values, constant = flat[0], may_be_constant(program, flat[0])
+    else:
+        values, constant = known.state, known.is_constant
+    constant = constant & (np.abs(flat - values) <= 1e-10 * (1 + np.abs(values))).all(0)
+    core, last = program.core, layers.layers[-1]
+    assert isinstance(core, ListedCore)
     predicted = torch.arange(layers.nodes[0])[core.predicted].numpy()
-    return predicted, last.count * len(last.weight) // max(len(predicted), 1)
+    width = last.count * len(last.weight) // max(len(predicted), 1)
+    return StateMaths(program, np.where(constant, values, 0.0), constant, predicted, width)
 
 
 def _maths_of(program: StepProgram) -> tuple:

@@ -265,6 +265,16 @@ void run(const Maths& m, const Network<T>& network, const Call& call, bool adjoi
   else run_tiles<T, 8, 3>(m, network, call, adjoint);
 }
 
+// Whether the start states' constant channels are those that the tapes were made for.
+inline bool fits(const Maths& m, const Call& call) {
+  for (int64_t s = 0; s < call.batch; ++s)
+    for (int64_t i = 0; i < m.size - m.varying_count; ++i) {
+      const double difference = call.states.get(s * call.state_stride + m.constant[i]) - m.values[i];
+      if (!(std::fabs(difference) <= TOLERANCE * (1 + std::fabs(m.values[i])))) return false;
+    }
+  return true;
+}
+
 }  // namespace gn
 
 extern "C" {
@@ -301,12 +311,7 @@ int64_t gn_network_stored(const void* network, int64_t is_double) {
 
 // 1 if a start state's constant channels are not those that the tapes were made for: nothing was computed.
 int64_t gn_rollout(const void* network, int64_t is_double, const gn::Maths* maths, const gn::Call* call) {
-  for (int64_t s = 0; s < call->batch; ++s)
-    for (int64_t i = 0; i < maths->size - maths->varying_count; ++i) {
-      const double expected = maths->values[i];
-      const double difference = call->states.get(s * call->state_stride + maths->constant[i]) - expected;
-      if (!(std::fabs(difference) <= gn::TOLERANCE * (1 + std::fabs(expected)))) return 1;
-    }
+  if (!gn::fits(*maths, *call)) return 1;
   if (is_double) gn::run(*maths, *static_cast<const gn::Network<double>*>(network), *call, false);
   else gn::run(*maths, *static_cast<const gn::Network<float>*>(network), *call, false);
   return 0;
