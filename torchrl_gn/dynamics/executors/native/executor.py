@@ -54,7 +54,7 @@ class NativeExecutor:
         if not same(_maths_of(self.program), _maths_of(program)):
             self.maths = self._untraceable = None
         self.program, self.eager = program, EagerExecutor(program)
-        layers, self.reason = _layers(program) if self._untraceable is None else (None, self._untraceable)
+        layers, self.reason = list_layers(program) if self._untraceable is None else (None, self._untraceable)
         self.layers = layers
         if layers is None:
             self.network = None
@@ -139,17 +139,10 @@ class NativeExecutor:
 
     def trace(self, states: Tensor) -> None:
         """Make the state maths for states whose constant channels are those of the first, as far as all have them."""
-        flat = states.detach().reshape(-1, *states.shape[-2:]).double().numpy()
-        if self.maths is None:
-            values, constant = flat[0], may_be_constant(self.program, flat[0])
-        else:
-            values, constant = self.maths.maths.state, self.maths.maths.is_constant
-        constant = constant & (np.abs(flat - values) <= 1e-10 * (1 + np.abs(values))).all(0)
-        core = self.program.core
-        assert isinstance(core, ListedCore) and self.layers is not None
+        assert self.layers is not None
         try:
-            kept, outputs = np.where(constant, values, 0.0), _outputs(core, self.layers)
-            maths = StateMaths(self.program, kept, constant, *outputs, self.change)
+            before = None if self.maths is None else self.maths.maths
+            maths = trace_states(self.program, self.layers, states, before, self.change)
         except (UntraceableError, TooLongError) as error:
             self.network, self.reason = None, str(error)
             self._untraceable = self.reason
@@ -200,7 +193,7 @@ def tile_of(count: int, threads: int) -> int:
     return min(TILE, -(-count // threads))
 
 
-def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
+def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     """The network as a list of layers, or why it cannot be one."""
     core = program.core
     if program.recurrent is not None:
@@ -215,11 +208,29 @@ def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     return layers, None
 
 
-def _outputs(core: ListedCore, layers: LayerList) -> tuple[np.ndarray, int]:
-    """Nodes that the network predicts, and components of each."""
-    last = layers.layers[-1]
+def trace_states(
+    program: StepProgram, layers: LayerList, states: Tensor, known: StateMaths | None = None, change: bool = False
+) -> StateMaths:
+    """State maths for states ``[*B, N, C]``: channels are constant that cannot change and are equal in all of them.
+
+    With ``known``, those of its constant channels that have their values in all of ``states``. With ``change``, the
+    result is the change instead of the next state.
+
+    Raises:
+        UntraceableError: if a feature uses an operation without scalar form.
+        TooLongError: if it needs too many registers.
+    """
+    flat = states.detach().reshape(-1, *states.shape[-2:]).double().numpy()
+    if known is None:
+        values, constant = flat[0], may_be_constant(program, flat[0])
+    else:
+        values, constant = known.state, known.is_constant
+    constant = constant & (np.abs(flat - values) <= 1e-10 * (1 + np.abs(values))).all(0)
+    core, last = program.core, layers.layers[-1]
+    assert isinstance(core, ListedCore)
     predicted = torch.arange(layers.nodes[0])[core.predicted].numpy()
-    return predicted, last.count * len(last.weight) // max(len(predicted), 1)
+    width = last.count * len(last.weight) // max(len(predicted), 1)
+    return StateMaths(program, np.where(constant, values, 0.0), constant, predicted, width, change)
 
 
 def _maths_of(program: StepProgram) -> tuple:

@@ -45,12 +45,7 @@ GN_API int64_t gn_stored(const void* network, int64_t kind, const gn::Maths* mat
 
 // 1 if a start state's constant channels are not those that the tapes were made for: nothing was computed.
 GN_API int64_t gn_rollout(const void* network, int64_t kind, const gn::Maths* maths, const gn::Call* call) {
-  for (int64_t s = 0; s < call->batch; ++s)
-    for (int64_t i = 0; i < maths->size - maths->varying_count; ++i) {
-      const double expected = maths->values[i];
-      const double difference = call->states.get(s * call->state_stride + maths->constant[i]) - expected;
-      if (!(std::fabs(difference) <= gn::TOLERANCE * (1 + std::fabs(expected)))) return 1;
-    }
+  if (!gn::fits(*maths, *call)) return 1;
   gn::with_network(network, kind, [&](const auto& known) { gn::run(*maths, known, *call, false); });
   return 0;
 }

@@ -355,4 +355,14 @@ void* make(const int64_t* code, const void* const* weights, const void* const* t
   return new Net(code, reinterpret_cast<const T* const*>(weights), reinterpret_cast<const T* const*>(tables));
 }
 
+// Whether the start states' constant channels are those that the tapes were made for.
+inline bool fits(const Maths& m, const Call& call) {
+  for (int64_t s = 0; s < call.batch; ++s)
+    for (int64_t i = 0; i < m.size - m.varying_count; ++i) {
+      const double difference = call.states.get(s * call.state_stride + m.constant[i]) - m.values[i];
+      if (!(std::fabs(difference) <= TOLERANCE * (1 + std::fabs(m.values[i])))) return false;
+    }
+  return true;
+}
+
 }  // namespace gn
