@@ -143,7 +143,7 @@ def test_the_example_is_c_and_runs_as_its_header_says(scenes, make_model, tmp_pa
 def test_c_refuses_what_the_native_executor_cannot_run(scenes, make_model, tmp_path):
     scene = scenes["pendulum"]
     bound = make_model(scene).bind(scene)
-    with pytest.raises(TypeError, match="bfloat16 products run by torch"):
+    with pytest.raises(TypeError, match="products in bfloat16 are not written out"):
         export_c(specialize(bound, executor="eager", dtype=torch.bfloat16), tmp_path / "step")
     with pytest.raises(TypeError, match="recurrent"):
         export_c(make_model(scene, core="recurrent", hidden_state=(1, 1, 1)).bind(scene), tmp_path / "step")

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import source
-from torchrl_gn.dynamics.executors.native.executor import list_layers, trace_states
+from torchrl_gn.dynamics.executors.native.executor import DTYPES, list_layers, trace_states
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.dynamics.specialized import SpecializedPredictor, specialize
@@ -91,7 +91,9 @@ def export_c(predictor: Predictor, folder: str | os.PathLike, states: Tensor | N
     model = _specialized(predictor)
     program, scene = model.executor().program, model.scene
     layers, reason = list_layers(program)
-    if layers is None:
+    if program.dtype not in DTYPES:
+        reason = f"products in {str(program.dtype).removeprefix('torch.')} are not written out"
+    if layers is None or reason is not None:
         raise TypeError(f"This model cannot be exported as C++: {reason}.")
     states = _rest(model) if states is None else states.detach().cpu()
     shape = scene.num_nodes, model.layout.size

@@ -261,18 +261,21 @@ extern const double @NAME@_rest[@UPPER@_STATE] = {
 };
 
 int @NAME@_step(const double* state, const double* action, double* next) {
-  return run({1, 1, 1, 1, array(state), @UPPER@_STATE, array(action), array(next), 0, {}, {}, nullptr}, false);
+  return run({1, 1, 1, 1, array(state), @UPPER@_STATE, array(action), array(next), 0, {}, {}, nullptr, 0, nullptr,
+              nullptr},
+             false);
 }
 
 int @NAME@_rollout(int batch, int steps, int threads, const double* start, const double* actions, double* states) {
-  return run({batch, steps, 1, threads, array(start), @UPPER@_STATE, array(actions), array(states), 1, {}, {}, nullptr},
+  return run({batch, steps, 1, threads, array(start), @UPPER@_STATE, array(actions), array(states), 1, {}, {}, nullptr,
+              0, nullptr, nullptr},
              false);
 }
 
 int @NAME@_rollout_gradient(int batch, int steps, int threads, const double* states, const double* actions,
                             const double* grad_states, double* grad_start, double* grad_actions) {
   return run({batch, steps, 1, threads, array(states), (steps + int64_t{1}) * @UPPER@_STATE, array(actions),
-              array(grad_states), 1, array(grad_start), array(grad_actions), nullptr},
+              array(grad_states), 1, array(grad_start), array(grad_actions), nullptr, 0, nullptr, nullptr},
              true);
 }
 }
