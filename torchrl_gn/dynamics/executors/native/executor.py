@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics.executors.eager import EagerExecutor, rollout_by_steps
 from torchrl_gn.dynamics.executors.native import library
-from torchrl_gn.dynamics.executors.native.state_maths import StateMaths, may_be_constant
-from torchrl_gn.dynamics.executors.native.tape import TooLongError
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
+from torchrl_gn.dynamics.executors.native.traced_program import MixedStatesError, TracedProgram
 from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.networks.core import ListedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.layers import LayerList
+from torchrl_gn.networks.linear import needs_plain_operations
 from torchrl_gn.networks.snapshot import same
 
-TILE = 24  # samples that stay in a processor's cache from layer to layer
 STORED_BYTES = 2**28  # activations' derivatives are kept for the gradient up to this size, else computed again
-_DTYPES = {torch.float32: 0, torch.float64: 1}  # as the C++ code tells them apart
-
-
-class _NotTracedError(Exception):
-    pass
+_TYPES = (Tensor, torch.nn.Parameter)
 
 
 class NativeExecutor:
@@ -33,149 +28,138 @@ class NativeExecutor:
 
     State maths in float64, the network in the program's float32 or float64. Differentiable once, in state and action;
     the gradient in a component of the state that cannot move is that of copying it. Results depend neither on the batch
-    that a sample is in nor on the number of threads.
+    that a sample is in nor on the number of threads. Several threads may run it at once.
     """
 
     fixed_batch, runs_all = False, True
 
     def __init__(self, program: StepProgram) -> None:
         self.program, self.eager = program, EagerExecutor(program)
-        self.network: library.NativeNetwork | None = None
-        self.maths: library.NativeMaths | None = None
-        self.reason: str | None = None  # why it runs by torch operations
+        self.native: tuple[library.NativeNetwork, TracedProgram] | None = None
         self.version = 0
+        self._reason: str | None = None
         self.update(program)
+
+    @property
+    def reason(self) -> str | None:
+        """Why it runs by torch operations; None if it runs natively."""
+        return self._reason if self.native is None else self.native[1].reason
 
     def update(self, program: StepProgram) -> None:
         """Take another program of the same scene: its state maths are traced again only if they differ."""
-        self.version += 1
-        if not same(_maths_of(self.program), _maths_of(program)):
-            self.maths = None
+        before, self.version = self.native, self.version + 1
+        same_maths = same(_maths_of(self.program), _maths_of(program))
         self.program, self.eager = program, EagerExecutor(program)
-        layers, self.reason = _layers(program)
-        self.layers = layers
+        layers, self._reason = _layers(program)
         if layers is None:
-            self.network = None
-        elif self.network is None or not self.network.update(layers):
-            self.maths = None
-            try:
-                self.network = library.NativeNetwork(layers)
-            except library.NoCompilerError as error:
-                self.network, self.reason = None, str(error)
+            self.native = None
+            return
+        try:
+            network = library.NativeNetwork(layers)  # a new one: other threads may still read the one before
+        except library.NoCompilerError as error:
+            self.native, self._reason = None, str(error)
+            return
+        kept = before is not None and same_maths and before[0].equals(network)
+        self.native = network, before[1] if before is not None and kept else TracedProgram(program, layers)
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        if self._runs(state, action):
-            try:
-                return self._rollout(state, action, False), None
-            except _NotTracedError:
-                pass
+        if self._runs(state, action) and (after := self._rollout(state, action, False)) is not None:
+            return after, None
         return self.eager.step(state, action, hidden)
 
     def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        if actions.shape[-2] and self._runs(state, actions):
-            try:
-                return self._rollout(state, actions, True), None
-            except _NotTracedError:
-                pass
+        if (
+            actions.shape[-2]
+            and self._runs(state, actions)
+            and (states := self._rollout(state, actions, True)) is not None
+        ):
+            return states, None
         return rollout_by_steps(self.eager, state, actions, hidden)
 
     def _runs(self, state: Tensor, action: Tensor) -> bool:
         return (
-            self.network is not None
-            and state.dtype in _DTYPES
-            and action.dtype in _DTYPES
+            self.native is not None
+            and self.native[1].reason is None
+            and type(state) in _TYPES
+            and type(action) in _TYPES
+            and state.dtype in library.DTYPES
+            and action.dtype in library.DTYPES
             and state.is_cpu
             and action.is_cpu
             and state.numel() > 0
-            and not torch.compiler.is_compiling()
-            and not torch._C._are_functorch_transforms_active()
+            and not needs_plain_operations()
+            and not torch._C._len_torch_dispatch_stack()  # a mode that must see every operation
+            and torch._C._get_tracing_state() is None  # of torch.jit.trace
         )
 
-    def _rollout(self, state: Tensor, actions: Tensor, many: bool) -> Tensor:
-        if (state.requires_grad or actions.requires_grad) and torch.is_grad_enabled():
-            return _Differentiable.apply(self, state, actions, many)  # pyright: ignore[reportReturnType]
-        return self.run(state.contiguous(), actions.contiguous(), many)
+    def _rollout(self, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
+        """The next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``.
 
-    def run(self, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None) -> Tensor:
-        """The next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``."""
-        shape, threads = state.shape, torch.get_num_threads()
-        size = shape[-2] * shape[-1]
-        count = state.numel() // size
-        if many:
-            steps = actions.shape[-2]
-            out = torch.empty((*shape[:-2], steps + 1, *shape[-2:]), dtype=state.dtype)
-        else:
-            steps, out = 1, torch.empty(shape, dtype=state.dtype)
-        call = (
-            *(count, steps, _tile(count, threads), threads),
-            *((state.data_ptr(), _DTYPES[state.dtype]), size, (actions.data_ptr(), _DTYPES[actions.dtype])),
-            *((out.data_ptr(), _DTYPES[out.dtype]), many, library.NOTHING, library.NOTHING),
-            None if stored is None else stored.data_ptr(),
-        )
-        network = self.network
-        assert network is not None
-        while self.maths is None or not library.rollout(network, self.maths, call):
-            self._trace(state)
-        return out
-
-    def _trace(self, states: Tensor) -> None:
-        """Make the state maths for states whose constant channels are those of the first, as far as all have them."""
-        flat = states.detach().reshape(-1, *states.shape[-2:]).double().numpy()
-        if self.maths is None:
-            values, constant = flat[0], may_be_constant(self.program, flat[0])
-        else:
-            values, constant = self.maths.maths.state, self.maths.maths.is_constant
-        constant = constant & (np.abs(flat - values) <= 1e-10 * (1 + np.abs(values))).all(0)
-        core = self.program.core
-        assert isinstance(core, ListedCore) and self.layers is not None
+        None if torch operations must run it.
+        """
         try:
-            maths = StateMaths(self.program, np.where(constant, values, 0.0), constant, *_outputs(core, self.layers))
-        except (UntraceableError, TooLongError) as error:
-            self.network, self.reason = None, str(error)
-            raise _NotTracedError from error
-        self.maths = library.NativeMaths(maths, self.layers)
+            if (state.requires_grad or actions.requires_grad) and torch.is_grad_enabled():
+                return _Differentiable.apply(self, state, actions, many)  # pyright: ignore[reportReturnType]
+            return self.run(state.contiguous(), actions.contiguous(), many)[0]
+        except MixedStatesError as mixed:
+            groups = mixed.groups
+        except UntraceableError:
+            return None
+        flat = state.reshape(-1, *state.shape[-2:]), actions.reshape(len(groups), *actions.shape[state.ndim - 2 :])
+        places = [(groups == group).nonzero().flatten() for group in groups.unique().tolist()]
+        parts = [(self.rollout if many else self.step)(*(each[at] for each in flat))[0] for at in places]
+        out = torch.cat(parts)[torch.cat(places).argsort()]
+        return out.view(*state.shape[:-2], *out.shape[1:])
+
+    def run(self, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None) -> tuple[Tensor, _Ran]:
+        """Results for contiguous inputs, and what ran them.
+
+        Raises:
+            MixedStatesError: if the samples need different state maths.
+            UntraceableError: if torch operations must run it.
+        """
+        assert self.native is not None
+        network, traced = self.native
+        call, out = library.forward_call(state, actions, many, stored)
+        return out, _Ran(call[:4], network, traced.run(network, call, state, actions), self.version)
+
+
+class _Ran(NamedTuple):
+    """What a gradient needs to know of its forward pass."""
+
+    sizes: tuple[int, int, int, int]  # samples, steps, samples of a tile, threads
+    network: library.NativeNetwork
+    maths: library.NativeMaths
+    version: int  # of the weights
 
 
 class _Differentiable(torch.autograd.Function):
     @staticmethod
     def forward(ctx, executor: NativeExecutor, state: Tensor, actions: Tensor, many: bool) -> Tensor:
-        state, actions, network = state.contiguous(), actions.contiguous(), executor.network
-        assert network is not None
-        steps = actions.shape[-2] if many else 1
-        count = state.shape[:-2].numel()
-        numbers, threads = count * steps * network.kept, torch.get_num_threads()
+        state, actions = state.contiguous(), actions.contiguous()
+        assert executor.native is not None
+        network = executor.native[0]
+        numbers = state.shape[:-2].numel() * (actions.shape[-2] if many else 1) * network.kept
         stored = None
         if numbers * network.dtype.itemsize <= STORED_BYTES:
-            stored = torch.empty(numbers, dtype=network.dtype)
-        out = executor.run(state, actions, many, stored)
+            stored = torch.empty(numbers, dtype=network.dtype, device="cpu")
+        out, ctx.ran = executor.run(state, actions, many, stored)
         ctx.save_for_backward(out if many else state, actions, stored)
-        ctx.call, ctx.many = (count, steps, _tile(count, threads), threads), many
-        ctx.executor, ctx.version, ctx.maths = executor, executor.version, executor.maths
+        ctx.executor, ctx.many = executor, many
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        executor, many, (states, actions, stored) = ctx.executor, ctx.many, ctx.saved_tensors
-        if ctx.version != executor.version:
+        states, actions, stored = ctx.saved_tensors
+        if ctx.ran.version != ctx.executor.version:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
-        gradient, steps, size = gradient.contiguous(), ctx.call[1], states.shape[-2] * states.shape[-1]
-        shape = (*states.shape[:-3], *states.shape[-2:]) if many else states.shape
-        of_state, of_actions = torch.empty(shape, dtype=states.dtype), torch.empty_like(actions)
-        call = (
-            *ctx.call,
-            *((states.data_ptr(), _DTYPES[states.dtype]), size * (steps + 1 if many else 1)),
-            *((actions.data_ptr(), _DTYPES[actions.dtype]), (gradient.data_ptr(), _DTYPES[gradient.dtype]), many),
-            *((of_state.data_ptr(), _DTYPES[states.dtype]), (of_actions.data_ptr(), _DTYPES[actions.dtype])),
-            None if stored is None else stored.data_ptr(),
+        sizes, network, maths, _ = ctx.ran
+        call, of_state, of_actions = library.adjoint_call(
+            sizes, states, actions, gradient.contiguous(), ctx.many, stored
         )
-        library.rollout_adjoint(executor.network, ctx.maths, call)
+        library.rollout_adjoint(network, maths, call)
         return None, of_state, of_actions, None
-
-
-def _tile(count: int, threads: int) -> int:
-    """Samples of a tile, such that there are tiles for all threads."""
-    return min(TILE, -(-count // threads))
 
 
 def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
@@ -185,19 +169,12 @@ def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
         return None, "a recurrent model runs by torch operations"
     if program.movable.device.type != "cpu":
         return None, f"on {program.movable.device.type}, it runs by torch operations"
-    if program.dtype not in _DTYPES:
+    if program.dtype not in library.DTYPES:
         return None, f"{str(program.dtype).removeprefix('torch.')} products run by torch operations"
     layers = core.layers() if isinstance(core, ListedCore) else None
     if layers is None:
         return None, "a core without a list of layers, or parameters of each sample, run by torch operations"
     return layers, None
-
-
-def _outputs(core: ListedCore, layers: LayerList) -> tuple[np.ndarray, int]:
-    """Nodes that the network predicts, and components of each."""
-    last = layers.layers[-1]
-    predicted = torch.arange(layers.nodes[0])[core.predicted].numpy()
-    return predicted, last.count * len(last.weight) // max(len(predicted), 1)
 
 
 def _maths_of(program: StepProgram) -> tuple:

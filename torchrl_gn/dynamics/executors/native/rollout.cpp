@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdlib>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -251,7 +252,10 @@ void run_tiles(const Maths& m, const Network<T>& network, const Call& call, bool
     }
   };
   std::vector<std::thread> others;
-  for (int64_t i = 1; i < std::min(call.threads, tiles); ++i) others.emplace_back(work);
+  try {
+    for (int64_t i = 1; i < std::min(call.threads, tiles); ++i) others.emplace_back(work);
+  } catch (const std::system_error&) {  // the system has no more: those that there are do all tiles
+  }
   work();
   for (auto& other : others) other.join();
 }
@@ -269,7 +273,7 @@ void run(const Maths& m, const Network<T>& network, const Call& call, bool adjoi
 
 extern "C" {
 
-// All functions may be called from several threads at once, except that an update excludes all else.
+// All functions may be called from several threads at once.
 int64_t gn_version() { return 1; }
 
 void* gn_network_new(int64_t is_double, const int64_t* code, const void* const* weights, const void* const* tables) {
@@ -278,15 +282,6 @@ void* gn_network_new(int64_t is_double, const int64_t* code, const void* const* 
                                    reinterpret_cast<const double* const*>(tables));
   return new gn::Network<float>(code, reinterpret_cast<const float* const*>(weights),
                                 reinterpret_cast<const float* const*>(tables));
-}
-
-void gn_network_update(void* network, int64_t is_double, const void* const* weights, const void* const* tables) {
-  if (is_double)
-    static_cast<gn::Network<double>*>(network)->update(reinterpret_cast<const double* const*>(weights),
-                                                       reinterpret_cast<const double* const*>(tables));
-  else
-    static_cast<gn::Network<float>*>(network)->update(reinterpret_cast<const float* const*>(weights),
-                                                      reinterpret_cast<const float* const*>(tables));
 }
 
 void gn_network_delete(void* network, int64_t is_double) {

@@ -27,8 +27,13 @@ def trace(function: Callable[..., tuple[Tensor, ...]], *inputs: Array) -> list[A
     Raises:
         UntraceableError: names the operation that has no scalar form.
     """
-    with torch.no_grad():
-        return [_array(_unwrapped(each)) for each in function(*map(_Symbolic, inputs))]
+    try:
+        with torch.no_grad():
+            return [_array(_unwrapped(each)) for each in function(*map(_Symbolic, inputs))]
+    except UntraceableError:
+        raise
+    except Exception as error:  # whatever a feature of one's own does with a tensor that has no numbers
+        raise UntraceableError(f"The state maths has no scalar form: {type(error).__name__}: {error}") from error
 
 
 class _Symbolic(Tensor):
@@ -172,10 +177,15 @@ def _matmul(a: Any, b: Any) -> Array:
 
 
 def _solve(a: Any, b: Any, **kwargs: Any) -> tuple[Array, ...]:
-    """Solve symmetric positive definite systems, as all of ours are: by L D L^T."""
+    """Solve symmetric positive definite systems, as all of ours are: by L D L^T.
+
+    Others come out wrong, which the comparison of every trace with torch finds.
+    """
     a, b = _array(a), _array(b)
-    vector = b.ndim == a.ndim - 1
+    vector = b.ndim == 1 or b.shape == a.shape[:-1]
     b = b[..., None] if vector else b
+    batch = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    a, b = np.broadcast_to(a, (*batch, *a.shape[-2:])), np.broadcast_to(b, (*batch, *b.shape[-2:]))
     out = np.empty(b.shape, dtype=object)
     for where in np.ndindex(a.shape[:-2]):
         out[where] = _solve_one(a[where], b[where])
@@ -271,9 +281,9 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
     "sub": _add(-1),
     "rsub": lambda a, b, alpha=1: _add(-1)(b, a, alpha=alpha),
     "mul": _mul,
-    "div": lambda a, b: _object(_array(a) / _array(b)),
+    "div": _elementwise(ex.divide, 2),
     "neg": lambda a: -a,
-    "reciprocal": lambda a: _object(1.0 / a),
+    "reciprocal": lambda a: _elementwise(ex.divide, 2)(1.0, a),
     "pow": _pow,
     "sqrt": _elementwise(ex.sqrt, 1),
     "sin": _elementwise(ex.sin, 1),
