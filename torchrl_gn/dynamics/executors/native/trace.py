@@ -17,8 +17,10 @@ from torchrl_gn.dynamics.executors.native import expressions as ex
 Array = np.ndarray  # of objects: expressions and numbers
 
 
-class UntraceableError(TypeError):
+class UntraceableError(RuntimeError):
     """A function uses an operation that has no scalar form here."""
+
+    # No TypeError: Python would take one in a comparison for "not equal".
 
 
 def trace(function: Callable[..., tuple[Tensor, ...]], *inputs: Array) -> list[Array]:
@@ -63,6 +65,7 @@ class _Symbolic(Tensor):
             args, kwargs = tree_map_only(_Symbolic, _unwrapped, (args, kwargs))
             try:
                 out = _OPERATIONS[name](*args, **kwargs)
+                out = out if isinstance(out, (Tensor, tuple, list)) else _object(out)  # numpy's 0-d results are objects
             except NotImplementedError as error:
                 raise UntraceableError(f"The operation {function} has no scalar form here: {error}.") from error
             dtype = torch.bool if name in ("lt", "gt", "eq") else torch.float64
@@ -124,7 +127,7 @@ def _pow(a: Array, exponent: float) -> Array:
         raise NotImplementedError(f"exponent {exponent}")
     out = a
     for _ in range(int(exponent) - 1):
-        out = out * a
+        out = _object(out * a)
     return out
 
 
