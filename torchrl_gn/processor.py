@@ -72,9 +72,14 @@ def processor_name() -> str:
     return _cpuinfo().get("model name") or platform.processor() or platform.machine()
 
 
+def processor_flags() -> str:
+    """Return all that the system says the processor can do, separated by spaces; empty if it does not say."""
+    return _cpuinfo().get("flags") or _cpuinfo().get("Features") or ""
+
+
 def instruction_sets() -> str:
     """Return the processor's vector and matrix instruction sets, such as ``"AVX2, FMA"``."""
-    flags = set((_cpuinfo().get("flags") or _cpuinfo().get("Features") or "").split())
+    flags = set(processor_flags().split())
     known = {"avx2": "AVX2", "fma": "FMA", "avx512f": "AVX-512", "avx512_bf16": "AVX-512 BF16"}
     known |= {"avx512_fp16": "AVX-512 FP16", "amx_tile": "AMX", "amx_bf16": "AMX BF16"}
     known |= {"asimd": "NEON", "sve": "SVE", "bf16": "BF16"}

@@ -10,13 +10,17 @@ import warnings
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import source
-from torchrl_gn.dynamics.executors.native.executor import DTYPES, list_layers, trace_states
+from torchrl_gn.dynamics.executors.native.executor import list_layers
+from torchrl_gn.dynamics.executors.native.library import DTYPES
+from torchrl_gn.dynamics.executors.native.state_maths import may_be_constant
+from torchrl_gn.dynamics.executors.native.traced_program import trace_states
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.dynamics.specialized import SpecializedPredictor, specialize
@@ -100,7 +104,9 @@ def export_c(predictor: Predictor, folder: str | os.PathLike, states: Tensor | N
     if states.shape[-2:] != shape or not states.numel():
         raise ValueError(f"states must be [*B, {shape[0]}, {shape[1]}], got {list(states.shape)}.")
     rest = states.reshape(-1, *shape)[0].double().numpy()
-    maths = trace_states(program, layers, states)
+    flat = states.reshape(-1, *shape).double().numpy()
+    constant = may_be_constant(program, rest) & (np.abs(flat - rest) <= 1e-10 * (1 + np.abs(rest))).all(0)
+    maths = trace_states(program, layers, rest, constant)
     names = getattr(scene, "actuator_names", [f"command {index}" for index in range(scene.num_actions)])
     about = source.Description(
         name=folder.name,

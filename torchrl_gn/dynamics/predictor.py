@@ -106,10 +106,7 @@ class Predictor(TensorDictModuleBase):
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the network."""
-        core = self.model.core
-        # Not of parameters() first: under TorchRL's losses weights may be plain tensors.
-        linear = (each.weight for each in core.modules() if isinstance(each, nn.Linear))
-        return next(itertools.chain(linear, core.parameters())).dtype
+        return dtype_of(self.model.core)
 
     @property
     def recurrent(self) -> bool:
@@ -296,3 +293,10 @@ class Predictor(TensorDictModuleBase):
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"
+
+
+def dtype_of(core: nn.Module) -> torch.dtype:
+    """Dtype of a network's weights."""
+    # Not of parameters() first: under TorchRL's losses weights may be plain tensors.
+    linear = (each.weight for each in core.modules() if isinstance(each, nn.Linear))
+    return next(itertools.chain(linear, core.parameters())).dtype

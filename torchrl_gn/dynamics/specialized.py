@@ -15,9 +15,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics import operators
 from torchrl_gn.dynamics.checks import UnseenParameterWarning
-from torchrl_gn.dynamics.executors import EXECUTORS
+from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor
 from torchrl_gn.dynamics.normalization import scaled, static_graph
-from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.dynamics.predictor import Predictor, dtype_of
 from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
@@ -71,7 +71,7 @@ class SpecializedPredictor(Predictor):
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the products."""
-        return self._dtype or super().dtype
+        return self._dtype or dtype_of(self.model.core)
 
     @property
     def fixed_batch(self) -> bool:
@@ -82,7 +82,13 @@ class SpecializedPredictor(Predictor):
         self._weights = _Watched([])
 
     def executor(self, parameters: TensorDictBase | None = None) -> Executor:
-        """What runs the step, from a snapshot of the weights as they are now."""
+        """What runs the step, from a snapshot of the weights as they are now.
+
+        Within ``torch.compile`` it folds in the compiled code, which then follows the weights.
+        """
+        if torch.compiler.is_compiling():
+            with torch.no_grad():
+                return EagerExecutor(super().program(parameters))
         if self._executor is None or not self._is_current(parameters):
             # Tensors made in inference mode could be neither overwritten nor differentiated outside.
             with torch.inference_mode(False), torch.no_grad():
@@ -164,7 +170,7 @@ class SpecializedPredictor(Predictor):
         """What one prediction handles in the reference model, and here."""
         program, core, size = self.executor().program, self.model.core, self.model.dynamic_size
         nodes, edges = self.scene.num_nodes, self.scene.num_edges
-        static = static_graph(self, self.scene_parameters, super().dtype)
+        static = static_graph(self, self.scene_parameters, dtype_of(core))
         kept_nodes, kept_edges = _width(program.nodes, size.nodes), _width(program.edges, size.edges)
 
         def graph(nodes_: int, edges_: int, dtype: torch.dtype) -> Graph:
@@ -175,7 +181,7 @@ class SpecializedPredictor(Predictor):
             return graph_concat(dynamic, dynamic.zeros(core.hidden_size)) if core.recurrent else dynamic
 
         with FlopCounterMode(display=False) as plain, torch.no_grad():
-            core(graph_concat(graph(size.nodes, size.edges, super().dtype), static))
+            core(graph_concat(graph(size.nodes, size.edges, dtype_of(core)), static))
         with FlopCounterMode(display=False) as quick, torch.no_grad():
             program.core.predict(graph(kept_nodes, kept_edges, self.dtype))
         rows = {

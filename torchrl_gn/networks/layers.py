@@ -74,7 +74,7 @@ class LayerList:
             code += [layer.count, len(layer.weight), activation, len(layer.inputs), len(layer.added)]
             for gather in (*layer.inputs, *layer.added):
                 code += [gather.source, *gather.offsets.tolist(), *gather.items.tolist()]
-        return torch.tensor(code)
+        return torch.tensor(code, device="cpu")
 
     def tensors(self) -> tuple[list[Tensor], list[Tensor | None]]:
         """Weights and tables of all layers, contiguous."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 from torch.nn import functional as F
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
@@ -29,18 +30,24 @@ def linear(pairs, table=None, matrix=None, items=None, activation: str | None = 
         items: ``[J, B, h]``.
         activation: one of :data:`ACTIVATIONS`, or none.
     """
-    relu = activation == "relu"
+    relu, plain = activation == "relu", needs_plain_operations()
     used = [tensor for pair in pairs if pair[0].shape[-1] for tensor in pair]
     if not used and items is None and table is not None:  # nothing varies
         out = table.expand(-1, pairs[0][0].shape[1], -1)
         out = F.relu(out) if relu else out
     else:
-        layer = _plain_layer if torch.compiler.is_compiling() else _Layer.apply
-        out = layer(relu, table, matrix, items, *used)
+        out = (_plain_layer if plain else _Layer.apply)(relu, table, matrix, items, *used)
     if relu or activation is None:
         return out
-    in_place = activation == "silu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling() and bool(used)
+    in_place = activation == "silu" and not torch.is_grad_enabled() and not plain and bool(used)
     return F.silu(out, inplace=True) if in_place else _FUNCTIONS[activation](out)
+
+
+def needs_plain_operations() -> bool:
+    """Whether a compiler, a transform of ``torch.func`` or forward-mode differentiation must see every operation."""
+    return (
+        torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
+    )
 
 
 def product(matrix: Tensor, items: Tensor) -> Tensor:
@@ -54,8 +61,6 @@ class _Layer(torch.autograd.Function):
     @classmethod
     def apply(cls, *inputs):  # pyright: ignore[reportIncompatibleMethodOverride]
         """As torch's own, which looks up the signature of ``forward`` each time: longer than a small layer takes."""
-        if torch._C._are_functorch_transforms_active():
-            return super().apply(*inputs)
         return super(torch.autograd.Function, cls).apply(*inputs)  # pyright: ignore[reportAttributeAccessIssue]
 
     @staticmethod
@@ -99,7 +104,7 @@ class _Layer(torch.autograd.Function):
 
 
 def _plain_layer(relu, table, matrix, items, *pairs):
-    """:class:`_Layer` in single operations, for a compiler to fuse."""
+    """:class:`_Layer` in single operations."""
     terms = [F.linear(x, weight) for x, weight in zip(pairs[::2], pairs[1::2], strict=True)]
     if items is not None:
         terms.append(product(matrix, items))

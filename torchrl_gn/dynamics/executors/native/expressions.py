@@ -10,6 +10,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 # Operations and their number of operands that are expressions; "c" at the end: the last operand is a constant.
 OPERATIONS = {
     name: arity
@@ -24,6 +26,12 @@ OPERATIONS = {
     for name in names.split()
 }
 """``sub_c`` is constant - x and ``div_c`` constant / x; ``madd`` is a * b + c, ``nmadd`` c - a * b."""
+
+
+class UntraceableError(RuntimeError):
+    """A function uses an operation that has no scalar form here."""
+
+    # No TypeError: Python would take one in a comparison for "not equal".
 
 
 class Expressions:
@@ -122,14 +130,25 @@ def zero_times(x: Any) -> Any:
     return x.graph.make("mul_c", (x.index,), 0.0) if isinstance(x, Scalar) else 0.0
 
 
+def divide(a: Any, b: Any) -> Any:
+    """``a / b``, of numbers as torch divides them, by zero too."""
+    if isinstance(a, Scalar) or isinstance(b, Scalar):
+        return a / b
+    with np.errstate(all="ignore"):
+        return float(np.float64(a) / np.float64(b))
+
+
 def _function(operation: str, of_number: Callable[[float], float]) -> Callable[[Any], Any]:
     def apply(x: Any) -> Any:
-        return x._one(operation) if isinstance(x, Scalar) else of_number(float(x))
+        if isinstance(x, Scalar):
+            return x._one(operation)
+        with np.errstate(all="ignore"):
+            return float(of_number(float(x)))
 
     return apply
 
 
-sqrt, sin, cos = (_function(name, getattr(math, name)) for name in ("sqrt", "sin", "cos"))
+sqrt, sin, cos = (_function(name, getattr(np, name)) for name in ("sqrt", "sin", "cos"))
 absolute = _function("abs", abs)
 
 
@@ -157,7 +176,7 @@ def _extreme(name: str, of_numbers: Callable) -> Callable[[Any, Any], Any]:
     return apply
 
 
-maximum, minimum = _extreme("max", max), _extreme("min", min)
+maximum, minimum = _extreme("max", np.maximum), _extreme("min", np.minimum)
 
 
 def atan2(y: Any, x: Any) -> Any:
@@ -210,7 +229,7 @@ _PULL: dict[str, Callable[..., tuple[Any, ...]]] = {
     "sqrt": lambda g, out, c, a: (g * (0.5 / out),),
     "sin": lambda g, out, c, a: (g * cos(a),),
     "cos": lambda g, out, c, a: (-(g * sin(a)),),
-    "abs": lambda g, out, c, a: (where(a < 0.0, -g, g),),
+    "abs": lambda g, out, c, a: (where(a < 0.0, -g, where(a > 0.0, g, 0.0)),),
     "max_c": lambda g, out, c, a: (where(a < c, 0.0, g),),
     "min_c": lambda g, out, c, a: (where(a > c, 0.0, g),),
     "less_c": lambda g, out, c, a: (0.0,),

@@ -1,86 +1,25 @@
-"""Build the C++ code once for this processor, and call it."""
+"""Call the C++ code."""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
-import hashlib
-import os
-import platform
-import shutil
-import subprocess
-import sys
-import tempfile
+import threading
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.atomic import atomic_path
+from torchrl_gn.dynamics.executors.native import build
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
 from torchrl_gn.dynamics.executors.native.tape import Tape
 from torchrl_gn.networks.layers import LayerList
-from torchrl_gn.processor import processor_name
 
-SOURCES = sorted(path for path in Path(__file__).parent.iterdir() if path.suffix in (".h", ".cpp"))
-_OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno", "-pthread")
+TILE = 24  # samples that stay in a processor's cache from layer to layer
+DTYPES = {torch.float32: 0, torch.float64: 1}  # as the C++ code tells them apart
 _P, _I = ctypes.c_void_p, ctypes.c_int64
-
-
-class NoCompilerError(FileNotFoundError):
-    """There is no C++ compiler, or it failed."""
-
-
-@functools.cache
-def load_library() -> ctypes.CDLL:
-    """The compiled code, built at the first use on a processor and kept in ``~/.cache/torchrl_gn`` (10 s).
-
-    Raises:
-        NoCompilerError: without a working C++ compiler (``CXX``, else c++, g++ or clang++).
-    """
-    compiler = os.environ.get("CXX") or next(filter(shutil.which, ("c++", "g++", "clang++")), None)
-    if compiler is None or shutil.which(compiler) is None:
-        raise NoCompilerError("There is no C++ compiler: install g++ for the native executor.")
-    options = [*_OPTIONS, *instruction_flags(), *os.environ.get("TORCHRL_GN_CXXFLAGS", "").split()]
-    version = _run([compiler, "--version"]).splitlines()[0]
-    text = "\n".join([compiler, version, *options, processor_name(), sys.platform, *(p.read_text() for p in SOURCES)])
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
-    name = f"native-{hashlib.sha256(text.encode()).hexdigest()[:16]}.so"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError:  # no home to write to
-        folder = Path(tempfile.mkdtemp(prefix="torchrl_gn-"))
-    file = folder / name
-    if file.exists():
-        with contextlib.suppress(OSError, AttributeError):  # damaged: build again
-            return _declared(ctypes.CDLL(str(file)))
-    sys.stderr.write("Building the native executor for this processor, once: about 20 s.\n")
-    with atomic_path(file) as temporary:
-        source = next(path for path in SOURCES if path.suffix == ".cpp")
-        _run([compiler, *options, str(source), "-o", str(temporary)])
-    return _declared(ctypes.CDLL(str(file)))
-
-
-def instruction_flags() -> list[str]:
-    """Compiler flags for what torch uses of this processor, which ``ATEN_CPU_CAPABILITY`` restricts."""
-    if platform.machine().lower() not in ("x86_64", "amd64"):
-        return []
-    sets = {"AVX512": ["-march=native"], "AVX2": ["-mavx2", "-mfma"]}
-    return sets.get(torch.backends.cpu.get_cpu_capability(), [])
-
-
-def _run(command: Sequence[str]) -> str:
-    try:
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    except (OSError, subprocess.CalledProcessError) as error:
-        text = getattr(error, "stderr", "") or str(error)
-        raise NoCompilerError(f"The C++ compiler failed: {' '.join(command)}\n{text[-2000:]}") from error
 
 
 class _Array(ctypes.Structure):
@@ -126,10 +65,12 @@ class _Call(ctypes.Structure):
     )
 
 
-def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
+@functools.cache
+def load_library() -> ctypes.CDLL:
+    """The compiled code; NoCompilerError if it cannot be built."""
+    library = build.load_code()
     signatures: dict[str, tuple[Any, list]] = {
         "gn_network_new": (_P, [_I, _P, _P, _P]),
-        "gn_network_update": (None, [_P, _I, _P, _P]),
         "gn_network_delete": (None, [_P, _I]),
         "gn_has_bfloat16": (_I, []),
         "gn_stored": (_I, [_P, _I, _P, _P]),
@@ -152,35 +93,30 @@ class NativeNetwork:
         self.library, self.dtype = load_library(), dtype
         self.kind = {torch.float32: 0, torch.float64: 1, torch.bfloat16: 2}[dtype]
         if self.kind == 2 and not self.library.gn_has_bfloat16():
-            raise TypeError("the native executor multiplies no bfloat16 on this processor")
-        self.code = layers.code().contiguous()
-        self.kept = _pointers(layers, self.number)
-        self.pointer = self.library.gn_network_new(self.kind, self.code.data_ptr(), *self.kept[:2])
+            raise TypeError("This processor multiplies no bfloat16.")
+        self.code, number = layers.code().contiguous(), self.number
+        weights, tables = layers.tensors()
+        self.weights = [each.detach().to(number) for each in weights]
+        self.tables = [None if each is None else each.detach().to(number) for each in tables]
+        addresses = pointers(self.weights), pointers(self.tables)
+        self.pointer = self.library.gn_network_new(self.kind, self.code.data_ptr(), *addresses)
+        # Numbers of a sample and step that its gradient needs: slopes of the activations, and the output.
+        sizes = [layer.count * len(layer.weight) for layer in layers.layers]
+        slopes = [size for size, layer in zip(sizes, layers.layers, strict=True) if layer.activation is not None]
+        self.kept = sum(slopes) + sizes[-1]
 
     @property
     def number(self) -> torch.dtype:
         """Dtype of sums, weights and tables."""
         return torch.float64 if self.kind == 1 else torch.float32
 
-    def fits(self, layers: LayerList, dtype: torch.dtype) -> bool:
-        """Whether the network differs in its weights alone."""
-        return dtype == self.dtype and torch.equal(layers.code(), self.code)
-
-    def update(self, layers: LayerList) -> None:
-        """Take other weights; no call may be running."""
-        self.kept = _pointers(layers, self.number)
-        self.library.gn_network_update(self.pointer, self.kind, *self.kept[:2])
+    def equals(self, other: NativeNetwork) -> bool:
+        """Whether both are the same but for their weights."""
+        return self.dtype == other.dtype and torch.equal(self.code, other.code)
 
     def __del__(self) -> None:
         if (pointer := getattr(self, "pointer", None)) is not None:
             self.library.gn_network_delete(pointer, self.kind)
-
-
-def _pointers(layers: LayerList, dtype: torch.dtype) -> tuple[Any, Any, Any]:
-    weights, tables = layers.tensors()
-    weights = [each.detach().to(dtype) for each in weights]
-    tables = [None if each is None else each.detach().to(dtype) for each in tables]
-    return pointers(weights), pointers(tables), (weights, tables)
 
 
 def pointers(tensors: Sequence[Tensor | None]) -> Any:
@@ -192,7 +128,7 @@ class NativeMaths:
     """State maths of one scene in the form that the C++ code reads."""
 
     def __init__(self, maths: StateMaths, layers: LayerList) -> None:
-        self.maths = maths
+        self.maths, self._lock = maths, threading.Lock()
         last = layers.layers[-1]
         self._kept: list[Any] = []
         self.struct = _Maths(
@@ -218,8 +154,14 @@ class NativeMaths:
 
     def add_adjoint(self) -> None:
         """Prepare gradients; once."""
-        if not self.struct.adjoint.instructions:
-            self.struct.adjoint = self._tape(self.maths.adjoint)
+        with self._lock:
+            if not self.struct.adjoint.instructions:
+                self.struct.adjoint = self._tape(self.maths.adjoint)
+
+    def fits(self, states: np.ndarray) -> np.ndarray:
+        """Which of flat states ``[count, N * C]`` have these constant channels, as ``gn_rollout`` finds."""
+        difference = np.abs(states[:, self.maths.constant] - self.maths.values)
+        return (difference <= 1e-9 * (1 + np.abs(self.maths.values))).all(1)
 
     def _tape(self, tape: Tape) -> _Tape:
         ends = np.array(tape.phases, dtype=np.int32)
@@ -238,34 +180,48 @@ class NativeMaths:
 NOTHING = (None, 0)  # no array
 
 
-def stored_count(network: NativeNetwork, maths: NativeMaths, call: tuple) -> int:
-    """Numbers that a call keeps for its adjoint."""
-    return network.library.gn_stored(network.pointer, network.kind, maths.reference, ctypes.byref(_Call(*call)))
+def forward_call(
+    state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None, result: Tensor | None = None
+) -> tuple[tuple, Tensor]:
+    """Fields of a call for contiguous inputs, and its result.
+
+    That is the next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``; or
+    shaped like ``result``.
+    """
+    shape, threads = state.shape, torch.get_num_threads()
+    size = shape[-2] * shape[-1]
+    count, steps = state.numel() // size, actions.shape[-2] if many else 1
+    out_shape = (*shape[:-2], steps + 1, *shape[-2:]) if many else shape if result is None else result.shape
+    out = torch.empty(out_shape, dtype=state.dtype, device="cpu")
+    tile = min(TILE, -(-count // threads))  # such that there are tiles for all threads
+    call = (
+        *(count, steps, tile, threads),
+        *((state.data_ptr(), DTYPES[state.dtype]), size, (actions.data_ptr(), DTYPES[actions.dtype])),
+        *((out.data_ptr(), DTYPES[out.dtype]), many, NOTHING, NOTHING),
+        *(None if stored is None else stored.data_ptr(), 0, None, None),
+    )
+    return call, out
 
 
-class Pool:
-    """Buffers that are used again: fresh pages cost as much as filling them."""
+def adjoint_call(
+    sizes: tuple, states: Tensor, actions: Tensor, gradient: Tensor, many: bool, stored: Tensor | None
+) -> tuple[tuple, Tensor, Tensor]:
+    """Fields of the call for the gradient of another, whose first fields are ``sizes``; gradients of state and actions.
 
-    def __init__(self) -> None:
-        self.free: list[Tensor] = []
-
-    def take(self, count: int, dtype: torch.dtype) -> Lease:
-        """A buffer of at least ``count`` numbers."""
-        for index, buffer in enumerate(self.free):
-            if count <= buffer.numel() <= 2 * count and buffer.dtype == dtype:
-                return Lease(self, self.free.pop(index))
-        self.free.clear()  # other batches are coming
-        return Lease(self, torch.empty(count, dtype=dtype))
-
-
-class Lease:
-    """A buffer that goes back to its pool with this object."""
-
-    def __init__(self, pool: Pool, tensor: Tensor) -> None:
-        self.pool, self.tensor = pool, tensor
-
-    def __del__(self) -> None:
-        self.pool.free = [*self.pool.free[-1:], self.tensor]
+    ``states`` are the start states, or for ``many`` all.
+    """
+    size = states.shape[-2] * states.shape[-1]
+    shape = (*states.shape[:-3], *states.shape[-2:]) if many else states.shape
+    of_state = torch.empty(shape, dtype=states.dtype, device="cpu")
+    of_actions = torch.empty_like(actions)
+    call = (
+        *sizes,
+        *((states.data_ptr(), DTYPES[states.dtype]), size * (sizes[1] + 1 if many else 1)),
+        *((actions.data_ptr(), DTYPES[actions.dtype]), (gradient.data_ptr(), DTYPES[gradient.dtype]), many),
+        *((of_state.data_ptr(), DTYPES[states.dtype]), (of_actions.data_ptr(), DTYPES[actions.dtype])),
+        *(None if stored is None else stored.data_ptr(), 0, None, None),
+    )
+    return call, of_state, of_actions
 
 
 def rollout(network: NativeNetwork, maths: NativeMaths, call: tuple) -> bool:
@@ -279,3 +235,9 @@ def rollout_adjoint(network: NativeNetwork, maths: NativeMaths, call: tuple) -> 
     maths.add_adjoint()
     reference = ctypes.byref(_Call(*call))
     network.library.gn_rollout_adjoint(network.pointer, network.kind, maths.reference, reference)
+
+
+def trained_count(network: NativeNetwork, sizes: tuple) -> int:
+    """Numbers that a step keeps for gradients of weights; ``sizes`` are a call's first fields."""
+    call = _Call(*sizes, train=1)
+    return network.library.gn_stored(network.pointer, network.kind, ctypes.byref(_Maths()), ctypes.byref(call))

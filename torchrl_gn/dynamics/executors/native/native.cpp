@@ -5,7 +5,7 @@
 
 extern "C" {
 
-// All functions may be called from several threads at once, except that an update excludes all else.
+// All functions may be called from several threads at once.
 
 // Whether kind 2 is there.
 GN_API int64_t gn_has_bfloat16() {
@@ -22,14 +22,6 @@ GN_API void* gn_network_new(int64_t kind, const int64_t* code, const void* const
 #endif
   return kind == 1 ? gn::make<gn::Network<double>>(code, weights, tables)
                    : gn::make<gn::Network<float>>(code, weights, tables);
-}
-
-GN_API void gn_network_update(void* network, int64_t kind, const void* const* weights, const void* const* tables) {
-  gn::with_network(network, kind, [&](const auto& known) {
-    using Net = std::decay_t<decltype(known)>;
-    using T = typename Net::Number;
-    const_cast<Net&>(known).update(reinterpret_cast<const T* const*>(weights), reinterpret_cast<const T* const*>(tables));
-  });
 }
 
 GN_API void gn_network_delete(void* network, int64_t kind) {

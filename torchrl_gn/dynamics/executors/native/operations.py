@@ -30,12 +30,13 @@ def _elementwise(function: Callable, arity: int) -> Callable:
     vectorized = np.frompyfunc(function, arity, 1)
 
     def apply(*args: Any, **kwargs: Any) -> Array:
-        return _object(vectorized(*map(to_array, args[:arity])))
+        return as_object(vectorized(*map(to_array, args[:arity])))
 
     return apply
 
 
-def _object(value: Any) -> Array:
+def as_object(value: Any) -> Array:
+    """An array, or one expression or number as an array without dimensions."""
     if isinstance(value, np.ndarray):
         return value
     found = np.empty((), dtype=object)
@@ -45,15 +46,15 @@ def _object(value: Any) -> Array:
 
 def _add(sign: int) -> Callable:
     def apply(a: Any, b: Any, *, alpha: float = 1) -> Array:
-        return _object(to_array(a) + to_array(b) * (sign * alpha))
+        return as_object(to_array(a) + to_array(b) * (sign * alpha))
 
     return apply
 
 
 def _mul(a: Any, b: Any) -> Array:
     if not isinstance(b, (Tensor, np.ndarray)) and b == 0:
-        return _object(np.frompyfunc(ex.zero_times, 1, 1)(a))
-    return _object(to_array(a) * to_array(b))
+        return as_object(np.frompyfunc(ex.zero_times, 1, 1)(a))
+    return as_object(to_array(a) * to_array(b))
 
 
 def _pow(a: Array, exponent: float) -> Array:
@@ -63,7 +64,7 @@ def _pow(a: Array, exponent: float) -> Array:
         raise NotImplementedError(f"exponent {exponent}")
     out = a
     for _ in range(int(exponent) - 1):
-        out = out * a
+        out = as_object(out * a)
     return out
 
 
@@ -112,14 +113,19 @@ def _norm(a: Array, order: float = 2, dim: Any = None, keepdim: bool = False, **
 
 def _matmul(a: Any, b: Any) -> Array:
     a, b = to_array(a), to_array(b)
-    return _object(np.matmul(a, b)) if a.size and b.size else np.full((*a.shape[:-1], b.shape[-1]), 0.0, dtype=object)
+    return as_object(np.matmul(a, b)) if a.size and b.size else np.full((*a.shape[:-1], b.shape[-1]), 0.0, dtype=object)
 
 
 def _solve(a: Any, b: Any, **kwargs: Any) -> tuple[Array, ...]:
-    """Solve symmetric positive definite systems, as all of ours are: by L D L^T."""
+    """Solve symmetric positive definite systems, as all of ours are: by L D L^T.
+
+    Others come out wrong, which the comparison of every trace with torch finds.
+    """
     a, b = to_array(a), to_array(b)
-    vector = b.ndim == a.ndim - 1
+    vector = b.ndim == 1 or b.shape == a.shape[:-1]
     b = b[..., None] if vector else b
+    batch = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    a, b = np.broadcast_to(a, (*batch, *a.shape[-2:])), np.broadcast_to(b, (*batch, *b.shape[-2:]))
     out = np.empty(b.shape, dtype=object)
     for where in np.ndindex(a.shape[:-2]):
         out[where] = _solve_one(a[where], b[where])
@@ -156,7 +162,7 @@ def _slice(a: Array, dim: int = 0, start: int | None = None, end: int | None = N
 
 def _index(a: Any, indices: Sequence[Any]) -> Array:
     keys = tuple(slice(None) if each is None else np.asarray(each.numpy(force=True)) for each in indices)
-    return _object(to_array(a)[keys])
+    return as_object(to_array(a)[keys])
 
 
 def _cat(parts: Sequence[Any], dim: int = 0) -> Array:
@@ -199,7 +205,7 @@ def _same(a: Array, *args: Any, **kwargs: Any) -> Array:
 
 def _linear(a: Any, weight: Any, bias: Any = None) -> Array:
     out = _matmul(a, to_array(weight).T)
-    return out if bias is None else _object(out + to_array(bias))
+    return out if bias is None else as_object(out + to_array(bias))
 
 
 PRODUCTS: dict[Any, Callable[..., Array]] = {
@@ -215,9 +221,9 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "sub": _add(-1),
     "rsub": lambda a, b, alpha=1: _add(-1)(b, a, alpha=alpha),
     "mul": _mul,
-    "div": lambda a, b: _object(to_array(a) / to_array(b)),
+    "div": _elementwise(ex.divide, 2),
     "neg": lambda a: -a,
-    "reciprocal": lambda a: _object(1.0 / a),
+    "reciprocal": lambda a: _elementwise(ex.divide, 2)(1.0, a),
     "pow": _pow,
     "sqrt": _elementwise(ex.sqrt, 1),
     "sin": _elementwise(ex.sin, 1),
@@ -245,8 +251,8 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "squeeze": _squeeze,
     "unsqueeze": _unsqueeze,
     "slice": _slice,
-    "select": lambda a, dim, index: _object(np.take(a, index, axis=dim)),
-    "index_select": lambda a, dim, index: _object(np.take(to_array(a), index.numpy(force=True), axis=dim)),
+    "select": lambda a, dim, index: as_object(np.take(a, index, axis=dim)),
+    "index_select": lambda a, dim, index: as_object(np.take(to_array(a), index.numpy(force=True), axis=dim)),
     "index": _index,
     "cat": _cat,
     "split_with_sizes": _split,

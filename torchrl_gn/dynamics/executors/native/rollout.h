@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdlib>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -324,7 +325,10 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
       }
   };
   std::vector<std::thread> others;
-  for (int64_t i = 1; i < std::min(call.threads, parts); ++i) others.emplace_back(work);
+  try {
+    for (int64_t i = 1; i < std::min(call.threads, parts); ++i) others.emplace_back(work);
+  } catch (const std::system_error&) {  // the system has no more: those that there are do all tiles
+  }
   work();
   for (auto& other : others) other.join();
   gradients.write(call, weights, tables);

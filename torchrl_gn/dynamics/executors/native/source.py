@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_gn.dynamics.executors.native.executor import TILE
-from torchrl_gn.dynamics.executors.native.library import SOURCES
+from torchrl_gn.dynamics.executors.native.build import SOURCES
+from torchrl_gn.dynamics.executors.native.library import TILE
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
 from torchrl_gn.dynamics.executors.native.tape import Tape
 from torchrl_gn.networks.layers import LayerList

@@ -128,8 +128,8 @@ void run_tape(const Tape& tape, int phase, double* registers) {
   INSTRUCTION(MUL, a[i] * b[i])
   INSTRUCTION(DIV, a[i] / b[i])
   INSTRUCTION(ATAN2, (each_pair(a[i], b[i], [](double y, double x) { return std::atan2(y, x); })))
-  INSTRUCTION(MAX, select<V>(a[i] < b[i], b[i], a[i]))
-  INSTRUCTION(MIN, select<V>(b[i] < a[i], b[i], a[i]))
+  INSTRUCTION(MAX, select<V>((a[i] < b[i]) | (b[i] != b[i]), b[i], a[i]))  // NaN if either is
+  INSTRUCTION(MIN, select<V>((b[i] < a[i]) | (b[i] != b[i]), b[i], a[i]))
   INSTRUCTION(LESS, select<V>(a[i] < b[i], one, zero))
   INSTRUCTION(MADD_C, a[i] * k + b[i])
   INSTRUCTION(WHERE, select<V>(a[i] != 0, b[i], c[i]))

@@ -11,11 +11,8 @@ from torch import Tensor
 from torch._decomp import decomposition_table
 from torch.utils._pytree import tree_map_only
 
-from torchrl_gn.dynamics.executors.native.operations import OPERATIONS, PRODUCTS, Array, to_array
-
-
-class UntraceableError(TypeError):
-    """A function uses an operation that has no scalar form here."""
+from torchrl_gn.dynamics.executors.native.expressions import UntraceableError
+from torchrl_gn.dynamics.executors.native.operations import OPERATIONS, PRODUCTS, Array, as_object, to_array
 
 
 def trace(function: Callable[..., tuple[Tensor, ...]], *inputs: Array) -> list[Array]:
@@ -24,8 +21,13 @@ def trace(function: Callable[..., tuple[Tensor, ...]], *inputs: Array) -> list[A
     Raises:
         UntraceableError: names the operation that has no scalar form.
     """
-    with torch.no_grad():
-        return [to_array(_unwrapped(each)) for each in function(*map(_Symbolic, inputs))]
+    try:
+        with torch.no_grad():
+            return [to_array(_unwrapped(each)) for each in function(*map(_Symbolic, inputs))]
+    except UntraceableError:
+        raise
+    except Exception as error:  # whatever a feature of one's own does with a tensor that has no numbers
+        raise UntraceableError(f"The state maths has no scalar form: {type(error).__name__}: {error}") from error
 
 
 class _Symbolic(Tensor):
@@ -55,6 +57,9 @@ class _Symbolic(Tensor):
             args, kwargs = tree_map_only(_Symbolic, _unwrapped, (args, kwargs))
             try:
                 out = OPERATIONS[name](*args, **kwargs)
+                out = (
+                    out if isinstance(out, (Tensor, tuple, list)) else as_object(out)
+                )  # numpy's 0-d results are objects
             except NotImplementedError as error:
                 raise UntraceableError(f"The operation {function} has no scalar form here: {error}.") from error
             dtype = torch.bool if name in ("lt", "gt", "eq") else torch.float64

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import library
-from torchrl_gn.dynamics.executors.native.executor import DTYPES, TILE, NativeExecutor, NotTracedError
+from torchrl_gn.dynamics.executors.native.executor import NativeExecutor
+from torchrl_gn.dynamics.executors.native.trace import UntraceableError
+from torchrl_gn.dynamics.executors.native.traced_program import MixedStatesError
 from torchrl_gn.networks.graph import Graph
-from torchrl_gn.networks.layers import LayerList
 
 
 class NativeDelta(NativeExecutor):
@@ -24,22 +25,13 @@ class NativeDelta(NativeExecutor):
 
     change = True
 
-    def _packed(self, network: library.NativeNetwork, layers: LayerList) -> library.NativeNetwork:
-        # Gradients of earlier predictions, with other weights, may be asked for later: leave their network as it is.
-        for kept, tensors in zip(network.kept[2], layers.tensors(), strict=True):
-            for before, now in zip(kept, tensors, strict=True):
-                if before is not None and not torch.equal(before, now):  # pyright: ignore[reportArgumentType]
-                    return library.NativeNetwork(layers, network.dtype)
-        return network
-
     def delta(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         """Predicted change ``[*B, N, 12]``, as :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
-        if self._runs(state, action) and self.program.dtype in DTYPES:
-            assert self.layers is not None
+        if self.layers is not None and self.program.dtype in library.DTYPES and self._runs(state, action):
             weights, tables = self.layers.tensors()
             try:
                 return _Trained.apply(self, state, action, *weights, *tables), None  # pyright: ignore[reportReturnType]
-            except NotTracedError:
+            except (MixedStatesError, UntraceableError):
                 pass
         return eager.delta(self.program, state, action, hidden)
 
@@ -47,41 +39,28 @@ class NativeDelta(NativeExecutor):
 class _Trained(torch.autograd.Function):
     @staticmethod
     def forward(ctx, executor: NativeDelta, state: Tensor, action: Tensor, *tensors: Tensor | None) -> Tensor:
-        state, action, network = state.contiguous(), action.contiguous(), executor.network
-        assert network is not None
-        count, threads, size = state.shape[:-2].numel(), torch.get_num_threads(), state.shape[-2] * state.shape[-1]
-        out = torch.empty((*state.shape[:-1], executor.program.layout.delta_size), dtype=state.dtype)
-        executor.prepare(state)
-        start = (count, 1, min(TILE, count), threads, _array(state), size, _array(action))
-        while True:
-            maths = executor.maths
-            assert maths is not None
-            call = (*start, _array(out), 0, library.NOTHING, library.NOTHING)
-            size = library.stored_count(network, maths, (*call, None, 1, None, None))
-            stored = executor.pool.take(size, network.number)
-            if library.rollout(network, maths, (*call, stored.tensor.data_ptr(), 1, None, None)):
-                break
-            executor.trace(state)
+        state, action = state.contiguous(), action.contiguous()
+        assert executor.native is not None
+        network, traced = executor.native
+        shape = state.new_empty((*state.shape[:-1], executor.program.layout.delta_size), device="meta")
+        call, out = library.forward_call(state, action, False, result=shape)
+        sizes = *call[:2], min(library.TILE, call[0]), call[3]  # a tile, and so the sums, whatever the threads
+        ctx.stored = executor.pool.take(library.trained_count(network, sizes), network.number)
+        call = (*sizes, *call[4:-4], ctx.stored.tensor.data_ptr(), 1, None, None)
+        ctx.maths = traced.run(network, call, state, action)
         ctx.save_for_backward(state, action)
-        ctx.start, ctx.maths, ctx.network, ctx.stored = start, maths, network, stored
+        ctx.network, ctx.sizes = network, sizes
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         network, (state, action) = ctx.network, ctx.saved_tensors
-        gradient = gradient.contiguous()
-        of_state, of_action = torch.empty_like(state), torch.empty_like(action)
-        packed = network.kept[2]
+        packed = network.weights, network.tables
         weights, tables = ([None if each is None else torch.empty_like(each) for each in part] for part in packed)
         addresses = library.pointers(weights), library.pointers(tables)
-        call = (
-            *(*ctx.start, _array(gradient), 0, _array(of_state), _array(of_action)),
-            *(ctx.stored.tensor.data_ptr(), 1, *map(ctypes.addressof, addresses)),
+        call, of_state, of_action = library.adjoint_call(
+            ctx.sizes, state, action, gradient.contiguous(), False, ctx.stored.tensor
         )
-        library.rollout_adjoint(network, ctx.maths, call)
+        library.rollout_adjoint(network, ctx.maths, (*call[:-3], 1, *map(ctypes.addressof, addresses)))
         return None, of_state, of_action, *weights, *tables
-
-
-def _array(tensor: Tensor) -> tuple[int, int]:
-    return tensor.data_ptr(), DTYPES[tensor.dtype]

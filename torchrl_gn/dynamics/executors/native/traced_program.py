@@ -1,0 +1,137 @@
+"""The state maths of a program, traced when states need it and compared with torch's."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.executors.native import library
+from torchrl_gn.dynamics.executors.native.state_maths import StateMaths, may_be_constant
+from torchrl_gn.dynamics.executors.native.trace import UntraceableError
+from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.networks.core import ListedCore
+from torchrl_gn.networks.layers import LayerList
+from torchrl_gn.networks.snapshot import snapshot
+
+_MOST_SPECIAL = 2
+
+
+class MixedStatesError(Exception):
+    """Samples need different state maths: ``groups`` has the number of each sample's, ``[count]``."""
+
+    def __init__(self, groups: np.ndarray) -> None:
+        super().__init__()
+        self.groups = torch.from_numpy(groups)
+
+
+class TracedProgram:
+    """Native state maths of a program: special ones for states with the same constant channels, and a general one.
+
+    A special one is traced for the first state that fits no other, up to ``_MOST_SPECIAL``. A sample is computed by the
+    first that fits, whatever the other samples are.
+    """
+
+    def __init__(self, program: StepProgram, layers: LayerList, change: bool = False) -> None:
+        self.program, self.layers, self.change = program, layers, change
+        self.reason: str | None = None  # why torch operations must run it
+        self.special: list[library.NativeMaths] = []
+        self.general: library.NativeMaths | None = None
+        self._example: tuple[np.ndarray, Tensor] | None = None  # a finite state and action
+        self._lock = threading.Lock()
+
+    def run(self, network: library.NativeNetwork, call: tuple, state: Tensor, actions: Tensor) -> library.NativeMaths:
+        """Run a call of the library, for contiguous states and actions; return the state maths that all samples fit.
+
+        Raises:
+            MixedStatesError: if there is none.
+            UntraceableError: if torch operations must run it.
+        """
+        if not self.special or not library.rollout(network, self.special[0], call):
+            with self._lock:
+                groups = self._groups(state, actions.reshape(*call[:2], actions.shape[-1])[:, 0])
+            if (groups != groups[0]).any():
+                raise MixedStatesError(groups)
+            maths = [*self.special, self.general][groups[0]]
+            if maths is None or not library.rollout(network, maths, call):
+                raise UntraceableError("The states do not fit.")
+            return maths
+        return self.special[0]
+
+    def _groups(self, states: Tensor, actions: Tensor) -> np.ndarray:
+        """Number of the state maths of each sample, ``[count]``, for its first action; -1: the general one."""
+        flat, actions = states.detach().reshape(len(actions), -1).double().numpy(), actions.detach().double()
+        finite = np.isfinite(flat).all(1) & actions.isfinite().all(1).numpy()
+        groups, left = np.full(len(flat), -1), np.ones(len(flat), dtype=bool)
+        for index in range(_MOST_SPECIAL):
+            if index == len(self.special):
+                if not (left & finite).any():
+                    break
+                sample = int((left & finite).argmax())
+                state = flat[sample].reshape(states.shape[-2:])
+                self._example = state, actions[sample]
+                self.special.append(self._traced(state, may_be_constant(self.program, state)))
+            fits = left & self.special[index].fits(flat)
+            groups[fits], left = index, left & ~fits
+        if left.any() and self.general is None and self._example is not None:
+            state = self._example[0]
+            self.general = self._traced(state, np.zeros_like(state, dtype=bool))
+        return groups
+
+    def _traced(self, state: np.ndarray, constant: np.ndarray) -> library.NativeMaths:
+        """State maths that agree with torch's on the example; else the reason is kept and raised."""
+        try:
+            with torch.device("cpu"), torch.no_grad():
+                maths = trace_states(self.program, self.layers, state, constant, self.change)
+                native = library.NativeMaths(maths, self.layers)
+                self._compare(native)
+        except UntraceableError as error:
+            self.reason = str(error)
+            raise
+        return native
+
+    def _compare(self, maths: library.NativeMaths) -> None:
+        """UntraceableError unless the example's next state is that of torch, both in float64."""
+        assert self._example is not None
+        state, action = torch.from_numpy(self._example[0]).clone(), self._example[1].clone()
+        program, network = self._in_float64
+        change = (
+            eager.delta(program, state, action)[0]
+            if self.change
+            else eager.step(program, state, action, None)[0] - state
+        )
+        call, found = library.forward_call(state, action, False, result=change)
+        if not library.rollout(network, maths, call):
+            raise UntraceableError("The state maths do not fit the state that they were traced for.")
+        found = found if self.change else found - state
+        error, size = float((found - change).norm()), float(change.norm())
+        if np.isfinite(size) and not error <= 1e-6 * size + 1e-12 * (1 + float(state.norm())):
+            raise UntraceableError(
+                f"The native step differs from torch's by {error / max(size, 1e-300):.1e} of the change."
+            )
+
+    @functools.cached_property
+    def _in_float64(self) -> tuple[StepProgram, library.NativeNetwork]:
+        core = snapshot(self.program.core, torch.float64)
+        network = library.NativeNetwork(core.layers(), torch.float64)
+        return replace(self.program, core=core, dtype=torch.float64), network
+
+
+def trace_states(
+    program: StepProgram, layers: LayerList, state: np.ndarray, constant: np.ndarray, change: bool = False
+) -> StateMaths:
+    """State maths of a program for states whose channels ``constant`` ``[N, C]`` are those of ``state``.
+
+    Raises:
+        UntraceableError: if they have no scalar form.
+    """
+    core, last = program.core, layers.layers[-1]
+    assert isinstance(core, ListedCore)
+    predicted = torch.arange(layers.nodes[0], device="cpu")[core.predicted].numpy()
+    width = last.count * len(last.weight) // max(len(predicted), 1)
+    return StateMaths(program, np.where(constant, state, 0.0), constant, predicted, width, change)
