@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +20,7 @@ from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.normalization import in_range, scaled, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.program import Executor, StepProgram
-from torchrl_gn.networks.core import UnfoldedCore
+from torchrl_gn.networks.core import UnfoldedCore, dtype_of
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
@@ -293,10 +292,3 @@ class Predictor(TensorDictModuleBase):
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"
-
-
-def dtype_of(core: nn.Module) -> torch.dtype:
-    """Dtype of a network's weights."""
-    # Not of parameters() first: under TorchRL's losses weights may be plain tensors.
-    linear = (each.weight for each in core.modules() if isinstance(each, nn.Linear))
-    return next(itertools.chain(linear, core.parameters())).dtype

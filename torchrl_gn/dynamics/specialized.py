@@ -17,8 +17,9 @@ from torchrl_gn.dynamics import operators
 from torchrl_gn.dynamics.checks import UnseenParameterWarning
 from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor
 from torchrl_gn.dynamics.normalization import scaled, static_graph
-from torchrl_gn.dynamics.predictor import Predictor, dtype_of
+from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
+from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
 from torchrl_gn.networks.snapshot import snapshot

@@ -28,8 +28,7 @@ class StateMaths:
         change: whether the result is the change ``[N, 12]`` instead of the next state.
 
     Raises:
-        UntraceableError: if a feature uses an operation without scalar form.
-        TooLongError: if it needs too many registers.
+        UntraceableError: if a feature uses an operation without scalar form, or it needs too many registers.
     """
 
     def __init__(
