@@ -13,8 +13,8 @@ import torch
 
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import export_c, export_step, specialize
-from torchrl_gn.dynamics.executors.native.executor import NativeExecutor
 from torchrl_gn.dynamics.executors.native.build import instruction_flags
+from torchrl_gn.dynamics.executors.native.executor import NativeExecutor
 from torchrl_gn.scenes import load_scene
 
 COMPILER = shutil.which("g++")
