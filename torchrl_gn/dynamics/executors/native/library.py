@@ -268,7 +268,7 @@ NOTHING = (None, 0)  # no array
 
 
 def forward_call(state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None) -> tuple[tuple, Tensor]:
-    """Fields of a call for contiguous inputs, and its result.
+    """Fields of a call for contiguous inputs, which must live as long as the call, and its result.
 
     That is the next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``.
     """
@@ -292,7 +292,7 @@ def adjoint_call(
 ) -> tuple[tuple, Tensor, Tensor]:
     """Fields of the call for the gradient of another, whose first fields are ``sizes``; gradients of state and actions.
 
-    ``states`` are the start states, or for ``many`` all.
+    ``states`` are the start states, or for ``many`` all; all tensors must live as long as the call.
     """
     size = states.shape[-2] * states.shape[-1]
     shape = (*states.shape[:-3], *states.shape[-2:]) if many else states.shape
