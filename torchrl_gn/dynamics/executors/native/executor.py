@@ -160,9 +160,9 @@ class _Differentiable(torch.autograd.Function):
         if ctx.ran.version != ctx.executor.version:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
         sizes, network, maths, _ = ctx.ran
-        call, of_state, of_actions = library.adjoint_call(
-            sizes, states, actions, gradient.contiguous(), ctx.many, None if ctx.stored is None else ctx.stored.tensor
-        )
+        gradient = gradient.contiguous()  # to live until the call is done
+        stored = None if ctx.stored is None else ctx.stored.tensor
+        call, of_state, of_actions = library.adjoint_call(sizes, states, actions, gradient, ctx.many, stored)
         library.rollout_adjoint(network, maths, call)
         return None, of_state, of_actions, None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import functools
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -65,7 +64,6 @@ class _Call(ctypes.Structure):
     )
 
 
-@functools.cache
 def load_library() -> ctypes.CDLL:
     """The compiled code; NoCompilerError if it cannot be built."""
     library = build.load_code()
@@ -183,7 +181,7 @@ NOTHING = (None, 0)  # no array
 def forward_call(
     state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None, result: Tensor | None = None
 ) -> tuple[tuple, Tensor]:
-    """Fields of a call for contiguous inputs, and its result.
+    """Fields of a call for contiguous inputs, which must live as long as the call, and its result.
 
     That is the next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``; or
     shaped like ``result``.
@@ -208,7 +206,7 @@ def adjoint_call(
 ) -> tuple[tuple, Tensor, Tensor]:
     """Fields of the call for the gradient of another, whose first fields are ``sizes``; gradients of state and actions.
 
-    ``states`` are the start states, or for ``many`` all.
+    ``states`` are the start states, or for ``many`` all; all tensors must live as long as the call.
     """
     size = states.shape[-2] * states.shape[-1]
     shape = (*states.shape[:-3], *states.shape[-2:]) if many else states.shape

@@ -59,8 +59,7 @@ class _Trained(torch.autograd.Function):
         packed = network.weights, network.tables
         weights, tables = ([None if each is None else torch.empty_like(each) for each in part] for part in packed)
         addresses = library.pointers(weights), library.pointers(tables)
-        call, of_state, of_action = library.adjoint_call(
-            ctx.sizes, state, action, gradient.contiguous(), False, ctx.stored.tensor
-        )
+        gradient, stored = gradient.contiguous(), ctx.stored.tensor  # to live until the call is done
+        call, of_state, of_action = library.adjoint_call(ctx.sizes, state, action, gradient, False, stored)
         library.rollout_adjoint(network, ctx.maths, (*call[:-3], 1, *map(ctypes.addressof, addresses)))
         return None, of_state, of_action, *weights, *tables
