@@ -99,7 +99,7 @@ class SpecializedPredictor(Predictor):
                 else:
                     self._executor.update(program)
             modules = list(self.model.modules())
-            owners: list[dict[str, Tensor | None]] = [module._parameters for module in modules]
+            owners: list[dict] = [module._parameters for module in modules]
             owners += [module._buffers for module in modules]
             self._weights, self._casts = _Watched(owners), self.model.casts
             # Views that share the storage keep it alive: no other tensor can come to lie at its address.
@@ -252,7 +252,7 @@ class _Watched:
     Read without a Python loop, which would take as long as a step of one state.
     """
 
-    def __init__(self, owners: Sequence[dict[str, Tensor | None]]) -> None:
+    def __init__(self, owners: Sequence[dict]) -> None:
         found = [(owner, name, one) for owner in owners for name, one in owner.items() if one is not None]
         found = [each for each in found if each[1] not in _FOLLOWING]
         # PyTorch counts no changes of tensors made in inference mode: they are never the same.
