@@ -37,7 +37,7 @@ class NoCompilerError(FileNotFoundError):
 
 @functools.cache
 def load_library() -> ctypes.CDLL:
-    """The compiled code, built at the first use on a processor and kept in ``~/.cache/torchrl_gn`` (10 s).
+    """The compiled code, built at the first use on a processor and kept in ``~/.cache/torchrl_gn`` (20 s).
 
     Raises:
         NoCompilerError: without a working C++ compiler (``CXX``, else c++, g++ or clang++).
