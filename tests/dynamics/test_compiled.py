@@ -127,5 +127,7 @@ def test_a_core_without_fold_is_not_compiled(scenes, monkeypatch):
     bound = ForwardModel.for_scene(scene, core="unfolded", **SMALL).bind(scene)
     with pytest.raises(TypeError, match=r"Unfolded has no fold\(\).*use executor='eager'"):
         specialize(bound, executor="compiled")
-    with pytest.raises(ValueError, match=r"executor='nativ' is not known; use one of \['eager', 'compiled', 'native'\]"):
+    with pytest.raises(
+        ValueError, match=r"executor='nativ' is not known; use one of \['eager', 'compiled', 'native'\]"
+    ):
         specialize(bound, executor="nativ")
