@@ -14,6 +14,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -486,48 +487,37 @@ def test_python_threads_step_at_once(quick, inputs, shared):
     data = [inputs(expected_of, count, seed=count) for count in (1, 7, 30, 50)]
     data[1][0][..., 2] += 0.1  # other constant channels: traced while others run
     expected = [pull(expected_of, *each) for each in data]
-    failed: list[int] = []
     start = threading.Barrier(4)
 
-    def work(index: int) -> None:
+    def work(index: int) -> bool:
         torch.set_num_threads(1 + index % 2)
         start.wait()
-        for _ in range(10):
-            if not equal(pull(predictors[index], *data[index]), expected[index]):
-                failed.append(index)
+        return all(equal(pull(predictors[index], *data[index]), expected[index]) for _ in range(10))
 
-    threads = [threading.Thread(target=work, args=(index,)) for index in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not failed
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(work, range(4)))
 
 
 def test_weights_change_while_another_thread_steps(quick, inputs):
     predictor = quick(latent=64)
     state, actions = inputs(predictor, 30)
     done = threading.Event()
-    failed: list[str] = []
 
-    def work() -> None:
-        try:
-            while not done.is_set():
-                if not predictor.rollout(state, actions)[0].isfinite().all():
-                    failed.append("not finite")
-        except Exception as error:
-            failed.append(repr(error))
+    def work() -> bool:
+        finite = True
+        while not done.is_set():
+            finite = finite and bool(predictor.rollout(state, actions)[0].isfinite().all())
+        return finite
 
-    thread = threading.Thread(target=work)
-    thread.start()
-    for _ in range(10):
-        with torch.no_grad():
-            for weight in predictor.model.parameters():
-                weight.mul_(0.99)
-        predictor.step(state, actions[:, 0])
-    done.set()
-    thread.join()
-    assert not failed
+    with ThreadPoolExecutor(1) as pool:
+        finite = pool.submit(work)
+        for _ in range(10):
+            with torch.no_grad():
+                for weight in predictor.model.parameters():
+                    weight.mul_(0.99)
+            predictor.step(state, actions[:, 0])
+        done.set()
+        assert finite.result()
 
 
 def _in_child(queue, predictor, state, actions) -> None:
@@ -649,7 +639,7 @@ def test_every_scene_is_traced(make_model, random_states, random_actions, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["humanoid", "walker", "hopper", "cheetah", "swimmer"])
+@pytest.mark.parametrize("name", ["humanoid", "walker", "hopper", "swimmer"])
 def test_scenes_of_the_suite_are_traced(make_model, random_states, random_actions, name):
     suite = pytest.importorskip("dm_control.suite")
     from torchrl_gn.scenes import load_scene
