@@ -43,7 +43,7 @@ WITH_PILLOW = {"drawing.py"}  # imported to draw a video, once Pillow was found
 # The names of ``import torchrl_gn``.
 PUBLIC = {
     "data": ["collect_trajectories", "create_dataset", "load_dataset", "trajectory_buffer"],
-    "dynamics": ["ForwardModel", "export_step", "specialize"],
+    "dynamics": ["ForwardModel", "export_c", "export_step", "specialize"],
     "envs": ["ModelEnv", "SceneEnv"],
     "evaluation": ["evaluate_errors", "rollout_video"],
     "identification": ["IdentifyingModel"],

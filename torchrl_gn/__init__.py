@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torchrl_gn.data import load_dataset as load_dataset
     from torchrl_gn.data import trajectory_buffer as trajectory_buffer
     from torchrl_gn.dynamics import ForwardModel as ForwardModel
+    from torchrl_gn.dynamics import export_c as export_c
     from torchrl_gn.dynamics import export_step as export_step
     from torchrl_gn.dynamics import specialize as specialize
     from torchrl_gn.envs import ModelEnv as ModelEnv
@@ -43,7 +44,7 @@ __version__ = "0.1.0"
 # The main names, by the folder that defines them; imported at their first use.
 _FOLDERS = {
     "data": ("collect_trajectories", "create_dataset", "load_dataset", "trajectory_buffer"),
-    "dynamics": ("ForwardModel", "export_step", "specialize"),
+    "dynamics": ("ForwardModel", "export_c", "export_step", "specialize"),
     "envs": ("ModelEnv", "SceneEnv"),
     "evaluation": ("evaluate_errors", "rollout_video"),
     "identification": ("IdentifyingModel",),

@@ -1,15 +1,24 @@
-"""Exported programs, run by a Python that has no torchrl_gn."""
+"""Exported programs, run without torchrl_gn: by another Python, or in C."""
 
 from __future__ import annotations
 
+import ctypes
 import json
+import shutil
 import subprocess
 import sys
 
 import pytest
 import torch
 
-from torchrl_gn.dynamics import export_step, specialize
+from torchrl_gn.data import Simulator, sample_start_states
+from torchrl_gn.dynamics import export_c, export_step, specialize
+from torchrl_gn.dynamics.executors.native.build import instruction_flags
+from torchrl_gn.dynamics.executors.native.executor import NativeExecutor
+from torchrl_gn.scenes import load_scene
+
+COMPILER = shutil.which("g++")
+with_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no g++ here")
 
 ALONE = """
 import sys
@@ -49,4 +58,99 @@ def test_a_model_of_many_variants_is_refused(scenes, make_model, tmp_path):
     scene = scenes["pendulum"]
     with pytest.raises(ValueError, match="physical parameters of their own"):
         export_step(make_model(scene).bind(scene, parameters_key="parameters"), tmp_path / "step.pt2")
+    assert not list(tmp_path.iterdir())
+
+
+def build(*arguments) -> None:
+    subprocess.run([str(COMPILER), "-O3", *map(str, arguments)], check=True, capture_output=True)
+
+
+def pointer(tensor: torch.Tensor) -> ctypes.c_void_p:
+    assert tensor.dtype == torch.float64 and tensor.is_contiguous()
+    return ctypes.c_void_p(tensor.data_ptr())
+
+
+def steps_of(library, state, actions, threads=1):
+    """Status and states of a rollout in C."""
+    states = torch.full((len(state), actions.shape[1] + 1, *state.shape[1:]), torch.nan, dtype=torch.float64)
+    status = library.twin_rollout(*actions.shape[:2], threads, pointer(state), pointer(actions), pointer(states))
+    return status, states
+
+
+@with_compiler
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [
+        ("pendulum", torch.float32),
+        pytest.param("swimmer6", torch.float64, marks=pytest.mark.slow),
+        pytest.param("jaco", torch.float32, marks=pytest.mark.slow),
+    ],
+)
+def test_c_functions_are_the_native_executor_bit_for_bit(fit, make_model, random_actions, tmp_path, name, dtype):
+    scene = load_scene(name)
+    bound = fit(make_model(scene, fitted=False).to(dtype), scene).bind(scene)
+    folder = export_c(bound, tmp_path / "twin")
+    assert sorted(file.name for file in folder.iterdir()) == ["main.c", "twin.cpp", "twin.h"]
+    flags = ["-Wall", "-Wextra", "-Werror", "-Wno-psabi"]
+    build(
+        "-std=c++17", *flags, *instruction_flags(), "-shared", "-fPIC", folder / "twin.cpp", "-o", tmp_path / "twin.so"
+    )
+    library = ctypes.CDLL(str(tmp_path / "twin.so"))
+
+    rest = torch.tensor((ctypes.c_double * (13 * scene.num_nodes)).in_dll(library, "twin_rest")[:], dtype=torch.float64)
+    rest = rest.reshape(1, -1, 13)
+    executor = specialize(bound).executor()
+    assert isinstance(executor, NativeExecutor)
+    executor.step(rest, torch.zeros(1, scene.num_actions))  # of the same constant channels
+    for count, steps, threads in ((1, 1, 1), (7, 3, 1), (30, 2, 2)):
+        state = Simulator(scene).observe(sample_start_states(scene, count, 0)).requires_grad_()
+        actions = random_actions(scene, count, steps).requires_grad_()
+        expected, _ = executor.rollout(state, actions)
+        status, states = steps_of(library, state, actions, threads)
+        assert status == 0 and torch.equal(states, expected)
+        weights = torch.randn(expected.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        found = torch.full_like(state, torch.nan), torch.full_like(actions, torch.nan)
+        given = (states, actions, weights, *found)
+        assert library.twin_rollout_gradient(count, steps, threads, *map(pointer, given)) == 0
+        for got, wanted in zip(found, torch.autograd.grad((expected * weights).sum(), (state, actions)), strict=True):
+            assert wanted.norm() > 0 and torch.equal(got, wanted)
+        after = torch.empty_like(state[0])
+        assert library.twin_step(*map(pointer, (state[0], actions[0, 0].contiguous(), after))) == 0
+        assert torch.equal(after, expected[0, 1])
+
+    elsewhere = rest.clone()
+    elsewhere[:, 0, 2] = 1.0  # the world cannot move
+    status, states = steps_of(library, elsewhere, torch.zeros(1, 1, scene.num_actions, dtype=torch.float64))
+    assert status == 1 and states.isnan().all()
+    moved = export_c(bound, tmp_path / "moved", torch.stack((rest[0], elsewhere[0])))
+    texts = [next(each.glob("*.cpp")).read_text() for each in (folder, moved)]
+    counts = [int(text.split(" MATHS = {")[1].split(", ")[1]) for text in texts]
+    assert counts[1] == counts[0] + 1  # one more channel varies
+
+
+@with_compiler
+@pytest.mark.slow
+def test_the_example_is_c_and_runs_as_its_header_says(scenes, make_model, tmp_path):
+    scene = scenes["falling"]  # no action
+    folder = export_c(make_model(scene).bind(scene), tmp_path / "falling")
+    build("-std=c++17", folder / "falling.cpp", folder / "main.c", "-o", tmp_path / "example")
+    printed = subprocess.run([tmp_path / "example"], check=True, capture_output=True, text=True).stdout
+    assert len(printed.splitlines()) == scene.num_nodes
+    strict = ("-x", "c", "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+    build(*strict, "-c", folder / "main.c", "-o", tmp_path / "main.o")
+
+
+def test_c_refuses_what_the_native_executor_cannot_run(scenes, make_model, tmp_path):
+    scene = scenes["pendulum"]
+    bound = make_model(scene).bind(scene)
+    with pytest.raises(TypeError, match="products in bfloat16 are not written out"):
+        export_c(specialize(bound, executor="eager", dtype=torch.bfloat16), tmp_path / "step")
+    with pytest.raises(TypeError, match="recurrent"):
+        export_c(make_model(scene, core="recurrent", hidden_state=(1, 1, 1)).bind(scene), tmp_path / "step")
+    with pytest.raises(ValueError, match="physical parameters of their own"):
+        export_c(make_model(scene).bind(scene, parameters_key="parameters"), tmp_path / "step")
+    with pytest.raises(ValueError, match="'my-model' is no C identifier"):
+        export_c(bound, tmp_path / "my-model")
+    with pytest.raises(ValueError, match=r"states must be \[\*B, 2, 13\], got \[3\]"):
+        export_c(bound, tmp_path / "step", torch.zeros(3))
     assert not list(tmp_path.iterdir())

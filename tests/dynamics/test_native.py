@@ -27,8 +27,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrl_gn.dynamics import BodyState, Contacts, Controls, ForwardModel, JointAxes, SpecializedPredictor, specialize
 from torchrl_gn.dynamics.executors import NativeExecutor
+from torchrl_gn.dynamics.executors.native import build, library
 from torchrl_gn.dynamics.executors.native import executor as native_executor
-from torchrl_gn.dynamics.executors.native import library
 from torchrl_gn.dynamics.features import Feature
 
 from .. import zoo
@@ -43,7 +43,7 @@ ZOO = sorted(path.stem for path in (ROOT / "tests/zoo").glob("*.xml"))
 def _has_compiler() -> bool:
     try:
         library.load_library()
-    except library.NoCompilerError:
+    except build.NoCompilerError:
         return False
     return True
 
@@ -611,6 +611,22 @@ def test_features_of_ones_own(fit, inputs, kind):
     assert torch.equal(predictor.rollout(state, actions)[0], expected) and native(predictor).reason == given
 
 
+def test_state_maths_with_too_many_registers(quick, inputs, monkeypatch):
+    predictor = quick()
+    eager = specialize(predictor, executor="eager")
+    state, actions = inputs(predictor, 3)
+    lifted = state + torch.eye(13, dtype=torch.float64)[2]
+    predictor.rollout(state, actions)
+    monkeypatch.setattr("torchrl_gn.dynamics.executors.native.tape._MOST_REGISTERS", 50)
+    for shift in (0.0, 0.1):  # no room for more special or general ones
+        native(predictor).native.traced.special[1:] = native(predictor).native.traced.special[:1]
+        assert torch.equal(predictor.rollout(lifted + shift, actions)[0], eager.rollout(lifted + shift, actions)[0])
+    assert native(predictor).reason is None
+    other = quick()
+    assert torch.equal(other.rollout(state, actions)[0], eager.rollout(state, actions)[0])
+    assert re.search(r"needs \d+ registers", native(other).reason)
+
+
 # Scenes
 
 
@@ -681,9 +697,9 @@ def fresh(tmp_path, monkeypatch, whole):
     folder = tmp_path / "a cache"
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
     monkeypatch.delenv("CXX", raising=False)
-    library._library_or_reason.cache_clear()
+    build._library_or_reason.cache_clear()
     yield folder / "torchrl_gn"
-    library._library_or_reason.cache_clear()
+    build._library_or_reason.cache_clear()
 
 
 @pytest.fixture
@@ -691,11 +707,11 @@ def builds(monkeypatch, whole):
     """Files of libraries that are built: a good one is copied instead."""
     built: list[Path] = []
 
-    def build(command, file: Path) -> None:
+    def build_it(command, file: Path) -> None:
         built.append(file)
         file.write_bytes(whole)
 
-    monkeypatch.setattr(library, "_build", build)
+    monkeypatch.setattr(build, "_build", build_it)
     return built
 
 
@@ -719,7 +735,7 @@ def test_without_a_compiler_it_runs_by_torch(fresh, quick, inputs, monkeypatch, 
     assert reason is not None and message in reason and "\n" not in reason
     assert f"native, but here by torch: {reason}" in str(predictor).splitlines()[0]
     assert torch.equal(found, specialize(predictor, executor="eager").rollout(state, actions)[0])
-    monkeypatch.setattr(library, "_load", lambda: pytest.fail("tried again"))
+    monkeypatch.setattr(build, "_load", lambda: pytest.fail("tried again"))
     with torch.no_grad():
         next(predictor.model.parameters()).mul_(1.1)
     predictor.rollout(state, actions)
@@ -727,7 +743,7 @@ def test_without_a_compiler_it_runs_by_torch(fresh, quick, inputs, monkeypatch, 
 
 def test_a_library_is_built_once(fresh, builds):
     first = library.load_library()
-    library._library_or_reason.cache_clear()
+    build._library_or_reason.cache_clear()
     assert library.load_library()._name == first._name == str(builds[0]) and len(builds) == 1
     assert fresh in builds[0].parents
 
@@ -744,7 +760,7 @@ def test_a_damaged_library_is_built_again(fresh, builds, whole, damage):
     }[damage]
     builds[0].unlink()  # the process has it open
     builds[0].write_bytes(damaged)
-    library._library_or_reason.cache_clear()
+    build._library_or_reason.cache_clear()
     assert library.load_library().gn_rollout
     assert len(builds) == 2 and builds[0].read_bytes() == whole
 
@@ -755,7 +771,7 @@ def test_what_an_interrupted_build_leaves_is_neither_loaded_nor_kept(fresh, monk
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(library, "_build", interrupted)
+        patch.setattr(build, "_build", interrupted)
         with pytest.raises(KeyboardInterrupt):
             library.load_library()
     assert len(list(fresh.glob("*.so"))) == 1
@@ -767,7 +783,7 @@ def test_a_folder_that_cannot_be_written_to(fresh, builds, monkeypatch):
     for variables in ({"XDG_CACHE_HOME": "/proc/no"}, {"XDG_CACHE_HOME": "", "HOME": "/proc/no"}):
         for name, value in variables.items():
             monkeypatch.setenv(name, value)
-        library._library_or_reason.cache_clear()
+        build._library_or_reason.cache_clear()
         assert library.load_library().gn_rollout
         assert not builds.pop().exists()
 
@@ -775,13 +791,13 @@ def test_a_folder_that_cannot_be_written_to(fresh, builds, monkeypatch):
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.setattr(Path, "home", homeless)
-    library._library_or_reason.cache_clear()
+    build._library_or_reason.cache_clear()
     assert library.load_library().gn_rollout
 
 
 def test_a_library_in_a_folder_that_is_read_only_is_used(fresh, builds, monkeypatch):
     library.load_library()
-    library._library_or_reason.cache_clear()
+    build._library_or_reason.cache_clear()
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: pytest.fail("written"))
     library.load_library()
     assert len(builds) == 1
@@ -790,14 +806,14 @@ def test_a_library_in_a_folder_that_is_read_only_is_used(fresh, builds, monkeypa
 def test_a_compiler_with_arguments(fresh, monkeypatch):
     commands = []
 
-    def build(command, file: Path) -> None:
+    def build_it(command, file: Path) -> None:
         commands.append(command)
-        raise library.NoCompilerError("no")
+        raise build.NoCompilerError("no")
 
-    monkeypatch.setattr(library, "_build", build)
+    monkeypatch.setattr(build, "_build", build_it)
     monkeypatch.setenv("CXX", "env 'A B=c d' g++ -DX")
     monkeypatch.setenv("TORCHRL_GN_CXXFLAGS", "-DNAME='a b' -O0")
-    with pytest.raises(library.NoCompilerError):
+    with pytest.raises(build.NoCompilerError):
         library.load_library()
     assert commands[0][:4] == ["env", "A B=c d", "g++", "-DX"] and commands[0][-2:] == ["-DNAME=a b", "-O0"]
 

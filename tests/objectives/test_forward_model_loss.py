@@ -10,10 +10,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_gn.data import create_dataset, trajectory_buffer
-from torchrl_gn.dynamics import Canonicalizer, ForwardModel
-from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics import Canonicalizer, ForwardModel, Predictor
+from torchrl_gn.dynamics.executors import EagerExecutor
 from torchrl_gn.dynamics.normalization import dynamic_graph
-from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
@@ -31,11 +30,12 @@ def predict(monkeypatch) -> Callable[[Callable], list[Tensor]]:
     def predict(delta: Callable) -> list[Tensor]:
         fed: list[Tensor] = []
 
-        def stub(program: StepProgram, state: Tensor, action: Tensor, hidden: None) -> tuple[Tensor, None]:
-            fed.append(state)
-            return delta(state, action) * program.movable, hidden
+        class Stub(EagerExecutor):
+            def delta(self, state: Tensor, action: Tensor, hidden: None) -> tuple[Tensor, None]:
+                fed.append(state)
+                return delta(state, action) * self.program.movable, hidden
 
-        monkeypatch.setattr(eager, "delta", stub)
+        monkeypatch.setattr(Predictor, "training_executor", lambda self, parameters: Stub(self.program(parameters)))
         return fed
 
     return predict
@@ -384,3 +384,17 @@ def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
     own = evaluate_errors(model.bind(data.scene_of("train", 0)), data.train[:1].exclude("parameters"), horizons=(4,))
     for error in ("one_step_error", "rollout_error_4"):
         assert table[error].total == pytest.approx(own[error].total, rel=1e-9)
+
+
+def test_leaving_out_what_never_varies_changes_neither_loss_nor_gradient(make_loss, windows, monkeypatch):
+    loss = make_loss()
+    network, whole = loss.trained.core, type(loss.model).program
+    results = []
+    for _ in range(2):
+        network.zero_grad()
+        value = loss(windows["swimmer6"])["loss_forward_model"]
+        value.backward()
+        results.append((value.detach(), *(weight.grad.clone() for weight in network.parameters())))
+        monkeypatch.setattr(type(loss.model), "program", lambda self, parameters, reduced: whole(self, parameters))
+    for reduced, full in zip(*results, strict=True):
+        torch.testing.assert_close(reduced, full, rtol=1e-9, atol=1e-12)

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.checks import check_shapes
 from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.program import InputScaling, OutputScaling
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
+from torchrl_gn.networks.core import FoldedCore, ReducibleCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
@@ -109,3 +111,27 @@ def update_dynamic_normalizers(
     model.edge_normalizer.update(edges)
     model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)
     model.residual_normalizer.update(residual(predictor, state, next_state, program.parameters), movable)
+
+
+def scaled(
+    predictor: Predictor, core: FoldedCore, rows: Tensor | None
+) -> tuple[FoldedCore, InputScaling, InputScaling, OutputScaling]:
+    """A folded core with the scaling of its nodes, edges and output.
+
+    With ``rows``, the components to predict, the core takes the scaling in and drops features that never vary, if
+    it can.
+    """
+    model = predictor.model
+    node, edge, residual = model.node_normalizer, model.edge_normalizer, model.residual_normalizer
+    # A hidden state is updated from all features.
+    if rows is None or predictor.recurrent or not isinstance(core, ReducibleCore):
+        return core, InputScaling.of(node), InputScaling.of(edge), OutputScaling.of(residual)
+    nodes, edges = InputScaling.folded(node), InputScaling.folded(edge)
+    assert nodes.columns is not None and edges.columns is not None
+    core = core.reduced(
+        (nodes.columns, node.inverse_std[nodes.columns]),
+        (edges.columns, edge.inverse_std[edges.columns]),
+        (rows, residual.std[rows]),
+        residual.mean[rows],
+    )
+    return core, nodes, edges, OutputScaling.folded(residual, rows)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,11 +15,12 @@ from torchrl_gn.dynamics.checks import check_scene, check_shapes, warn_of_unseen
 from torchrl_gn.dynamics.constraints import make_projection
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.eager import EagerExecutor
+from torchrl_gn.dynamics.executors.native import NativeDelta
 from torchrl_gn.dynamics.features.controls import ControlInputs
-from torchrl_gn.dynamics.normalization import in_range, static_graph
+from torchrl_gn.dynamics.normalization import in_range, scaled, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
-from torchrl_gn.dynamics.program import Executor, InputScaling, OutputScaling, StepProgram
-from torchrl_gn.networks.core import UnfoldedCore
+from torchrl_gn.dynamics.program import Executor, StepProgram
+from torchrl_gn.networks.core import UnfoldedCore, dtype_of
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
@@ -73,6 +73,7 @@ class Predictor(TensorDictModuleBase):
         check_scene(model, scene)
         self.model, self.scene, self.layout = model, scene, model.layout
         self.strict, self.reference = strict, reference
+        self._trainer: NativeDelta | None = None
 
         ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
         self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
@@ -167,19 +168,28 @@ class Predictor(TensorDictModuleBase):
         tensordict.set(self.out_keys[0], after)
         return tensordict if hidden is None else tensordict.set(self.out_keys[1], hidden)
 
-    def program(self, parameters: TensorDictBase | None = None, *, reference: bool = False) -> StepProgram:
-        """The step as it is now, differentiable in the weights; the ``reference`` does not fold the core."""
+    def program(
+        self, parameters: TensorDictBase | None = None, *, reference: bool = False, reduced: bool = False
+    ) -> StepProgram:
+        """The step as it is now, differentiable in the weights.
+
+        The ``reference`` does not fold the core; ``reduced`` leaves out features that never vary.
+        """
         model, values = self.model, self.parameter_reader.read(parameters)
         static, unfolded = static_graph(self, values), self.reference or reference
+        core = UnfoldedCore(model.core, static) if unfolded else model.core.fold(self.incidence, static)
+        # All components: a loss of weights that are not finite is not finite.
+        rows = torch.arange(model.residual_normalizer.size, device=self.movable.device) if reduced else None
+        core, nodes, edges, output = scaled(self, core, rows)
         return StepProgram(
             **self.constants(),
             parameters=values,
-            nodes=InputScaling.of(model.node_normalizer),
-            edges=InputScaling.of(model.edge_normalizer),
+            nodes=nodes,
+            edges=edges,
             recurrent=model.core if self.recurrent else None,
             static=static if self.recurrent else None,
-            core=UnfoldedCore(model.core, static) if unfolded else model.core.fold(self.incidence, static),
-            output=OutputScaling.of(model.residual_normalizer),
+            core=core,
+            output=output,
             change_std=model.delta_normalizer.std,
             dtype=self.dtype,
         )
@@ -201,6 +211,17 @@ class Predictor(TensorDictModuleBase):
     def executor(self, parameters: TensorDictBase | None = None) -> Executor:
         """What runs the step, for one or many steps of the same samples."""
         return EagerExecutor(self.program(parameters))
+
+    def training_executor(self, parameters: TensorDictBase | None = None) -> EagerExecutor | NativeDelta:
+        """What predicts changes by its ``delta``, differentiable in states, actions and weights."""
+        if torch.compiler.is_compiling():  # which cannot ask which features vary
+            return EagerExecutor(self.program(parameters))
+        program = self.program(parameters, reduced=True)
+        if self._trainer is None:
+            self._trainer = NativeDelta(program)
+        else:
+            self._trainer.update(program)
+        return self._trainer
 
     def step(
         self,
@@ -266,12 +287,8 @@ class Predictor(TensorDictModuleBase):
         nodes, edges, globals_ = (hidden_state[part] for part in ("nodes", "edges", "globals_"))
         return Graph(nodes, edges, globals_, self.incidence.edge_index)
 
+    def __getstate__(self) -> dict:
+        return {**super().__getstate__(), "_trainer": None}  # a copy packs for itself
+
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"
-
-
-def dtype_of(core: nn.Module) -> torch.dtype:
-    """Dtype of a network's weights."""
-    # Not of parameters() first: under TorchRL's losses weights may be plain tensors.
-    linear = (each.weight for each in core.modules() if isinstance(each, nn.Linear))
-    return next(itertools.chain(linear, core.parameters())).dtype

@@ -10,16 +10,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from torchrl_gn.dynamics import operators
 from torchrl_gn.dynamics.checks import UnseenParameterWarning
 from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor
-from torchrl_gn.dynamics.normalization import static_graph
-from torchrl_gn.dynamics.predictor import Predictor, dtype_of
-from torchrl_gn.dynamics.program import Executor, InputScaling, OutputScaling, StepProgram
-from torchrl_gn.networks.core import Columns, ReducibleCore
+from torchrl_gn.dynamics.normalization import scaled, static_graph
+from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
+from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
 from torchrl_gn.networks.snapshot import snapshot
@@ -56,6 +57,7 @@ class SpecializedPredictor(Predictor):
         self._executor: Executor | None = None
         self._weights, self._casts = _Watched([]), 0
         self._given: dict[str, tuple[Tensor, int]] = {}
+        self._number = operators.register(self)
         # Refuse now what the executor cannot run, not at the first step.
         if not getattr(EXECUTORS[executor], "runs_all", True):
             self.executor()
@@ -63,6 +65,10 @@ class SpecializedPredictor(Predictor):
     def __getstate__(self) -> dict:
         # A copy folds and compiles for itself.
         return {**super().__getstate__(), "_executor": None, "_weights": _Watched([]), "_given": {}}
+
+    def __setstate__(self, state: dict) -> None:
+        super().__setstate__(state)
+        self._number = operators.register(self)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -119,29 +125,44 @@ class SpecializedPredictor(Predictor):
             and all(_same(given[name], *kept) for name, kept in self._given.items())
         )
 
-    def program(self, parameters: TensorDictBase | None = None, *, reference: bool = False) -> StepProgram:
+    def step(
+        self,
+        state: Tensor,
+        action: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDict | None]:
+        if self._is_operator(parameters):
+            return torch.ops.torchrl_gn.rollout(state, action, self._number, False), None
+        return super().step(state, action, parameters, hidden_state)
+
+    def rollout(
+        self,
+        state: Tensor,
+        actions: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDict | None]:
+        if self._is_operator(parameters):
+            return torch.ops.torchrl_gn.rollout(state, actions, self._number, True), None
+        return super().rollout(state, actions, parameters, hidden_state)
+
+    def _is_operator(self, parameters: TensorDictBase | None) -> bool:
+        """Whether a compiler must not look inside: into the check whether the weights changed, and C++."""
+        return torch.compiler.is_compiling() and parameters is None and not self.recurrent
+
+    def program(
+        self, parameters: TensorDictBase | None = None, *, reference: bool = False, reduced: bool = True
+    ) -> StepProgram:
         """Snapshot of the step, without features and components that never vary; whole as the ``reference``."""
         if reference:
             return super().program(parameters, reference=True)
-        model = self.model
         values = PhysicalParameters(*(value.detach().clone() for value in self.parameter_reader.read(parameters)))
-        nodes, edges = InputScaling.of(model.node_normalizer), InputScaling.of(model.edge_normalizer)
-        output = OutputScaling.of(model.residual_normalizer)
         # In float64, so that folding loses nothing.
-        core = copy.deepcopy(model.core).double()
+        core = copy.deepcopy(self.model.core).double()
         folded = core.fold(self.incidence, static_graph(self, values, torch.float64))
-        # A hidden state is updated from all features.
-        if isinstance(folded, ReducibleCore) and not core.recurrent:
-            residual = model.residual_normalizer
-            nodes, edges = InputScaling.folded(model.node_normalizer), InputScaling.folded(model.edge_normalizer)
-            rows = (self.movable.any(0) & ~residual.constant).nonzero().flatten()
-            output = OutputScaling.folded(residual, rows)
-            folded = folded.reduced(
-                _scaled(nodes, model.node_normalizer.inverse_std),
-                _scaled(edges, model.edge_normalizer.inverse_std),
-                (rows, residual.std[rows]),
-                residual.mean[rows],
-            )
+        rows = (self.movable.any(0) & ~self.model.residual_normalizer.constant).nonzero().flatten()
+        folded, nodes, edges, output = scaled(self, folded, rows if reduced else None)
         return StepProgram(
             **self.constants(),
             parameters=values,
@@ -151,7 +172,7 @@ class SpecializedPredictor(Predictor):
             static=static_graph(self, values, self.dtype) if core.recurrent else None,
             core=snapshot(folded, self.dtype),
             output=_copied(output),
-            change_std=model.delta_normalizer.std.clone(),
+            change_std=self.model.delta_normalizer.std.clone(),
             dtype=self.dtype,
         )
 
@@ -276,11 +297,6 @@ def _same(now: Tensor, kept: Tensor, version: int) -> bool:
         and _version(now) == version
         and (now.shape, now.stride(), now.dtype) == (kept.shape, kept.stride(), kept.dtype)
     )
-
-
-def _scaled(inputs: InputScaling, scale: Tensor) -> Columns:
-    assert inputs.columns is not None
-    return inputs.columns, scale[inputs.columns]
 
 
 def _width(inputs: InputScaling, full: int) -> int:

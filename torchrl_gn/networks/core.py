@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import torch
 from torch import Tensor, nn
 
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
@@ -96,3 +98,10 @@ class UnfoldedCore:
 
     def predict(self, dynamic: Graph) -> Tensor:
         return self.core(graph_concat(dynamic, self.static)).nodes
+
+
+def dtype_of(core: nn.Module) -> torch.dtype:
+    """Dtype of a network's weights."""
+    # Not of parameters() first: under TorchRL's losses weights may be plain tensors.
+    linear = (each.weight for each in core.modules() if isinstance(each, nn.Linear))
+    return next(itertools.chain(linear, core.parameters())).dtype

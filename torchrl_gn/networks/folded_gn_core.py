@@ -122,7 +122,7 @@ class FoldedGNCore:
         device = self.reduce.device
         every_edge = torch.arange(count_e, device=device)
         kept, predicted = every_edge[self.kept], torch.arange(count_n, device=device)[self.predicted]
-        senders, receivers = self.ends.split(count_e)
+        senders, receivers = self.ends[:count_e], self.ends[count_e:]
         builder = LayerBuilder(self.activation)
 
         def mlp(factors: Factors, inputs: Sequence[Gather], added: Sequence[Gather] = ()) -> int:
@@ -184,13 +184,14 @@ class FoldedGNCore:
             first_node=change(self.first_node, 1, nodes),
             second_edge=change(self.second_edge, 1, ends),
             second_node=change(self.second_node, 1, nodes),
-            out=(_columns(weight.T, out).T, bias[out[0]] * out[1] + shift),
+            out=(_columns(weight.T, out).T, bias[out[0]] * out[1].to(bias.dtype) + shift.to(bias.dtype)),
         )
 
 
 def _columns(weight: Tensor, columns: Columns) -> Tensor:
     index, factor = columns
-    return weight[:, index] * factor
+    # index_select: its gradient adds whole columns.
+    return weight.index_select(1, index) * factor.to(weight.dtype)
 
 
 def items_first(features: Tensor) -> Tensor:

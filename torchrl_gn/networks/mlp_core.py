@@ -135,9 +135,11 @@ class FoldedMLP:
         parts = list(self.weights)
         for index, (columns, count) in enumerate(zip((nodes, edges), self.counts, strict=True)):
             kept, factor = columns
-            parts[index] = (parts[index].unflatten(1, (count, -1))[:, :, kept] * factor).flatten(1)
+            parts[index] = (parts[index].unflatten(1, (count, -1))[:, :, kept] * factor.to(parts[index].dtype)).flatten(
+                1
+            )
         weight, bias = self.out
-        rows, factor = out
+        rows, factor, shift = out[0], out[1].to(weight.dtype), shift.to(weight.dtype)
         changed = weight[:, rows] * factor[:, None], bias[:, rows] * factor + shift
         return replace(self, weights=tuple(parts), out=changed)
 

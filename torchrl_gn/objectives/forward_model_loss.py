@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor
-from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
@@ -162,10 +161,11 @@ class ForwardModelLoss(LossModule):
             state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
         layout, steps = self.model.layout, state.shape[1]
         current, hidden = self.perturb(state[:, 0]), None
-        errors, program = state.new_zeros(len(layout.components)), self.model.program(parameters)
+        errors = state.new_zeros(len(layout.components))
+        executor = self.model.training_executor(parameters)
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
-            delta, hidden = eager.delta(program, current, action[:, step], hidden)
+            delta, hidden = executor.delta(current, action[:, step], hidden)
             errors = errors + self.component_errors(delta, target)
             if step + 1 < steps:
                 teacher_forced = step + 1 < self.teacher_forced_steps

@@ -28,6 +28,10 @@ class EagerExecutor:
     def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         return rollout_by_steps(self, state, actions, hidden)
 
+    def delta(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        """As :func:`delta`."""
+        return delta(self.program, state, action, hidden)
+
 
 def rollout_by_steps(
     executor: Executor, state: Tensor, actions: Tensor, hidden: Graph | None

@@ -1,3 +1,4 @@
 """The native executor: state maths as tapes of scalar instructions and the network's layers, run by C++."""
 
 from torchrl_gn.dynamics.executors.native.executor import NativeExecutor as NativeExecutor
+from torchrl_gn.dynamics.executors.native.training import NativeDelta as NativeDelta

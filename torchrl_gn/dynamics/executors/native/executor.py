@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.executors.eager import EagerExecutor, rollout_by_steps
 from torchrl_gn.dynamics.executors.native import library
+from torchrl_gn.dynamics.executors.native.build import NoCompilerError
+from torchrl_gn.dynamics.executors.native.pool import Pool
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
 from torchrl_gn.dynamics.executors.native.traced_program import MixedStatesError, TracedProgram
 from torchrl_gn.dynamics.program import StepProgram
@@ -32,11 +34,12 @@ class NativeExecutor:
     """
 
     fixed_batch, runs_all = False, True
+    change = False  # whether the result is a change instead of the next state
 
     def __init__(self, program: StepProgram) -> None:
         self.program, self.eager = program, EagerExecutor(program)
-        self.native: _Native | None = None
-        self.version = 0
+        self.native: Native | None = None
+        self.version, self.pool = 0, Pool()
         self._reason: str | None = None
         self.update(program)
 
@@ -50,34 +53,35 @@ class NativeExecutor:
         before, self.version = self.native, self.version + 1
         same_maths = same(_maths_of(self.program), _maths_of(program))
         self.program, self.eager = program, EagerExecutor(program)
-        layers, self._reason = _layers(program)
+        layers, self._reason = list_layers(program)
         if layers is None:
             self.native = None
             return
         try:
-            network = library.NativeNetwork(layers)  # a new one: other threads may still read the one before
-        except library.NoCompilerError as error:
+            # A new one: other threads may still read the one before.
+            network = library.NativeNetwork(layers, program.dtype)
+        except (NoCompilerError, TypeError) as error:
             self.native, self._reason = None, str(error)
             return
         kept = before is not None and same_maths and before.network.equals(network)
-        traced = before.traced if before is not None and kept else TracedProgram(program, layers)
-        self.native = _Native(network, traced, self.version)
+        traced = before.traced if before is not None and kept else TracedProgram(program, layers, self.change)
+        self.native = Native(network, layers, traced, self.version)
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        if (native := self._running(state, action)) is not None:
+        if (native := self.running(state, action)) is not None:
             after = self._rollout(native, state, action, False)
             if after is not None:
                 return after, None
         return self.eager.step(state, action, hidden)
 
     def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        if actions.shape[-2] and (native := self._running(state, actions)) is not None:
+        if actions.shape[-2] and (native := self.running(state, actions)) is not None:
             states = self._rollout(native, state, actions, True)
             if states is not None:
                 return states, None
         return rollout_by_steps(self.eager, state, actions, hidden)
 
-    def _running(self, state: Tensor, action: Tensor) -> _Native | None:
+    def running(self, state: Tensor, action: Tensor) -> Native | None:
         """What runs inputs natively; None if torch must."""
         native = self.native
         runs = (
@@ -96,7 +100,7 @@ class NativeExecutor:
         )
         return native if runs else None
 
-    def _rollout(self, native: _Native, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
+    def _rollout(self, native: Native, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
         """The next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``.
 
         None if torch operations must run it.
@@ -116,16 +120,17 @@ class NativeExecutor:
         return out.view(*state.shape[:-2], *out.shape[1:])
 
 
-class _Native(NamedTuple):
+class Native(NamedTuple):
     """A network and the state maths around it."""
 
     network: library.NativeNetwork
+    layers: LayerList
     traced: TracedProgram
     version: int  # of the weights
 
 
 def _run(
-    native: _Native, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None
+    native: Native, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None
 ) -> tuple[Tensor, tuple, library.NativeMaths]:
     """Results for contiguous inputs, and what a gradient needs: sizes of the call, and its state maths.
 
@@ -139,37 +144,38 @@ def _run(
 
 class _Differentiable(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, executor: NativeExecutor, native: _Native, state: Tensor, actions: Tensor, many: bool) -> Tensor:
+    def forward(ctx, executor: NativeExecutor, native: Native, state: Tensor, actions: Tensor, many: bool) -> Tensor:
         state, actions, network = state.contiguous(), actions.contiguous(), native.network
         numbers = state.shape[:-2].numel() * (actions.shape[-2] if many else 1) * network.kept
         stored = None
-        if numbers * network.dtype.itemsize <= STORED_BYTES:
-            stored = torch.empty(numbers, dtype=network.dtype, device="cpu")
-        out, ctx.sizes, ctx.maths = _run(native, state, actions, many, stored)
-        ctx.save_for_backward(out if many else state, actions, stored)
-        ctx.executor, ctx.native, ctx.many = executor, native, many
+        if numbers * network.number.itemsize <= STORED_BYTES:
+            stored = executor.pool.take(numbers, network.number)
+        out, ctx.sizes, ctx.maths = _run(native, state, actions, many, None if stored is None else stored.tensor)
+        ctx.save_for_backward(out if many else state, actions)
+        ctx.executor, ctx.native, ctx.many, ctx.stored = executor, native, many, stored
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        states, actions, stored = ctx.saved_tensors
+        states, actions = ctx.saved_tensors
         if ctx.native.version != ctx.executor.version:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
         gradient = gradient.contiguous()  # to live until the call is done
+        stored = None if ctx.stored is None else ctx.stored.tensor
         call, of_state, of_actions = library.adjoint_call(ctx.sizes, states, actions, gradient, ctx.many, stored)
         library.rollout_adjoint(ctx.native.network, ctx.maths, call)
         return None, None, of_state, of_actions, None
 
 
-def _layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
+def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     """The network as a list of layers, or why it cannot be one."""
     core = program.core
     if program.recurrent is not None:
         return None, "a recurrent model runs by torch operations"
     if program.movable.device.type != "cpu":
         return None, f"on {program.movable.device.type}, it runs by torch operations"
-    if program.dtype not in library.DTYPES:
+    if program.dtype not in (*library.DTYPES, torch.bfloat16):
         return None, f"{str(program.dtype).removeprefix('torch.')} products run by torch operations"
     layers = core.layers() if isinstance(core, ListedCore) else None
     if layers is None:

@@ -28,6 +28,12 @@ OPERATIONS = {
 """``sub_c`` is constant - x and ``div_c`` constant / x; ``madd`` is a * b + c, ``nmadd`` c - a * b."""
 
 
+class UntraceableError(RuntimeError):
+    """A function uses an operation that has no scalar form here."""
+
+    # No TypeError: Python would take one in a comparison for "not equal".
+
+
 class Expressions:
     """All expressions of one trace, numbered so that operands come before what is made of them."""
 

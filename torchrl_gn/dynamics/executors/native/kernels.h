@@ -9,6 +9,9 @@
 #include <cstring>
 #include <type_traits>
 #include <utility>
+#ifdef __AVX512BF16__
+#include <immintrin.h>
+#endif
 
 namespace gn __attribute__((visibility("hidden"))) {  // libraries built for other processors may be loaded beside
 
@@ -77,30 +80,40 @@ void accumulate_rows(T* to, int64_t to_step, const T* from, int64_t step, int ro
 }
 
 // out[r][column] = init[r][column] + sum_k x[r][k] w[k][column] for R rows and N panels of columns, begun at one.
-// Rows of x and panels of w lie apart as kernels of two kinds know: forward, x is [r][kStride] and w packed
-// [panel][depth][L]; in sums over rows, of gradients of weights, x is [k][kStride] and so is w.
+// Kernels are of three kinds: x is [r][kStride] and w packed [panel][depth][L]; the same of pairs of bfloat16, summed in
+// float32; or sums over rows, for gradients of weights, where x is [k][kStride] and so is w.
+enum Kind { kPlain, kPairs, kOverRows };
+
 template <class T>
 using Kernel = void (*)(const T* x, const T* w, int64_t depth, int64_t panel, const T* const* init, int64_t column,
                         T* out, int64_t stride);
 
-template <class T, bool kOverRows, int R, int N>
+template <class T, Kind kKind, int R, int N>
 void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64_t panel, const T* const* init,
               int64_t column, T* out, int64_t stride) {
   using V = Vector<T>;
-  constexpr int L = kLanes<T>, row = kOverRows ? 1 : kStride;
+  constexpr int L = kLanes<T>, row = kKind == kOverRows ? 1 : kStride;
+  constexpr int next_w = kKind == kOverRows ? kStride : L, next_x = kKind == kOverRows ? kStride : 1;
   typename V::type sum[R][N];
 #pragma GCC unroll 12
   for (int r = 0; r < R; r++)
 #pragma GCC unroll 8
     for (int v = 0; v < N; v++) sum[r][v] = V::load(init[r] + column + v * L);
-  for (int64_t k = 0; k < depth; k++, w += kOverRows ? kStride : L, x += kOverRows ? kStride : 1) {
+  for (int64_t k = 0; k < depth; k++, w += next_w, x += next_x) {
     typename V::type weights[N];
 #pragma GCC unroll 8
-    for (int v = 0; v < N; v++) weights[v] = V::load(w + v * (kOverRows ? L : panel));
+    for (int v = 0; v < N; v++) weights[v] = V::load(w + v * (kKind == kOverRows ? L : panel));
 #pragma GCC unroll 12
     for (int r = 0; r < R; r++) {
 #pragma GCC unroll 8
-      for (int v = 0; v < N; v++) sum[r][v] += x[r * row] * weights[v];
+      for (int v = 0; v < N; v++) {
+#ifdef __AVX512BF16__
+        if constexpr (kKind == kPairs)
+          sum[r][v] = _mm512_dpbf16_ps(sum[r][v], (__m512bh)_mm512_set1_ps(x[r * row]), (__m512bh)weights[v]);
+        else
+#endif
+          sum[r][v] += x[r * row] * weights[v];
+      }
     }
   }
 #pragma GCC unroll 12
@@ -109,38 +122,61 @@ void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64
     for (int v = 0; v < N; v++) V::store(out + r * stride + column + v * L, sum[r][v]);
 }
 
-template <class T, bool kOverRows, int N, int... R>
+template <class T, Kind kKind, int N, int... R>
 Kernel<T> kernel_of_rows(int rows, std::integer_sequence<int, R...>) {
-  static constexpr Kernel<T> kernels[] = {multiply<T, kOverRows, R + 1, N>...};
+  static constexpr Kernel<T> kernels[] = {multiply<T, kKind, R + 1, N>...};
   return kernels[rows - 1];
 }
 
-template <class T, bool kOverRows>
+template <class T, Kind kKind>
 Kernel<T> kernel(int rows, int panels) {
-  if constexpr (!kOverRows) {  // few rows are worth more panels at once: sums that do not wait for each other
-    if (panels == 8) return kernel_of_rows<T, false, 8>(rows, std::make_integer_sequence<int, kAccumulators / 8>{});
-    if (panels == 4) return kernel_of_rows<T, false, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
+  if constexpr (kKind != kOverRows) {  // few rows are worth more panels at once: sums that do not wait for each other
+    if (panels == 8) return kernel_of_rows<T, kKind, 8>(rows, std::make_integer_sequence<int, kAccumulators / 8>{});
+    if (panels == 4) return kernel_of_rows<T, kKind, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
   }
-  if (panels == 2) return kernel_of_rows<T, kOverRows, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
-  return kernel_of_rows<T, kOverRows, 1>(rows, std::make_integer_sequence<int, kRows>{});
+  if (panels == 2) return kernel_of_rows<T, kKind, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
+  return kernel_of_rows<T, kKind, 1>(rows, std::make_integer_sequence<int, kRows>{});
 }
 
 // out[rows][panels * L] = init + x @ w, with panels of w some numbers apart.
-template <class T, bool kOverRows = false>
+template <class T, Kind kKind>
 void product(const T* x, const T* w, int rows, int64_t panels, int64_t depth, int64_t panel, const T* const* init,
              T* out, int64_t stride) {
   int blocks = (rows + kRows - 1) / kRows, block = (rows + blocks - 1) / blocks;
   int most = 2;
-  while (!kOverRows && most < 8 && block <= kAccumulators / (2 * most)) most *= 2;
+  while (kKind != kOverRows && most < 8 && block <= kAccumulators / (2 * most)) most *= 2;
   for (int64_t p = 0; p < panels;) {
     int taken = most;
     while (taken > panels - p) taken /= 2;
-    for (int r = 0; r < rows; r += block)
-      kernel<T, kOverRows>(rows - r < block ? rows - r : block, taken)(
-          x + r * (kOverRows ? 1 : kStride), w + p * panel, depth, panel, init + r, p * kLanes<T>, out + r * stride,
-          stride);
+    for (int r = 0; r < rows; r += block) {
+      const T* left = x + r * (kKind == kOverRows ? 1 : kStride);
+      kernel<T, kKind>(rows - r < block ? rows - r : block, taken)(left, w + p * panel, depth, panel, init + r,
+                                                                   p * kLanes<T>, out + r * stride, stride);
+    }
     p += taken;
   }
+}
+
+// Nearest bfloat16, as its bits; NaN stays.
+inline uint16_t bfloat16(float value) {
+  uint32_t bits;
+  std::memcpy(&bits, &value, 4);
+  if (value != value) return static_cast<uint16_t>(bits >> 16 | 64);
+  return static_cast<uint16_t>((bits + 0x7fff + (bits >> 16 & 1)) >> 16);
+}
+
+// Rows of x as bfloat16, in place: pairs of numbers where one was, an odd last one with a zero.
+template <class T>
+void pair_up(T* x, int rows, int64_t count) {
+#ifdef __AVX512BF16__
+  for (int r = 0; r < rows; r++, x += kStride) {
+    if (count % 2) x[count] = 0;
+    for (int64_t c = 0; c < count; c += 32) {
+      auto pairs = _mm512_cvtne2ps_pbh(_mm512_loadu_ps(x + c + 16), _mm512_loadu_ps(x + c));
+      _mm512_storeu_ps(x + c / 2, (__m512)pairs);
+    }
+  }
+#endif
 }
 
 enum Activation : int64_t { kNone, kRelu, kSilu, kGelu, kTanh };

@@ -1,132 +1,24 @@
-"""Build the C++ code once for this processor, and call it."""
+"""Call the C++ code."""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
-import functools
-import hashlib
-import os
-import platform
-import shlex
-import shutil
-import subprocess
-import sys
-import tempfile
 import threading
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock
 from torch import Tensor
 
-from torchrl_gn.atomic import atomic_path
+from torchrl_gn.dynamics.executors.native import build
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
 from torchrl_gn.dynamics.executors.native.tape import Tape
 from torchrl_gn.networks.layers import LayerList
-from torchrl_gn.processor import processor_flags, processor_name
 
-SOURCES = sorted(path for path in Path(__file__).parent.iterdir() if path.suffix in (".h", ".cpp"))
-_OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno", "-pthread")
 TILE = 24  # samples that stay in a processor's cache from layer to layer
 DTYPES = {torch.float32: 0, torch.float64: 1}  # as the C++ code tells them apart
 _P, _I = ctypes.c_void_p, ctypes.c_int64
-
-
-class NoCompilerError(FileNotFoundError):
-    """There is no C++ compiler, or it failed: the message is one line."""
-
-
-def load_library() -> ctypes.CDLL:
-    """The compiled code, built at the first use on a processor and kept in ``~/.cache/torchrl_gn`` (20 s).
-
-    Raises:
-        NoCompilerError: without a working C++ compiler (``CXX``, which may have arguments, else c++, g++ or clang++).
-    """
-    found = _library_or_reason()
-    if isinstance(found, str):
-        raise NoCompilerError(found)
-    return found
-
-
-@functools.cache
-def _library_or_reason() -> ctypes.CDLL | str:
-    try:
-        return _load()
-    except (OSError, ValueError) as error:
-        return str(error)
-
-
-def _load() -> ctypes.CDLL:
-    compiler = shlex.split(os.environ.get("CXX", "")) or list(filter(shutil.which, ("c++", "g++", "clang++")))[:1]
-    if not compiler or shutil.which(compiler[0]) is None:
-        raise NoCompilerError("There is no C++ compiler: install g++ for the native executor.")
-    options = [*_OPTIONS, *instruction_flags(), *shlex.split(os.environ.get("TORCHRL_GN_CXXFLAGS", ""))]
-    version = _run([*compiler, "--version"]).splitlines()[:1]
-    parts = [*compiler, *version, *options, processor_name(), processor_flags(), sys.platform]
-    digest = hashlib.sha256("\n".join([*parts, *(path.read_text() for path in SOURCES)]).encode())
-    name, command = f"native-{digest.hexdigest()[:16]}.so", [*compiler, *options]
-    try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
-        file = folder / name
-        if (library := _opened(file)) is not None:
-            return library
-        folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / f".{name}.lock"):  # others wait for whoever builds
-            if (library := _opened(file)) is None:
-                for left in folder.glob(f".{file.stem}.*.so"):  # by a build that was interrupted
-                    left.unlink()
-                _build(command, file)
-                library = _opened(file)
-        if library is not None:
-            return library
-    except NoCompilerError:
-        raise
-    except (OSError, RuntimeError):  # no home, or none to write to
-        pass
-    with tempfile.TemporaryDirectory(prefix="torchrl_gn-") as temporary:
-        file = Path(temporary) / name  # code in the home may not be run, either
-        _build(command, file)
-        return _declared(ctypes.CDLL(str(file)))
-
-
-def _build(command: Sequence[str], file: Path) -> None:
-    """Compile to a file that ends with its SHA-256."""
-    sys.stderr.write("Building the native executor for this processor, once: about 20 s.\n")
-    source = next(path for path in SOURCES if path.suffix == ".cpp")
-    with atomic_path(file) as temporary:
-        _run([*command, str(source), "-o", str(temporary)])
-        with temporary.open("ab") as out:
-            out.write(hashlib.sha256(temporary.read_bytes()).digest())
-
-
-def _opened(file: Path) -> ctypes.CDLL | None:
-    """The library of a whole file; None if it is missing or damaged, which could end the process."""
-    with contextlib.suppress(OSError, AttributeError):
-        content = file.read_bytes()
-        if hashlib.sha256(content[:-32]).digest() == content[-32:]:
-            return _declared(ctypes.CDLL(str(file)))
-    return None
-
-
-def instruction_flags() -> list[str]:
-    """Compiler flags for what torch uses of this processor, which ``ATEN_CPU_CAPABILITY`` restricts."""
-    if platform.machine().lower() not in ("x86_64", "amd64"):
-        return []
-    sets = {"AVX512": ["-march=native"], "AVX2": ["-mavx2", "-mfma"]}
-    return sets.get(torch.backends.cpu.get_cpu_capability(), [])
-
-
-def _run(command: Sequence[str]) -> str:
-    try:
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    except (OSError, subprocess.CalledProcessError) as error:
-        lines = (getattr(error, "stderr", "") or str(error)).splitlines()
-        first = next((line for line in lines if "error" in line), "".join(lines[-1:]))
-        raise NoCompilerError(f"The C++ compiler {command[0]} failed: {first.strip()}") from error
 
 
 class _Array(ctypes.Structure):
@@ -147,9 +39,9 @@ class _Tape(ctypes.Structure):
 
 class _Maths(ctypes.Structure):
     _fields_ = (
-        *((name, _I) for name in ("size", "varying_count", "actions", "outputs", "node_inputs", "edge_inputs")),
-        *((name, _I) for name in ("node_width", "edge_width", "output_width")),
-        *((name, _P) for name in ("varying", "constant", "values")),
+        *((name, _I) for name in ("size", "varying_count", "result_size", "result_count", "is_state", "actions")),
+        *((name, _I) for name in ("outputs", "node_inputs", "edge_inputs", "node_width", "edge_width", "output_width")),
+        *((name, _P) for name in ("varying", "constant", "values", "results")),
         ("forward", _Tape),
         ("adjoint", _Tape),
     )
@@ -166,14 +58,20 @@ class _Call(ctypes.Structure):
         ("grad_state", _Array),
         ("grad_actions", _Array),
         ("stored", _P),
+        ("train", _I),
+        ("grad_weights", _P),
+        ("grad_tables", _P),
     )
 
 
-def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
+def load_library() -> ctypes.CDLL:
+    """The compiled code; NoCompilerError if it cannot be built."""
+    library = build.load_code()
     signatures: dict[str, tuple[Any, list]] = {
         "gn_network_new": (_P, [_I, _P, _P, _P]),
         "gn_network_delete": (None, [_P, _I]),
-        "gn_network_stored": (_I, [_P, _I]),
+        "gn_has_bfloat16": (_I, []),
+        "gn_stored": (_I, [_P, _I, _P, _P]),
         "gn_rollout": (_I, [_P, _I, _P, _P]),
         "gn_rollout_adjoint": (None, [_P, _I, _P, _P]),
     }
@@ -184,18 +82,31 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
 
 
 class NativeNetwork:
-    """A layer list packed for the processor; freed with the object."""
+    """A layer list packed for the processor; freed with the object.
 
-    def __init__(self, layers: LayerList) -> None:
-        self.library = load_library()
-        self.dtype = layers.layers[0].weight.dtype
-        self.is_double = int(self.dtype == torch.float64)
-        self.code = layers.code().contiguous()
-        weights, tables, self._kept = _pointers(layers)
-        self.pointer = self.library.gn_network_new(self.is_double, self.code.data_ptr(), weights, tables)
-        last = layers.layers[-1]
-        # Numbers of a sample and step that its gradient needs: activations' derivatives and the output.
-        self.kept = self.library.gn_network_stored(self.pointer, self.is_double) + last.count * len(last.weight)
+    TypeError for bfloat16 on a processor that does not multiply it.
+    """
+
+    def __init__(self, layers: LayerList, dtype: torch.dtype) -> None:
+        self.library, self.dtype = load_library(), dtype
+        self.kind = {torch.float32: 0, torch.float64: 1, torch.bfloat16: 2}[dtype]
+        if self.kind == 2 and not self.library.gn_has_bfloat16():
+            raise TypeError("This processor multiplies no bfloat16.")
+        self.code, number = layers.code().contiguous(), self.number
+        weights, tables = layers.tensors()
+        self.weights = [each.detach().to(number) for each in weights]
+        self.tables = [None if each is None else each.detach().to(number) for each in tables]
+        addresses = pointers(self.weights), pointers(self.tables)
+        self.pointer = self.library.gn_network_new(self.kind, self.code.data_ptr(), *addresses)
+        # Numbers of a sample and step that its gradient needs: slopes of the activations, and the output.
+        sizes = [layer.count * len(layer.weight) for layer in layers.layers]
+        slopes = [size for size, layer in zip(sizes, layers.layers, strict=True) if layer.activation is not None]
+        self.kept = sum(slopes) + sizes[-1]
+
+    @property
+    def number(self) -> torch.dtype:
+        """Dtype of sums, weights and tables."""
+        return torch.float64 if self.kind == 1 else torch.float32
 
     def equals(self, other: NativeNetwork) -> bool:
         """Whether both are the same but for their weights."""
@@ -203,16 +114,12 @@ class NativeNetwork:
 
     def __del__(self) -> None:
         if (pointer := getattr(self, "pointer", None)) is not None:
-            self.library.gn_network_delete(pointer, self.is_double)
+            self.library.gn_network_delete(pointer, self.kind)
 
 
-def _pointers(layers: LayerList) -> tuple[Any, Any, Any]:
-    weights, tables = layers.tensors()
-    return (
-        (_P * len(weights))(*(each.data_ptr() for each in weights)),
-        (_P * len(tables))(*(None if each is None else each.data_ptr() for each in tables)),
-        (weights, tables),
-    )
+def pointers(tensors: Sequence[Tensor | None]) -> Any:
+    """Addresses of contiguous tensors."""
+    return (_P * len(tensors))(*(None if each is None else each.data_ptr() for each in tensors))
 
 
 class NativeMaths:
@@ -225,6 +132,9 @@ class NativeMaths:
         self.struct = _Maths(
             size=maths.is_constant.size,
             varying_count=len(maths.varying),
+            result_size=maths.result_size,
+            result_count=len(maths.results),
+            is_state=not maths.change,
             actions=maths.actions,
             outputs=last.count * len(last.weight),
             node_inputs=layers.nodes[0] * layers.nodes[1],
@@ -235,6 +145,7 @@ class NativeMaths:
             varying=maths.varying.ctypes.data,
             constant=maths.constant.ctypes.data,
             values=maths.values.ctypes.data,
+            results=maths.results.ctypes.data,
             forward=self._tape(maths.forward),
         )
         self.reference = ctypes.addressof(self.struct)
@@ -267,22 +178,25 @@ class NativeMaths:
 NOTHING = (None, 0)  # no array
 
 
-def forward_call(state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None) -> tuple[tuple, Tensor]:
+def forward_call(
+    state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None, result: Tensor | None = None
+) -> tuple[tuple, Tensor]:
     """Fields of a call for contiguous inputs, which must live as long as the call, and its result.
 
-    That is the next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``.
+    That is the next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``; or
+    shaped like ``result``.
     """
     shape, threads = state.shape, torch.get_num_threads()
     size = shape[-2] * shape[-1]
     count, steps = state.numel() // size, actions.shape[-2] if many else 1
-    out_shape = (*shape[:-2], steps + 1, *shape[-2:]) if many else shape
+    out_shape = (*shape[:-2], steps + 1, *shape[-2:]) if many else shape if result is None else result.shape
     out = torch.empty(out_shape, dtype=state.dtype, device="cpu")
     tile = min(TILE, -(-count // threads))  # such that there are tiles for all threads
     call = (
         *(count, steps, tile, threads),
         *((state.data_ptr(), DTYPES[state.dtype]), size, (actions.data_ptr(), DTYPES[actions.dtype])),
         *((out.data_ptr(), DTYPES[out.dtype]), many, NOTHING, NOTHING),
-        None if stored is None else stored.data_ptr(),
+        *(None if stored is None else stored.data_ptr(), 0, None, None),
     )
     return call, out
 
@@ -303,7 +217,7 @@ def adjoint_call(
         *((states.data_ptr(), DTYPES[states.dtype]), size * (sizes[1] + 1 if many else 1)),
         *((actions.data_ptr(), DTYPES[actions.dtype]), (gradient.data_ptr(), DTYPES[gradient.dtype]), many),
         *((of_state.data_ptr(), DTYPES[states.dtype]), (of_actions.data_ptr(), DTYPES[actions.dtype])),
-        None if stored is None else stored.data_ptr(),
+        *(None if stored is None else stored.data_ptr(), 0, None, None),
     )
     return call, of_state, of_actions
 
@@ -311,11 +225,17 @@ def adjoint_call(
 def rollout(network: NativeNetwork, maths: NativeMaths, call: tuple) -> bool:
     """Run ``gn_rollout`` on the fields of a call; False if a start state has other constant channels."""
     reference = ctypes.byref(_Call(*call))
-    return not network.library.gn_rollout(network.pointer, network.is_double, maths.reference, reference)
+    return not network.library.gn_rollout(network.pointer, network.kind, maths.reference, reference)
 
 
 def rollout_adjoint(network: NativeNetwork, maths: NativeMaths, call: tuple) -> None:
     """Run ``gn_rollout_adjoint`` on the fields of a call."""
     maths.add_adjoint()
     reference = ctypes.byref(_Call(*call))
-    network.library.gn_rollout_adjoint(network.pointer, network.is_double, maths.reference, reference)
+    network.library.gn_rollout_adjoint(network.pointer, network.kind, maths.reference, reference)
+
+
+def trained_count(network: NativeNetwork, sizes: tuple) -> int:
+    """Numbers that a step keeps for gradients of weights; ``sizes`` are a call's first fields."""
+    call = _Call(*sizes, train=1)
+    return network.library.gn_stored(network.pointer, network.kind, ctypes.byref(_Maths()), ctypes.byref(call))

@@ -13,9 +13,18 @@
 
 namespace gn __attribute__((visibility("hidden"))) {
 
-template <class T>
-class Network {  // T: float or double. Methods touch only ws and stored: several threads may run one network.
+// T: float or double. kBfloat16: factors of the products are rounded, sums stay float32; for float, if the compiler
+// defines __AVX512BF16__. Methods touch only ws and stored: several threads may run one network.
+template <class T, bool kBfloat16 = false>
+class Network {
+#ifndef __AVX512BF16__
+  static_assert(!kBfloat16, "bfloat16 needs -mavx512bf16");
+#endif
+  static_assert(!kBfloat16 || sizeof(T) == 4, "bfloat16 is summed in float");
+
  public:
+  using Number = T;
+
   // code: see above; weights[i] row-major [out, K] and tables[i] [I, out] or nullptr, of every layer i.
   Network(const int64_t* code, const T* const* weights, const T* const* tables) {
     add_buffer(code[0], code[1]);
@@ -59,6 +68,20 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
   // Numbers of T, to lie at a 64-byte boundary, that a tile of S samples needs.
   size_t workspace(int S, bool gradient) const {
     return scratch() + (gradient ? 2 : 1) * S * total_ + kLanes<T>;
+  }
+  // The activations of a tile of S samples, which weight_gradients() reads: they may be moved to another ws.
+  T* activations(T* ws) const { return ws + scratch(); }
+  int64_t activation_count(int S) const { return S * total_; }
+  // Numbers of every layer's weight and table; 0 of a table that is not there.
+  std::vector<int64_t> weight_sizes() const {
+    std::vector<int64_t> sizes;
+    for (const Layer& layer : layers_) sizes.push_back(layer.width * layer.depth);
+    return sizes;
+  }
+  std::vector<int64_t> table_sizes() const {
+    std::vector<int64_t> sizes;
+    for (const Layer& layer : layers_) sizes.push_back(layer.has_table ? layer.items * layer.width : 0);
+    return sizes;
   }
   // Numbers per sample that backward() needs of forward(): slopes of the activations.
   size_t stored() const { return stored_; }
@@ -117,7 +140,9 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
   };
   struct Gather {
     int64_t source, width, column = 0;
+    bool in_order = true;                 // row i is one item, items[0] + i
     bool clears = false, writes = false;  // in backward(): zero the source's gradient first; or overwrite it
+    bool apart = true;                    // no other gather of the layer has its source
     std::vector<int64_t> offsets, items;
   };
   struct Layer {
@@ -125,10 +150,19 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     Activation activation;
     std::vector<Gather> inputs, added;
     bool has_table = false, direct = false;  // direct: backward() multiplies into the only input's gradient
+    int64_t reads(int64_t source) const {
+      int64_t count = 0;
+      for (auto* gathers : {&inputs, &added})
+        for (const Gather& gather : *gathers) count += gather.source == source;
+      return count;
+    }
     Block forward, backward, table;  // [out / L][in][L], [in / L][out][L], [I or 1][out], padded
   };
 
   static int64_t padded(int64_t width) { return (width + kLanes<T> - 1) / kLanes<T> * kLanes<T>; }
+
+  // Numbers of T that hold a row of a product's factors.
+  static int64_t steps(int64_t depth) { return kBfloat16 ? (depth + 1) / 2 : depth; }
 
   static Block block(int64_t count) {
     size_t bytes = (std::max<int64_t>(count, 1) * sizeof(T) + 63) / 64 * 64;
@@ -139,10 +173,18 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
 
   static Block pack(const T* weight, int64_t columns, int64_t depth, int64_t column_step, int64_t depth_step) {
     constexpr int L = kLanes<T>;
-    Block packed = block(padded(columns) * depth);
+    Block packed = block(padded(columns) * steps(depth));
     for (int64_t c = 0; c < columns; c++)
-      for (int64_t k = 0; k < depth; k++)
-        packed[(c / L * depth + k) * L + c % L] = weight[c * column_step + k * depth_step];
+      for (int64_t k = 0; k < depth; k++) {
+        T value = weight[c * column_step + k * depth_step];
+        T& to = packed[(c / L * steps(depth) + steps(k + 1) - 1) * L + c % L];
+        if constexpr (kBfloat16) {
+          uint16_t half = bfloat16(value);
+          std::memcpy(reinterpret_cast<char*>(&to) + 2 * (k % 2), &half, 2);
+        } else {
+          to = value;
+        }
+      }
     return packed;
   }
 
@@ -158,6 +200,8 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     code += items + 1;
     gather.items.assign(code, code + gather.offsets.back());
     code += gather.offsets.back();
+    for (int64_t i = 0; i < items && gather.in_order; i++)
+      gather.in_order = gather.offsets[i + 1] == i + 1 && gather.items[i] == gather.items[0] + i;
   }
 
   // Which gather is the first in backward() to reach its source.
@@ -167,17 +211,17 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     for (size_t i = layers_.size(); i-- > 0;)
       for (auto* gathers : {&layers_[i].inputs, &layers_[i].added})
         for (Gather& gather : *gathers) {
+          gather.apart = layers_[i].reads(gather.source) == 1;
           if (reached[gather.source]) continue;
           reached[gather.source] = true;
           std::vector<int64_t> items = gather.items;
           std::sort(items.begin(), items.end());
-          bool once = static_cast<int64_t>(items.size()) == buffers_[gather.source].items;
+          bool once = gather.apart && static_cast<int64_t>(items.size()) == buffers_[gather.source].items;
           for (size_t j = 0; once && j < items.size(); j++) once = items[j] == static_cast<int64_t>(j);
           (once ? gather.writes : gather.clears) = true;
           Layer& layer = layers_[i];
-          bool only = gathers == &layer.inputs && layer.inputs.size() == 1;
-          layer.direct = gather.writes && only && items == gather.items && padded(layer.depth) == layer.depth &&
-                         buffers_[gather.source].items == layer.items;
+          bool only = gathers == &layer.inputs && layer.inputs.size() == 1 && layer.added.empty();
+          layer.direct = only && once && gather.in_order && padded(layer.depth) == layer.depth;
         }
     for (size_t b = 0; b < buffers_.size(); b++)
       if (!reached[b]) unread_.push_back(b);
@@ -226,12 +270,14 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     }
   }
 
-  const T* rows_of(const Gather& g, int64_t j, T* ws, int S, int sample) const {
+  const T* rows_of(const Gather& g, int64_t j, T* ws, int S, int64_t sample) const {
     return values(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
   }
 
   // Columns [from, to) of gathered rows; up to a vector more is written after each.
   void gather(const Gather& g, T* ws, int S, int64_t start, int rows, int64_t from, int64_t to, T* x) const {
+    if (g.in_order)
+      return copy_rows(x, kStride, rows_of(g, 0, ws, S, start) + from, g.width, rows, to - from);
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
       T* out = x + row * kStride;
       int64_t j = g.offsets[item], last = g.offsets[item + 1];
@@ -249,6 +295,15 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
       int64_t from = std::max(begin, g.column), to = std::min(end, g.column + g.width);
       if (from < to) gather(g, ws, S, start, rows, from - g.column, to - g.column, ws + from - begin);
     }
+  }
+
+  // Adds the product of a chunk's left factor, columns [k, k + count) of depth, and packed weights to init.
+  static void multiply(const T* packed, T* x, int rows, int64_t k, int64_t count, int64_t depth, int64_t width,
+                       const T* const* init, T* out) {
+    constexpr int L = kLanes<T>;
+    if constexpr (kBfloat16) pair_up(x, rows, count);
+    product<T, kBfloat16 ? kPairs : kPlain>(x, packed + steps(k) * L, rows, width / L, steps(count), steps(depth) * L,
+                                            init, out, width);
   }
 
   // Pre-activations of a chunk.
@@ -269,8 +324,7 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     for (int64_t k = 0; k == 0 || k < layer.depth; k += kDepth) {
       int64_t end = std::min<int64_t>(k + kDepth, layer.depth);
       gather(layer, ws, S, start, rows, k, end);
-      product(ws, layer.forward.get() + k * kLanes<T>, rows, width / kLanes<T>, end - k, layer.depth * kLanes<T>, init,
-              to, width);
+      multiply(layer.forward.get(), ws, rows, k, end - k, layer.depth, width, init, to);
       for (int r = 0; r < rows; r++) init[r] = to + r * width;
     }
     for (int r = 0; r < rows && !direct; r++) std::copy_n(to + r * width, layer.width, out + r * layer.width);
@@ -302,8 +356,8 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
           T* to = weight + (o + p) * depth + k;
           const T* init[kChunk];
           for (int r = 0; r < outputs; r++) init[r] = whole ? to + r * depth : zeros_.get();
-          product<T, true>(dz + p, ws, outputs, stride / kLanes<T>, rows, kLanes<T>, init, whole ? to : results(ws),
-                           whole ? depth : stride);
+          product<T, kOverRows>(dz + p, ws, outputs, stride / kLanes<T>, rows, kLanes<T>, init,
+                                whole ? to : results(ws), whole ? depth : stride);
           if (!whole) accumulate_rows<T, true>(to, depth, results(ws), stride, outputs, columns);
         }
       }
@@ -319,20 +373,21 @@ class Network {  // T: float or double. Methods touch only ws and stored: severa
     for (int64_t k = 0; k < width; k += kDepth) {
       int64_t count = std::min<int64_t>(kDepth, width - k);
       multiply_slopes(grad + k, slopes ? slopes + k : nullptr, width, rows, count, ws);
-      product(ws, layer.backward.get() + k * kLanes<T>, rows, depth / kLanes<T>, count, width * kLanes<T>, init,
-              results, depth);
+      multiply(layer.backward.get(), ws, rows, k, count, width, depth, init, results);
       for (int r = 0; r < rows; r++) init[r] = results + r * depth;
     }
+    if (layer.direct) return;
+    auto scatter = [&](const Gather& g, int64_t j, int64_t sample, int row, int now) {
+      T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
+      const T* from = results + row * depth + g.column;
+      (g.writes ? accumulate_rows<T, false> : accumulate_rows<T, true>)(to, g.width, from, depth, now, g.width);
+    };
+    for (const Gather& g : layer.inputs)
+      if (g.in_order && g.apart) scatter(g, 0, start, 0, rows);
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
       for (const Gather& g : layer.inputs)
-        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1] && !layer.direct; j++) {
-          T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;
-          const T* from = results + row * depth + g.column;
-          if (g.writes)
-            accumulate_rows<T, false>(to, g.width, from, depth, now, g.width);
-          else
-            accumulate_rows<T, true>(to, g.width, from, depth, now, g.width);
-        }
+        for (int64_t j = g.offsets[item]; j < g.offsets[item + 1] && !(g.in_order && g.apart); j++)
+          scatter(g, j, sample, row, now);
       for (const Gather& g : layer.added)
         for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++) {
           T* to = gradients(ws, S, g.source) + (g.items[j] * S + sample) * g.width;

@@ -23,19 +23,28 @@ class StateMaths:
         program: the step.
         state: ``[N, C]`` a state.
         constant: ``[N, C]`` which channels may be taken for constant; those that the step changes are not.
-        outputs: nodes that the network predicts and components of each, ``(P, F_out)``.
+        predicted: ``[P]`` nodes that the network predicts.
+        width: components of each, ``F_out``.
+        change: whether the result is the change ``[N, 12]`` instead of the next state.
 
     Raises:
-        UntraceableError: if a feature uses an operation without scalar form.
-        TooLongError: if it needs too many registers.
+        UntraceableError: if a feature uses an operation without scalar form, or it needs too many registers.
     """
 
     def __init__(
-        self, program: StepProgram, state: np.ndarray, constant: np.ndarray, predicted: np.ndarray, width: int
+        self,
+        program: StepProgram,
+        state: np.ndarray,
+        constant: np.ndarray,
+        predicted: np.ndarray,
+        width: int,
+        change: bool = False,
     ) -> None:
         while True:
             graph = Expressions()
-            symbols, actions, outputs, inputs, after = _forward(program, graph, state, constant, predicted, width)
+            symbols, actions, outputs, inputs, (after, delta) = _forward(
+                program, graph, state, constant, predicted, width
+            )
             stays = np.frompyfunc(lambda a, b: not isinstance(a, Scalar) and abs(a - b) <= 1e-12 * (1 + abs(b)), 2, 1)
             changed = constant & ~stays(after, state).astype(bool)
             if not changed.any():
@@ -46,21 +55,28 @@ class StateMaths:
         self.varying = np.flatnonzero(~flat).astype(np.int32)  # [L] channels of the flat state [N * C] that change
         self.constant = np.flatnonzero(flat).astype(np.int32)  # [N * C - L] the others
         self.values = state.ravel()[flat].astype(np.float64)  # [N * C - L] of these
-        self._graph, self._after, self._inputs = graph, after[~constant].tolist(), inputs
+        self._graph, self._inputs, self.change = graph, inputs, change
+        # [R] channels of the flat result that are computed: the varying ones of a state, a change's that are not 0.
+        self.results, self.result_size = self.varying, state.size
+        self._after: list[Any] = after[~constant].tolist()
+        if change:
+            changes = np.frompyfunc(lambda a: isinstance(a, Scalar) or a != 0, 1, 1)(delta.ravel()).astype(bool)
+            self.results, self.result_size = np.flatnonzero(changes).astype(np.int32), delta.size
+            self._after = delta.ravel()[changes].tolist()
         self._groups: list[list[Scalar]] = [symbols[~constant].tolist(), actions.tolist(), outputs.tolist()]
-        # Phase 0: network inputs from the varying channels and the action; phase 1: the next varying channels from the
-        # network's output.
+        # Phase 0: network inputs from the varying channels and the action; phase 1: the result from the network's
+        # output.
         self.forward = assemble(graph, self._groups, [self._inputs, self._after])
 
     @functools.cached_property
     def adjoint(self) -> Tape:
         """The pull-back of ``forward``.
 
-        Phase 0: gradient of the network's output from that of the next state. Phase 1: gradients of state and action
+        Phase 0: gradient of the network's output from that of the result. Phase 1: gradients of state and action
         from those of the network's inputs.
         """
         graph, (varying, actions, outputs) = self._graph, self._groups
-        of_after, of_inputs = graph.inputs(3, len(varying)), graph.inputs(4, len(self._inputs))
+        of_after, of_inputs = graph.inputs(3, len(self._after)), graph.inputs(4, len(self._inputs))
         last = gradient(graph, self._after, of_after, [*outputs, *varying])
         first = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
         of_state = [a + b for a, b in zip(last[len(outputs) :], first, strict=False)]
@@ -83,7 +99,7 @@ def may_be_constant(program: StepProgram, state: np.ndarray) -> np.ndarray:
 
 def _forward(
     program: StepProgram, graph: Expressions, state: np.ndarray, constant: np.ndarray, predicted: np.ndarray, width: int
-) -> tuple[Array, Array, Array, list[Any], Array]:
+) -> tuple[Array, Array, Array, list[Any], list[Array]]:
     symbols = np.empty(state.shape, dtype=object)
     symbols[...] = state.astype(float).astype(object)
     varying = np.flatnonzero(~constant.ravel())
@@ -100,7 +116,8 @@ def _forward(
 
     def after(state: Tensor, predicted: Tensor) -> tuple[Tensor, ...]:
         canonical = program.canonicalizer(state, program.parameters)
-        return (program.layout.apply(state, eager.change(program, state, canonical, predicted)),)
+        change = eager.change(program, state, canonical, predicted)
+        return program.layout.apply(state, change), change
 
     inputs = [each for part in trace(before, symbols, actions) for each in part.ravel().tolist()]
-    return symbols, actions, outputs, inputs, trace(after, symbols, full)[0]
+    return symbols, actions, outputs, inputs, trace(after, symbols, full)

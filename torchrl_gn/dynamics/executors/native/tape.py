@@ -8,16 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_gn.dynamics.executors.native.expressions import OPERATIONS, Expressions, Scalar
+from torchrl_gn.dynamics.executors.native.expressions import OPERATIONS, Expressions, Scalar, UntraceableError
 
 CODES = {name: code for code, name in enumerate(OPERATIONS)}
 """Numbers of the operations, as ``enum Operation`` of tape.h has them."""
 INSTRUCTION = np.dtype([("code", "u2"), ("out", "u2"), ("a", "u2"), ("b", "u2"), ("c", "u2"), ("_", "u2"), ("k", "u4")])
 _MOST_REGISTERS = 2**16 - 1
-
-
-class TooLongError(TypeError):
-    """A scene's state maths needs more registers than a tape has."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +63,7 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
         k = constants.setdefault(constant, len(constants))
         instructions.append((CODES[operation], where[index], a, b, c, 0, k))
     if count > _MOST_REGISTERS:
-        raise TooLongError(f"The state maths of this scene needs {count} registers.")
+        raise UntraceableError(f"The state maths of this scene needs {count} registers.")
     read = {operand for index in order for operand in nodes[index][1]} | {i for outputs in results for i in outputs}
     return Tape(
         instructions=np.array(instructions, dtype=INSTRUCTION),

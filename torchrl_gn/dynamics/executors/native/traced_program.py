@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import threading
 from dataclasses import replace
@@ -37,11 +38,12 @@ class TracedProgram:
     first that fits, whatever the other samples are.
     """
 
-    def __init__(self, program: StepProgram, layers: LayerList) -> None:
-        self.program, self.layers = program, layers
+    def __init__(self, program: StepProgram, layers: LayerList, change: bool = False) -> None:
+        self.program, self.layers, self.change = program, layers, change
         self.reason: str | None = None  # why torch operations must run it
         self.special: list[library.NativeMaths] = []
         self.general: library.NativeMaths | None = None
+        self._tried_general = False
         self._example: tuple[np.ndarray, Tensor] | None = None  # a finite state and action
         self._lock = threading.Lock()
 
@@ -75,29 +77,25 @@ class TracedProgram:
                 sample = int((left & finite).argmax())
                 state = flat[sample].reshape(states.shape[-2:])
                 self._example = state, actions[sample]
-                self.special.append(self._traced(state, may_be_constant(self.program, state)))
+                try:
+                    self.special.append(self._traced(state, may_be_constant(self.program, state)))
+                except UntraceableError as error:
+                    self.reason = str(error)
+                    raise
             fits = left & self.special[index].fits(flat)
             groups[fits], left = index, left & ~fits
-        if left.any() and self.general is None and self._example is not None:
-            state = self._example[0]
-            self.general = self._traced(state, np.zeros_like(state, dtype=bool))
+        if left.any() and not self._tried_general and self._example is not None:
+            state, self._tried_general = self._example[0], True
+            with contextlib.suppress(UntraceableError):  # torch runs states that need it
+                self.general = self._traced(state, np.zeros_like(state, dtype=bool))
         return groups
 
     def _traced(self, state: np.ndarray, constant: np.ndarray) -> library.NativeMaths:
-        """State maths that agree with torch's on the example; else the reason is kept and raised."""
-        core = self.program.core
-        assert isinstance(core, ListedCore)
-        last = self.layers.layers[-1]
-        predicted = torch.arange(self.layers.nodes[0], device="cpu")[core.predicted].numpy()
-        width = last.count * len(last.weight) // max(len(predicted), 1)
-        try:
-            with torch.device("cpu"), torch.no_grad():
-                maths = StateMaths(self.program, np.where(constant, state, 0.0), constant, predicted, width)
-                native = library.NativeMaths(maths, self.layers)
-                self._compare(native)
-        except UntraceableError as error:
-            self.reason = str(error)
-            raise
+        """State maths that agree with torch's on the example; else UntraceableError."""
+        with torch.device("cpu"), torch.no_grad():
+            maths = trace_states(self.program, self.layers, state, constant, self.change)
+            native = library.NativeMaths(maths, self.layers)
+            self._compare(native)
         return native
 
     def _compare(self, maths: library.NativeMaths) -> None:
@@ -105,11 +103,16 @@ class TracedProgram:
         assert self._example is not None
         state, action = torch.from_numpy(self._example[0]).clone(), self._example[1].clone()
         program, network = self._in_float64
-        change = eager.step(program, state, action, None)[0] - state
-        call, found = library.forward_call(state, action, False)
+        change = (
+            eager.delta(program, state, action)[0]
+            if self.change
+            else eager.step(program, state, action, None)[0] - state
+        )
+        call, found = library.forward_call(state, action, False, result=change)
         if not library.rollout(network, maths, call):
             raise UntraceableError("The state maths do not fit the state that they were traced for.")
-        error, size = float((found - state - change).norm()), float(change.norm())
+        found = found if self.change else found - state
+        error, size = float((found - change).norm()), float(change.norm())
         if np.isfinite(size) and not error <= 1e-6 * size + 1e-12 * (1 + float(state.norm())):
             raise UntraceableError(
                 f"The native step differs from torch's by {error / max(size, 1e-300):.1e} of the change."
@@ -118,4 +121,20 @@ class TracedProgram:
     @functools.cached_property
     def _in_float64(self) -> tuple[StepProgram, library.NativeNetwork]:
         core = snapshot(self.program.core, torch.float64)
-        return replace(self.program, core=core, dtype=torch.float64), library.NativeNetwork(core.layers())
+        network = library.NativeNetwork(core.layers(), torch.float64)
+        return replace(self.program, core=core, dtype=torch.float64), network
+
+
+def trace_states(
+    program: StepProgram, layers: LayerList, state: np.ndarray, constant: np.ndarray, change: bool = False
+) -> StateMaths:
+    """State maths of a program for states whose channels ``constant`` ``[N, C]`` are those of ``state``.
+
+    Raises:
+        UntraceableError: if they have no scalar form.
+    """
+    core, last = program.core, layers.layers[-1]
+    assert isinstance(core, ListedCore)
+    predicted = torch.arange(layers.nodes[0], device="cpu")[core.predicted].numpy()
+    width = last.count * len(last.weight) // max(len(predicted), 1)
+    return StateMaths(program, np.where(constant, state, 0.0), constant, predicted, width, change)

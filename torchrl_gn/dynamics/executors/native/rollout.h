@@ -1,8 +1,10 @@
-// Rollouts of a specialised forward model, and their gradients, without Python: the C interface of library.py.
+// Rollouts of a specialised forward model and their gradients: the state maths by tapes, the network by network.h.
 //
-// Samples are handled in tiles of up to 24, each from its first step to its last by one thread: the state maths by
-// tapes (tape.h, samples as lanes), the network by network.h. Every sample is computed in the same order whatever the
-// batch, the tile and the number of threads, so results do not depend on them.
+// Samples are handled in tiles of up to 24, each from its first step to its last by one thread, with samples as the
+// lanes of its tapes. Every sample is computed in the same order whatever the batch, the tile and the number of
+// threads, so results do not depend on them.
+#pragma once
+
 #include <algorithm>
 #include <atomic>
 #include <cstdlib>
@@ -13,7 +15,7 @@
 #include "network.h"
 #include "tape.h"
 
-namespace gn {
+namespace gn __attribute__((visibility("hidden"))) {
 
 // A number array in float32 or float64.
 struct Array {
@@ -32,6 +34,9 @@ struct Array {
 struct Maths {
   int64_t size;            // channels of a state, N * C
   int64_t varying_count;   // of them change
+  int64_t result_size;     // numbers of a result: a state, or a change N * 12
+  int64_t result_count;    // of them are computed
+  int64_t is_state;        // a result is a state: its other channels are copied, and steps follow each other
   int64_t actions;
   int64_t outputs;         // P * F_out
   int64_t node_inputs, edge_inputs;  // N * F_n, E * F_e
@@ -39,6 +44,7 @@ struct Maths {
   const int32_t* varying;
   const int32_t* constant;
   const double* values;    // of the constant channels
+  const int32_t* results;  // channels of a result that are computed
   Tape forward, adjoint;
 };
 
@@ -47,11 +53,14 @@ struct Call {
   Array states;            // forward: start states [B, size]; adjoint: all states, sample stride below
   int64_t state_stride;    // from sample to sample, in numbers
   Array actions;           // [B, T, A]
-  Array out;               // forward: [B, T + with_start, size]; adjoint: gradient of those
+  Array out;               // forward: [B, T + with_start, result_size]; adjoint: gradient of those
   int64_t with_start;
   Array grad_state;        // adjoint: [B, size]
   Array grad_actions;      // adjoint: [B, T, A]
-  void* stored;            // [B * T * stored()] network numbers, or null: compute the steps again
+  void* stored;            // what the adjoint needs of the network, as gn_stored() says; null: compute it again
+  int64_t train;           // of one step all is stored, and the adjoint adds gradients of the weights
+  void* const* grad_weights;  // of every layer [out, K]
+  void* const* grad_tables;   // and [I, out], or null
 };
 
 constexpr double TOLERANCE = 1e-9;
@@ -83,16 +92,18 @@ class Arena {
   size_t size_ = 0, used_ = 0;
 };
 
-template <class T, int W, int C>
+template <class Net, int W, int C>
 struct Runner {
+  using T = typename Net::Number;
   static constexpr int L = W * C;
   const Maths& m;
-  const Network<T>& network;
+  const Net& network;
   const Call& call;
   int64_t first;
   int count;  // samples of this tile
   double* r;
   T* ws;
+  T* whole;  // where the only step keeps its slopes and activations; null: as stored() says
 
   int64_t sample(int lane) const { return first + (lane < count ? lane : count - 1); }
 
@@ -125,7 +136,7 @@ struct Runner {
   }
 
   T* stored(int64_t step) const {
-    if (!call.stored) return nullptr;
+    if (!call.stored || whole) return whole;
     const int64_t block = network.stored() + m.outputs;
     return static_cast<T*>(call.stored) + (first * call.steps + step * count) * block;
   }
@@ -151,14 +162,21 @@ struct Runner {
       T* derivatives = stored(t);
       predict(m.forward, derivatives);
       const T* output = network.output(ws, count);
-      if (derivatives) std::memcpy(derivatives + count * network.stored(), output, sizeof(T) * count * m.outputs);
+      if (whole)
+        std::copy_n(network.activations(ws), network.activation_count(count), whole + count * network.stored());
+      else if (derivatives)
+        std::copy_n(output, count * m.outputs, derivatives + count * network.stored());
       from_network(m.forward, 2, 0, m.outputs, m.output_width, output);
       run_tape<W, C>(m.forward, 1, r);
       for (int lane = 0; lane < count; ++lane) {
-        const int64_t to = ((first + lane) * rows + t + call.with_start) * m.size, start = (first + lane) * call.state_stride;
-        for (int64_t i = 0; i < m.varying_count; ++i) call.out.set(to + m.varying[i], result(m.forward, 1, i)[lane]);
-        for (int64_t i = 0; i < m.size - m.varying_count; ++i)
-          call.out.set(to + m.constant[i], call.states.get(start + m.constant[i]));
+        const int64_t to = ((first + lane) * rows + t + call.with_start) * m.result_size;
+        const int64_t start = (first + lane) * call.state_stride;
+        if (m.is_state)
+          for (int64_t i = 0; i < m.size - m.varying_count; ++i)
+            call.out.set(to + m.constant[i], call.states.get(start + m.constant[i]));
+        else
+          for (int64_t i = 0; i < m.result_size; ++i) call.out.set(to + i, 0.0);
+        for (int64_t i = 0; i < m.result_count; ++i) call.out.set(to + m.results[i], result(m.forward, 1, i)[lane]);
       }
       if (t + 1 < call.steps) {
         // Results may lie in the registers of inputs: move all at once.
@@ -171,39 +189,40 @@ struct Runner {
 
   // Gradient of the varying channels; that of the constant ones is what their copies receive.
   // again, derivatives: room for the step that is computed again; gradient: of the varying channels.
-  void adjoint(double* again, T* derivatives, double* gradient) const {
+  void adjoint(double* again, T* derivatives, double* gradient, T* const* of_weights, T* const* of_tables) const {
     const int64_t rows = call.steps + call.with_start, A = m.actions, n = m.varying_count;
     std::fill_n(gradient, n * L, 0.0);
     auto incoming = [&](int64_t s, int64_t row, int64_t channel) {
-      return call.out.get((s * rows + row) * m.size + channel);
+      return call.out.get((s * rows + row) * m.result_size + channel);
     };
     for (int64_t t = call.steps - 1; t >= 0; --t) {
-      for (int64_t i = 0; i < n; ++i)
-        for (int lane = 0; lane < L; ++lane)
-          gradient[i * L + lane] += incoming(sample(lane), t + call.with_start, m.varying[i]);
       auto state = [&](int64_t s, int, int64_t i) {
         return call.states.get(s * call.state_stride + t * m.size + m.varying[i]);
       };
       auto action = [&](int64_t s, int, int64_t i) { return call.actions.get((s * call.steps + t) * A + i); };
       const T* kept = stored(t);
-      const T* output;
-      if (kept) {
+      const T* output = network.output(ws, count);
+      if (whole) {
+        std::copy_n(kept + count * network.stored(), network.activation_count(count), network.activations(ws));
+      } else if (kept) {
         output = kept + count * network.stored();
       } else {
-        Runner forward{m, network, call, first, count, again, ws};
+        Runner forward{m, network, call, first, count, again, ws, nullptr};
         forward.load(m.forward, 0, n, state);
         forward.load(m.forward, 1, A, action);
         forward.predict(m.forward, derivatives);
         kept = derivatives;
-        output = network.output(ws, count);
       }
       load(m.adjoint, 0, n, state);
       load(m.adjoint, 1, A, action);
       from_network(m.adjoint, 2, 0, m.outputs, m.output_width, output);
-      load(m.adjoint, 3, n, [&](int64_t, int lane, int64_t i) { return gradient[i * L + lane]; });
+      load(m.adjoint, 3, m.result_count, [&](int64_t s, int lane, int64_t i) {
+        return incoming(s, t + call.with_start, m.results[i]) + (m.is_state ? gradient[i * L + lane] : 0.0);
+      });
       run_tape<W, C>(m.adjoint, 0, r);
       to_network(m.adjoint, 0, 0, m.outputs, m.output_width, network.grad_output(ws, count));
       network.backward(ws, count, kept);
+      if (of_weights) network.weight_gradients(ws, count, kept, of_weights, of_tables);
       from_network(m.adjoint, 4, 0, m.node_inputs, m.node_width, network.grad_nodes(ws, count));
       from_network(m.adjoint, 4, m.node_inputs, m.edge_inputs, m.edge_width, network.grad_edges(ws, count));
       run_tape<W, C>(m.adjoint, 1, r);
@@ -219,16 +238,66 @@ struct Runner {
                             gradient[i * L + lane] + (call.with_start ? incoming(s, 0, m.varying[i]) : 0.0));
       for (int64_t i = 0; i < m.size - n; ++i) {
         double sum = 0;
-        for (int64_t row = 0; row < rows; ++row) sum += incoming(s, row, m.constant[i]);
+        for (int64_t row = 0; row < rows && m.is_state; ++row) sum += incoming(s, row, m.constant[i]);
         call.grad_state.set(s * m.size + m.constant[i], sum);
       }
     }
   }
 };
 
-template <class T, int W, int C>
-void run_tiles(const Maths& m, const Network<T>& network, const Call& call, bool adjoint) {
+// Where a call's tiles keep what their adjoint needs: T's of one tile.
+template <class Net>
+int64_t tile_store(const Maths& m, const Net& network, const Call& call) {
+  if (!call.train) return (network.stored() + m.outputs) * call.tile * call.steps;
+  return network.stored() * call.tile + network.activation_count(call.tile);
+}
+
+// Gradients of the weights, added up in as many parts as do not depend on the threads.
+template <class T>
+struct WeightGradients {
+  static constexpr int64_t kMostParts = 4;
+  WeightGradients(const Call& call, const std::vector<int64_t>& weights, const std::vector<int64_t>& tables, int64_t tiles)
+      : parts(call.train ? std::min(tiles, kMostParts) : 0), numbers(parts), of_weights(parts), of_tables(parts) {
+    for (int64_t part = 0; part < parts; ++part) {
+      int64_t total = 0;
+      for (size_t i = 0; i < weights.size(); ++i) total += weights[i] + tables[i];
+      numbers[part].assign(total, T(0));
+      T* at = numbers[part].data();
+      for (size_t i = 0; i < weights.size(); ++i) {
+        of_weights[part].push_back(at);
+        of_tables[part].push_back(call.grad_tables[i] ? at + weights[i] : nullptr);
+        at += weights[i] + tables[i];
+      }
+    }
+  }
+  void write(const Call& call, const std::vector<int64_t>& weights, const std::vector<int64_t>& tables) const {
+    if (!parts) return;
+    for (size_t i = 0; i < weights.size(); ++i) {
+      sum(static_cast<T*>(call.grad_weights[i]), of_weights, i, weights[i]);
+      if (call.grad_tables[i]) sum(static_cast<T*>(call.grad_tables[i]), of_tables, i, tables[i]);
+    }
+  }
+  void sum(T* to, const std::vector<std::vector<T*>>& from, size_t i, int64_t size) const {
+    std::copy_n(from[0][i], size, to);
+    for (int64_t part = 1; part < parts; ++part)
+      for (int64_t j = 0; j < size; ++j) to[j] += from[part][i][j];
+  }
+
+  int64_t parts;
+  std::vector<std::vector<T>> numbers;
+  std::vector<std::vector<T*>> of_weights, of_tables;
+};
+
+template <class Net, int W, int C>
+void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoint) {
+  using T = typename Net::Number;
   const int64_t tiles = (call.batch + call.tile - 1) / call.tile;
+  const bool trains = adjoint && call.train;
+  const std::vector<int64_t> none;
+  const auto weights = trains ? network.weight_sizes() : none, tables = trains ? network.table_sizes() : none;
+  WeightGradients<T> gradients(call, weights, tables, trains ? tiles : 0);
+  // Each part's tiles are handled in order by one thread; without parts, a tile is a part.
+  const int64_t parts = gradients.parts ? gradients.parts : tiles;
   std::atomic<int64_t> next{0};
   auto work = [&]() {
     constexpr int L = W * C;
@@ -244,71 +313,60 @@ void run_tiles(const Maths& m, const Network<T>& network, const Call& call, bool
     T* const scratch = arena.take<T>(ws);
     T* const kept = arena.take<T>(derivatives);
     double* const sums = arena.take<double>(gradient);
-    for (int64_t tile; (tile = next++) < tiles;) {
-      const int64_t first = tile * call.tile, count = std::min(call.tile, call.batch - first);
-      Runner<T, W, C> runner{m, network, call, first, static_cast<int>(count), r, scratch};
-      if (adjoint) runner.adjoint(more, kept, sums);
-      else runner.forward();
-    }
+    for (int64_t part; (part = next++) < parts;)
+      for (int64_t tile = part; tile < tiles; tile += parts) {
+        const int64_t first = tile * call.tile, count = std::min(call.tile, call.batch - first);
+        T* const whole =
+            call.train ? static_cast<T*>(call.stored) + tile * tile_store(m, network, call) : nullptr;
+        Runner<Net, W, C> runner{m, network, call, first, static_cast<int>(count), r, scratch, whole};
+        if (!adjoint) runner.forward();
+        else if (!call.train) runner.adjoint(more, kept, sums, nullptr, nullptr);
+        else runner.adjoint(more, kept, sums, gradients.of_weights[part].data(), gradients.of_tables[part].data());
+      }
   };
   std::vector<std::thread> others;
   try {
-    for (int64_t i = 1; i < std::min(call.threads, tiles); ++i) others.emplace_back(work);
+    for (int64_t i = 1; i < std::min(call.threads, parts); ++i) others.emplace_back(work);
   } catch (const std::system_error&) {  // the system has no more: those that there are do all tiles
   }
   work();
   for (auto& other : others) other.join();
+  gradients.write(call, weights, tables);
 }
 
-template <class T>
-void run(const Maths& m, const Network<T>& network, const Call& call, bool adjoint) {
-  if (call.tile <= 1) run_tiles<T, 1, 1>(m, network, call, adjoint);
-  else if (call.tile <= 4) run_tiles<T, 4, 1>(m, network, call, adjoint);
-  else if (call.tile <= 8) run_tiles<T, 8, 1>(m, network, call, adjoint);
-  else if (call.tile <= 16) run_tiles<T, 8, 2>(m, network, call, adjoint);
-  else run_tiles<T, 8, 3>(m, network, call, adjoint);
+template <class Net>
+void run(const Maths& m, const Net& network, const Call& call, bool adjoint) {
+  if (call.tile <= 1) run_tiles<Net, 1, 1>(m, network, call, adjoint);
+  else if (call.tile <= 4) run_tiles<Net, 4, 1>(m, network, call, adjoint);
+  else if (call.tile <= 8) run_tiles<Net, 8, 1>(m, network, call, adjoint);
+  else if (call.tile <= 16) run_tiles<Net, 8, 2>(m, network, call, adjoint);
+  else run_tiles<Net, 8, 3>(m, network, call, adjoint);
+}
+
+// Calls a function with the network of a kind: 0 float32, 1 float64, 2 bfloat16 products summed in float32.
+template <class F>
+auto with_network(const void* network, int64_t kind, F function) {
+  if (kind == 1) return function(*static_cast<const Network<double>*>(network));
+#ifdef __AVX512BF16__
+  if (kind == 2) return function(*static_cast<const Network<float, true>*>(network));
+#endif
+  return function(*static_cast<const Network<float>*>(network));
+}
+
+template <class Net>
+void* make(const int64_t* code, const void* const* weights, const void* const* tables) {
+  using T = typename Net::Number;
+  return new Net(code, reinterpret_cast<const T* const*>(weights), reinterpret_cast<const T* const*>(tables));
+}
+
+// Whether the start states' constant channels are those that the tapes were made for.
+inline bool fits(const Maths& m, const Call& call) {
+  for (int64_t s = 0; s < call.batch; ++s)
+    for (int64_t i = 0; i < m.size - m.varying_count; ++i) {
+      const double difference = call.states.get(s * call.state_stride + m.constant[i]) - m.values[i];
+      if (!(std::fabs(difference) <= TOLERANCE * (1 + std::fabs(m.values[i])))) return false;
+    }
+  return true;
 }
 
 }  // namespace gn
-
-extern "C" {
-
-// All functions may be called from several threads at once.
-int64_t gn_version() { return 1; }
-
-void* gn_network_new(int64_t is_double, const int64_t* code, const void* const* weights, const void* const* tables) {
-  if (is_double)
-    return new gn::Network<double>(code, reinterpret_cast<const double* const*>(weights),
-                                   reinterpret_cast<const double* const*>(tables));
-  return new gn::Network<float>(code, reinterpret_cast<const float* const*>(weights),
-                                reinterpret_cast<const float* const*>(tables));
-}
-
-void gn_network_delete(void* network, int64_t is_double) {
-  if (is_double) delete static_cast<gn::Network<double>*>(network);
-  else delete static_cast<gn::Network<float>*>(network);
-}
-
-int64_t gn_network_stored(const void* network, int64_t is_double) {
-  return is_double ? static_cast<const gn::Network<double>*>(network)->stored()
-                   : static_cast<const gn::Network<float>*>(network)->stored();
-}
-
-// 1 if a start state's constant channels are not those that the tapes were made for: nothing was computed.
-int64_t gn_rollout(const void* network, int64_t is_double, const gn::Maths* maths, const gn::Call* call) {
-  for (int64_t s = 0; s < call->batch; ++s)
-    for (int64_t i = 0; i < maths->size - maths->varying_count; ++i) {
-      const double expected = maths->values[i];
-      const double difference = call->states.get(s * call->state_stride + maths->constant[i]) - expected;
-      if (!(std::fabs(difference) <= gn::TOLERANCE * (1 + std::fabs(expected)))) return 1;
-    }
-  if (is_double) gn::run(*maths, *static_cast<const gn::Network<double>*>(network), *call, false);
-  else gn::run(*maths, *static_cast<const gn::Network<float>*>(network), *call, false);
-  return 0;
-}
-
-void gn_rollout_adjoint(const void* network, int64_t is_double, const gn::Maths* maths, const gn::Call* call) {
-  if (is_double) gn::run(*maths, *static_cast<const gn::Network<double>*>(network), *call, true);
-  else gn::run(*maths, *static_cast<const gn::Network<float>*>(network), *call, true);
-}
-}

@@ -1,0 +1,282 @@
+"""One scene's step as C++ source that needs nothing else: the executor's code, then tapes and weights as arrays."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_gn.dynamics.executors.native.build import SOURCES
+from torchrl_gn.dynamics.executors.native.library import TILE
+from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
+from torchrl_gn.dynamics.executors.native.tape import Tape
+from torchrl_gn.networks.layers import LayerList
+
+_ORDER = ("kernels.h", "network.h", "tape.h", "rollout.h")
+_TYPES = {"i": "int32_t", "l": "int64_t", "f": "float", "d": "double"}
+
+
+@dataclass(frozen=True)
+class Description:
+    """What the header says of a scene."""
+
+    name: str  # prefix of all names, a C identifier
+    scene: str
+    timestep: float  # seconds
+    nodes: tuple[str, ...]
+    channels: tuple[str, ...]  # components of a node's state with their sizes
+    actions: tuple[str, ...]  # name and bounds of each
+
+
+def header(about: Description, shape: tuple[int, int]) -> str:
+    """Header of the functions; ``shape`` is ``[N, C]`` of a state."""
+    return _filled(
+        _HEADER,
+        about,
+        TIMESTEP=f"{about.timestep:.17g}",
+        NODES=str(shape[0]),
+        CHANNELS=str(shape[1]),
+        ACTIONS=str(len(about.actions)),
+        NODE_NAMES=_listed(about.nodes),
+        CHANNEL_NAMES=", ".join(about.channels),
+        ACTION_NAMES=_listed(about.actions),
+    )
+
+
+def example(about: Description) -> str:
+    """A short C program that calls the functions."""
+    return _filled(_EXAMPLE, about)
+
+
+def source(about: Description, layers: LayerList, maths: StateMaths, rest: np.ndarray) -> str:
+    """C++ source of the functions; ``rest`` is a state ``[N, C]``."""
+    weights, tables = layers.tensors()
+    last = layers.layers[-1]
+    kind = _TYPES[weights[0].numpy().dtype.char]
+    arrays = [_array("CODE", layers.code().numpy())]
+    arrays += [_array(f"WEIGHT_{i}", each.numpy()) for i, each in enumerate(weights)]
+    arrays += [_array(f"TABLE_{i}", each.numpy()) for i, each in enumerate(tables) if each is not None]
+    arrays += [_array(name.upper(), getattr(maths, name)) for name in ("varying", "constant", "values")]
+    table_names = ["nullptr" if each is None else f"TABLE_{i}" for i, each in enumerate(tables)]
+    arrays.append(f"const {kind}* const WEIGHTS[] = {{{', '.join(f'WEIGHT_{i}' for i in range(len(weights)))}}};")
+    arrays.append(f"const {kind}* const TABLES[] = {{{', '.join(table_names)}}};")
+    arrays += [_tape("FORWARD", maths.forward), _tape("ADJOINT", maths.adjoint)]
+    outputs = last.count * len(last.weight)
+    inputs = (layers.nodes[0] * layers.nodes[1], layers.edges[0] * layers.edges[1])
+    sizes = (maths.is_constant.size, len(maths.varying), maths.result_size, len(maths.results), 1, maths.actions)
+    widths = (layers.nodes[1], layers.edges[1], len(last.weight))
+    numbers = ", ".join(map(str, (*sizes, outputs, *inputs, *widths)))
+    includes, engine = _engine()
+    return _filled(
+        _SOURCE,
+        about,
+        INCLUDES=includes,
+        ENGINE=engine,
+        ARRAYS="\n".join(arrays),
+        MATHS=f"{{{numbers}, VARYING, CONSTANT, VALUES, VARYING, FORWARD, ADJOINT}}",
+        TYPE=kind,
+        TILE=str(TILE),
+        REST=_numbers(rest),
+    )
+
+
+def _engine() -> tuple[str, str]:
+    """Standard headers, and the executor's code without its C interface."""
+    files = {path.name: path.read_text() for path in SOURCES if path.suffix == ".h"}
+    if files.keys() != set(_ORDER):
+        raise RuntimeError(f"The native executor has the files {sorted(files)}, not {sorted(_ORDER)}.")
+    text = "\n".join(files[name] for name in _ORDER)
+    includes = sorted(set(re.findall(r"^#include <.*>$", text, re.MULTILINE)))
+    # An unnamed namespace around it hides all names: several models go into one program.
+    text = text.replace(' __attribute__((visibility("hidden")))', "")
+    text = re.sub(r"^#(?:include|pragma once).*\n", "", text, flags=re.MULTILINE)
+    return "\n".join(includes), re.sub(r"\n{3,}", "\n\n", text).strip()
+
+
+def _tape(name: str, tape: Tape) -> str:
+    rows = (f"{{{', '.join(map(str, row))}}}" for row in tape.instructions.tolist())
+    parts = [f"const gn::Instruction {name}_INSTRUCTIONS[] = {{\n{_wrapped(rows)}\n}};"]
+    parts.append(_array(f"{name}_CONSTANTS", tape.constants))
+    parts.append(_array(f"{name}_ENDS", np.array(tape.phases, dtype=np.int32)))
+    for which, tables in (("INPUTS", tape.inputs), ("OUTPUTS", tape.outputs)):
+        parts += [_array(f"{name}_{which}_{i}", each) for i, each in enumerate(tables)]
+        names = ", ".join(f"{name}_{which}_{i}" for i in range(len(tables)))
+        parts.append(f"const int32_t* const {name}_{which}[] = {{{names}}};")
+    parts.append(
+        f"const gn::Tape {name} = {{{name}_INSTRUCTIONS, {name}_CONSTANTS, {name}_ENDS, {tape.registers},"
+        f" {len(tape.inputs)}, {name}_INPUTS, {name}_OUTPUTS}};"
+    )
+    return "\n".join(parts)
+
+
+def _array(name: str, values: np.ndarray) -> str:
+    return f"const {_TYPES[values.dtype.char]} {name}[] = {{\n{_numbers(values)}\n}};"
+
+
+def _numbers(values: np.ndarray) -> str:
+    """Numbers that are read back bit for bit; a zero for none, as C++ has no empty arrays."""
+    form = {"f": "%.9g", "d": "%.17g"}.get(values.dtype.char, "%d")
+    text = _wrapped(form % value for value in values.ravel().tolist() or [0])
+    return text.replace("inf", "INFINITY").replace("nan", "NAN")
+
+
+def _wrapped(items: Iterable[str], count: int = 8) -> str:
+    rows = list(items)
+    return ",\n".join(", ".join(rows[i : i + count]) for i in range(0, len(rows), count))
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return "".join(f"\n *   {index}: {_comment(name)}" for index, name in enumerate(names)) or " none"
+
+
+def _comment(text: str) -> str:
+    return " ".join(text.replace("*/", "* /").split())
+
+
+def _filled(template: str, about: Description, **values: str) -> str:
+    """The template with ``@KEY@`` replaced."""
+    values = {"NAME": about.name, "UPPER": about.name.upper(), "SCENE": _comment(about.scene), **values}
+    return re.sub(r"@([A-Z_]+)@", lambda match: values[match[1]], template)
+
+
+_HEADER = """\
+/* Learned forward model of @SCENE@, control step @TIMESTEP@ s; written by torchrl_gn. Float64, row-major.
+ *
+ * State: [@UPPER@_NODES][@UPPER@_CHANNELS].
+ * Channels of a node: @CHANNEL_NAMES@.
+ * Nodes:@NODE_NAMES@
+ * Actions:@ACTION_NAMES@
+ *
+ * Build with GCC or Clang:
+ *   g++ -O3 -std=c++17 -march=native @NAME@.cpp main.c
+ * Without -march=native (or -mavx2 -mfma) it is three to eight times as slow, and GCC warns of its vector ABI, which
+ * does not matter here.
+ *
+ * Functions may be called from several threads at once. They return 0, or 1 if a channel that cannot move is not as in
+ * @NAME@_rest; then they write nothing.
+ */
+#ifndef @UPPER@_H
+#define @UPPER@_H
+
+#define @UPPER@_NODES @NODES@
+#define @UPPER@_CHANNELS @CHANNELS@
+#define @UPPER@_STATE (@UPPER@_NODES * @UPPER@_CHANNELS)
+#define @UPPER@_ACTIONS @ACTIONS@
+#define @UPPER@_TIMESTEP @TIMESTEP@
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* A state of the system at rest. */
+extern const double @NAME@_rest[@UPPER@_STATE];
+
+/* The state after one control step.
+ *   state, next: [STATE]; action: [ACTIONS]
+ */
+int @NAME@_step(const double* state, const double* action, double* next);
+
+/* States under actions.
+ *   batch, steps: B samples, T steps; threads: at most so many, 1 for the caller's alone
+ *   start: [B][STATE]; actions: [B][T][ACTIONS]
+ *   states: [B][T + 1][STATE], the start first
+ */
+int @NAME@_rollout(int batch, int steps, int threads, const double* start, const double* actions, double* states);
+
+/* Gradient of a scalar function of the states of a rollout.
+ *   states: [B][T + 1][STATE], as @NAME@_rollout wrote them; actions: [B][T][ACTIONS]
+ *   grad_states: [B][T + 1][STATE], the function's gradient in the states
+ *   grad_start: [B][STATE] and grad_actions: [B][T][ACTIONS], its gradient in start and actions. Channels that cannot
+ *   move count as copied from the start.
+ */
+int @NAME@_rollout_gradient(int batch, int steps, int threads, const double* states, const double* actions,
+                            const double* grad_states, double* grad_start, double* grad_actions);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
+"""
+
+_EXAMPLE = """\
+/* Simulate 100 steps without control; the last state's gradient in the first action. */
+#include <stdio.h>
+
+#include "@NAME@.h"
+
+enum { STEPS = 100, LAST = STEPS * @UPPER@_STATE };
+static double actions[STEPS * @UPPER@_ACTIONS + 1], states[LAST + @UPPER@_STATE], weights[LAST + @UPPER@_STATE];
+static double of_start[@UPPER@_STATE], of_actions[STEPS * @UPPER@_ACTIONS + 1];
+
+int main(void) {
+  int i, error = @NAME@_rollout(1, STEPS, 1, @NAME@_rest, actions, states);
+  if (error) return error;
+  for (i = 0; i < @UPPER@_STATE; ++i)
+    printf("%12.6f%s", states[LAST + i], (i + 1) % @UPPER@_CHANNELS ? " " : "\\n");
+  for (i = 0; i < @UPPER@_STATE; ++i) weights[LAST + i] = 1; /* of the sum of the last state's channels */
+  error = @NAME@_rollout_gradient(1, STEPS, 1, states, actions, weights, of_start, of_actions);
+  for (i = 0; i < @UPPER@_ACTIONS; ++i) printf("d sum / d action %d: %g\\n", i, of_actions[i]);
+  return error;
+}
+"""
+
+_SOURCE = """\
+// Learned forward model of @SCENE@: see @NAME@.h. Written by torchrl_gn (MIT License, (c) 2026 torchrl_gn authors).
+#include "@NAME@.h"
+
+@INCLUDES@
+
+namespace {
+
+@ENGINE@
+
+// The scene.
+@ARRAYS@
+const gn::Maths MATHS = @MATHS@;
+
+const gn::Network<@TYPE@>& network() {
+  static const gn::Network<@TYPE@> packed(CODE, WEIGHTS, TABLES);
+  return packed;
+}
+
+gn::Array array(const double* data) { return {const_cast<double*>(data), 1}; }
+
+int run(gn::Call call, bool adjoint) {
+  if (!gn::fits(MATHS, call)) return 1;
+  call.threads = std::max<int64_t>(call.threads, 1);
+  call.tile = std::min<int64_t>(@TILE@, (call.batch + call.threads - 1) / call.threads);
+  if (call.batch > 0) gn::run(MATHS, network(), call, adjoint);
+  return 0;
+}
+
+}  // namespace
+
+extern "C" {
+
+extern const double @NAME@_rest[@UPPER@_STATE] = {
+@REST@
+};
+
+int @NAME@_step(const double* state, const double* action, double* next) {
+  return run({1, 1, 1, 1, array(state), @UPPER@_STATE, array(action), array(next), 0, {}, {}, nullptr, 0, nullptr,
+              nullptr},
+             false);
+}
+
+int @NAME@_rollout(int batch, int steps, int threads, const double* start, const double* actions, double* states) {
+  return run({batch, steps, 1, threads, array(start), @UPPER@_STATE, array(actions), array(states), 1, {}, {}, nullptr,
+              0, nullptr, nullptr},
+             false);
+}
+
+int @NAME@_rollout_gradient(int batch, int steps, int threads, const double* states, const double* actions,
+                            const double* grad_states, double* grad_start, double* grad_actions) {
+  return run({batch, steps, 1, threads, array(states), (steps + int64_t{1}) * @UPPER@_STATE, array(actions),
+              array(grad_states), 1, array(grad_start), array(grad_actions), nullptr, 0, nullptr, nullptr},
+             true);
+}
+}
+"""
