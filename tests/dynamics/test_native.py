@@ -29,6 +29,7 @@ from torchrl_gn.dynamics import BodyState, Contacts, Controls, ForwardModel, Joi
 from torchrl_gn.dynamics.executors import NativeExecutor
 from torchrl_gn.dynamics.executors.native import build, library
 from torchrl_gn.dynamics.executors.native import executor as native_executor
+from torchrl_gn.dynamics.executors.native.pool import Pool
 from torchrl_gn.dynamics.features import Feature
 
 from .. import zoo
@@ -61,9 +62,10 @@ def native(predictor) -> NativeExecutor:
 def quick(scenes, make_model):
     """Specialised predictor of a system, its network wide enough for whole vectors and rests of them."""
 
-    def make(name: str = "swimmer6", dtype=torch.float32, **options) -> SpecializedPredictor:
+    def make(name: str = "swimmer6", dtype=torch.float32, products=None, **options) -> SpecializedPredictor:
         options = {"latent": 20, "edge_hidden": (36,), "node_hidden": (36,), "activation": "silu"} | options
-        return specialize(make_model(scenes[name], **options).to(dtype).requires_grad_(False).bind(scenes[name]))
+        model = make_model(scenes[name], **options).to(dtype).requires_grad_(False)
+        return specialize(model.bind(scenes[name]), dtype=products)
 
     return make
 
@@ -94,10 +96,13 @@ def equal(found, expected) -> bool:
 # The same bits
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.filterwarnings("ignore::torchrl_gn.processor.SlowDtypeWarning")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 @pytest.mark.parametrize("name", FEW)
 def test_a_sample_is_the_same_in_every_batch(quick, inputs, name, dtype):
-    predictor = quick(name, dtype)
+    if dtype == torch.bfloat16 and not library.load_library().gn_has_bfloat16():
+        pytest.skip("the processor multiplies no bfloat16")
+    predictor = quick(name, torch.float64 if dtype == torch.float64 else torch.float32, products=dtype)
     state, actions = inputs(predictor, 61)
     whole = pull(predictor, state, actions)
     for count in (1, 2, 3, 4, 5, 8, 9, 16, 17, 24, 25, 48, 60):
@@ -498,6 +503,27 @@ def test_python_threads_step_at_once(quick, inputs, shared):
         assert all(pool.map(work, range(4)))
 
 
+def test_buffers_are_lent_to_one_at_a_time():
+    pool = Pool()
+
+    def work(index: int) -> bool:
+        own = True
+        for count in range(3000):
+            lease = pool.take(8 + count % 3, torch.float32)
+            lease.tensor.fill_(index)
+            own = own and bool((lease.tensor == index).all())
+        return own
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as workers:
+            assert all(workers.map(work, range(4)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert len(pool.free) <= 2
+
+
 def test_weights_change_while_another_thread_steps(quick, inputs):
     predictor = quick(latent=64)
     state, actions = inputs(predictor, 30)
@@ -847,12 +873,21 @@ SANITIZED = """
 import torch
 from tests import zoo
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.executors.native import executor
+from torchrl_gn.dynamics.executors.native import executor, library
 for name in ("swimmer6", "joints"):
     scene = zoo.load(name)
     for sizes in ({"latent": 6, "hidden": (8,)}, {"latent": 20, "hidden": (36,), "activation": "gelu"}):
-        for dtype in (torch.float32, torch.float64):
-            predictor = specialize(ForwardModel.for_scene(scene, **sizes).to(dtype).requires_grad_(False).bind(scene))
+        for dtype in (torch.float32, torch.float64, torch.bfloat16):
+            if dtype == torch.bfloat16 and not library.load_library().gn_has_bfloat16():
+                continue
+            products, dtype = dtype, torch.float32 if dtype == torch.bfloat16 else dtype
+            model = ForwardModel.for_scene(scene, **sizes).to(dtype)
+            for normalizer in model.modules():
+                if hasattr(normalizer, "m2"):
+                    ones = {key: torch.ones_like(value) for key, value in normalizer.state_dict().items()}
+                    normalizer.load_state_dict(ones)
+            trained = model.bind(scene).training_executor()
+            predictor = specialize(model.bind(scene), dtype=products)
             for count in (1, 3, 7, 13, 24, 50):
                 for threads in (1, 3):
                     torch.set_num_threads(threads)
@@ -865,6 +900,11 @@ for name in ("swimmer6", "joints"):
                         predictor.rollout(state, actions)[0].sum().backward()
                         predictor.step(state, actions[:, 0])[0].sum().backward()
             assert predictor.executor().reason is None, predictor.executor().reason
+            for count in (1, 5, 130):
+                torch.set_num_threads(2)
+                trained.delta(state[:1].expand(count, -1, -1), actions[:1, 0].expand(count, -1))[0].sum().backward()
+                torch.set_num_threads(1)
+            assert trained.reason is None, trained.reason
 print("fine")
 """
 
