@@ -917,7 +917,7 @@ def test_sanitizers_find_nothing(tmp_path):
     libraries = [where("libasan.so"), where("libubsan.so"), where("libstdc++.so.6")]
     if not all(map(os.path.isabs, libraries)):
         pytest.skip("there are no sanitizers")
-    flags = "-fsanitize=address,undefined -fno-sanitize-recover=undefined -O1 -g"
+    flags = "-fsanitize=address,undefined -fno-sanitize-recover=undefined -O1"
     done = run(
         SANITIZED,
         check=False,

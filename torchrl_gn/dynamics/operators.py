@@ -50,7 +50,7 @@ def rollout_adjoint(
     leaves = [each.detach().requires_grad_() for each in (state, actions)]
     executor = _predictor(predictor).executor()
     with torch.enable_grad():
-        out, _ = executor.rollout(*leaves) if many else executor.step(*leaves)
+        out, _ = executor.rollout(leaves[0], leaves[1]) if many else executor.step(leaves[0], leaves[1])
     found = torch.autograd.grad(out, leaves, gradient, allow_unused=True)
     of_state, of_actions = (
         torch.zeros_like(leaf) if each is None else each for leaf, each in zip(leaves, found, strict=True)

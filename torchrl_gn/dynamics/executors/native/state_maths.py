@@ -46,7 +46,7 @@ class StateMaths:
                 program, graph, state, constant, predicted, width
             )
             stays = np.frompyfunc(lambda a, b: not isinstance(a, Scalar) and abs(a - b) <= 1e-12 * (1 + abs(b)), 2, 1)
-            changed = constant & ~stays(after, state).astype(bool)
+            changed = constant & ~np.asarray(stays(after, state), dtype=bool)
             if not changed.any():
                 break
             constant = constant & ~changed
@@ -60,7 +60,7 @@ class StateMaths:
         self.results, self.result_size = self.varying, state.size
         self._after: list[Any] = after[~constant].tolist()
         if change:
-            changes = np.frompyfunc(lambda a: isinstance(a, Scalar) or a != 0, 1, 1)(delta.ravel()).astype(bool)
+            changes = [isinstance(each, Scalar) or each != 0 for each in delta.ravel().tolist()]
             self.results, self.result_size = np.flatnonzero(changes).astype(np.int32), delta.size
             self._after = delta.ravel()[changes].tolist()
         self._groups: list[list[Scalar]] = [symbols[~constant].tolist(), actions.tolist(), outputs.tolist()]

@@ -54,12 +54,11 @@ class _Symbolic(Tensor):
     def __torch_dispatch__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         kwargs, name = kwargs or {}, function._schema.name.removeprefix("aten::")
         if name in OPERATIONS:
-            args, kwargs = tree_map_only(_Symbolic, _unwrapped, (args, kwargs))
+            args, options = tree_map_only(_Symbolic, _unwrapped, (args, kwargs))
             try:
-                out = OPERATIONS[name](*args, **kwargs)
-                out = (
-                    out if isinstance(out, (Tensor, tuple, list)) else as_object(out)
-                )  # numpy's 0-d results are objects
+                out = OPERATIONS[name](*args, **options)
+                # numpy's 0-d results are objects
+                out = out if isinstance(out, (Tensor, tuple, list)) else as_object(out)
             except NotImplementedError as error:
                 raise UntraceableError(f"The operation {function} has no scalar form here: {error}.") from error
             dtype = torch.bool if name in ("lt", "gt", "eq") else torch.float64
