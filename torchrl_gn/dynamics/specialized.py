@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import operator
+import threading
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -93,21 +94,29 @@ class SpecializedPredictor(Predictor):
             with torch.no_grad():
                 return EagerExecutor(super().program(parameters))
         if self._executor is None or not self._is_current(parameters):
-            # Tensors made in inference mode could be neither overwritten nor differentiated outside.
-            with torch.inference_mode(False), torch.no_grad():
-                program = self.program(parameters)
-                if self._executor is None:
-                    self._executor = EXECUTORS[self.executor_name](program)
-                else:
-                    self._executor.update(program)
-            modules = list(self.model.modules())
-            owners: list[dict] = [module._parameters for module in modules]
-            owners += [module._buffers for module in modules]
-            self._weights, self._casts = _Watched(owners), self.model.casts
-            # Views that share the storage keep it alive: no other tensor can come to lie at its address.
-            given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
-            self._given = {name: (value.detach(), _version(value)) for name, value in given.items()}
+            with _TAKING:
+                if self._executor is None or not self._is_current(parameters):
+                    self._take(parameters)
+        assert self._executor is not None
         return self._executor
+
+    def _take(self, parameters: TensorDictBase | None) -> None:
+        """Take a snapshot of the weights."""
+        modules = list(self.model.modules())
+        owners: list[dict[str, Any]] = [module._parameters for module in modules]
+        owners += [module._buffers for module in modules]
+        watched, casts = _Watched(owners), self.model.casts  # before they are read: another thread may change them
+        # Tensors made in inference mode could be neither overwritten nor differentiated outside.
+        with torch.inference_mode(False), torch.no_grad():
+            program = self.program(parameters)
+            if self._executor is None:
+                self._executor = EXECUTORS[self.executor_name](program)
+            else:
+                self._executor.update(program)
+        self._weights, self._casts = watched, casts
+        # Views that share the storage keep it alive: no other tensor can come to lie at its address.
+        given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
+        self._given = {name: (value.detach(), _version(value)) for name, value in given.items()}
 
     def _is_current(self, parameters: TensorDictBase | None) -> bool:
         given = {} if parameters is None else dict(parameters.items())
@@ -273,6 +282,7 @@ class _Watched:
         )
 
 
+_TAKING = threading.Lock()  # one thread takes a snapshot, others wait for it
 _FOLLOWING = ("count", "m2", "inverse_std")  # statistics that change with a normaliser's mean and deviation
 _STATE = operator.attrgetter("_version", "dtype")
 

@@ -38,7 +38,7 @@ class NativeExecutor:
 
     def __init__(self, program: StepProgram) -> None:
         self.program, self.eager = program, EagerExecutor(program)
-        self.native: tuple[library.NativeNetwork, TracedProgram] | None = None
+        self.native: Native | None = None
         self.version, self.pool = 0, Pool()
         self._reason: str | None = None
         self.update(program)
@@ -46,7 +46,7 @@ class NativeExecutor:
     @property
     def reason(self) -> str | None:
         """Why it runs by torch operations; None if it runs natively."""
-        return self._reason if self.native is None else self.native[1].reason
+        return self._reason if self.native is None else self.native.traced.reason
 
     def update(self, program: StepProgram) -> None:
         """Take another program of the same scene: its state maths are traced again only if they differ."""
@@ -54,7 +54,6 @@ class NativeExecutor:
         same_maths = same(_maths_of(self.program), _maths_of(program))
         self.program, self.eager = program, EagerExecutor(program)
         layers, self._reason = list_layers(program)
-        self.layers = layers
         if layers is None:
             self.native = None
             return
@@ -64,27 +63,30 @@ class NativeExecutor:
         except (NoCompilerError, TypeError) as error:
             self.native, self._reason = None, str(error)
             return
-        kept = before is not None and same_maths and before[0].equals(network)
-        self.native = network, before[1] if before is not None and kept else TracedProgram(program, layers, self.change)
+        kept = before is not None and same_maths and before.network.equals(network)
+        traced = before.traced if before is not None and kept else TracedProgram(program, layers, self.change)
+        self.native = Native(network, layers, traced, self.version)
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        if self._runs(state, action) and (after := self._rollout(state, action, False)) is not None:
-            return after, None
+        if (native := self.running(state, action)) is not None:
+            after = self._rollout(native, state, action, False)
+            if after is not None:
+                return after, None
         return self.eager.step(state, action, hidden)
 
     def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        if (
-            actions.shape[-2]
-            and self._runs(state, actions)
-            and (states := self._rollout(state, actions, True)) is not None
-        ):
-            return states, None
+        if actions.shape[-2] and (native := self.running(state, actions)) is not None:
+            states = self._rollout(native, state, actions, True)
+            if states is not None:
+                return states, None
         return rollout_by_steps(self.eager, state, actions, hidden)
 
-    def _runs(self, state: Tensor, action: Tensor) -> bool:
-        return (
-            self.native is not None
-            and self.native[1].reason is None
+    def running(self, state: Tensor, action: Tensor) -> Native | None:
+        """What runs inputs natively; None if torch must."""
+        native = self.native
+        runs = (
+            native is not None
+            and native.traced.reason is None
             and type(state) in _TYPES
             and type(action) in _TYPES
             and state.dtype in library.DTYPES
@@ -96,16 +98,17 @@ class NativeExecutor:
             and not torch._C._len_torch_dispatch_stack()  # a mode that must see every operation
             and torch._C._get_tracing_state() is None  # of torch.jit.trace
         )
+        return native if runs else None
 
-    def _rollout(self, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
+    def _rollout(self, native: Native, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
         """The next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``.
 
         None if torch operations must run it.
         """
         try:
             if (state.requires_grad or actions.requires_grad) and torch.is_grad_enabled():
-                return _Differentiable.apply(self, state, actions, many)  # pyright: ignore[reportReturnType]
-            return self.run(state.contiguous(), actions.contiguous(), many)[0]
+                return _Differentiable.apply(self, native, state, actions, many)  # pyright: ignore[reportReturnType]
+            return _run(native, state.contiguous(), actions.contiguous(), many)[0]
         except MixedStatesError as mixed:
             groups = mixed.groups
         except UntraceableError:
@@ -118,55 +121,53 @@ class NativeExecutor:
         out = torch.cat(parts)[torch.cat(places).argsort()]
         return out.view(*state.shape[:-2], *out.shape[1:])
 
-    def run(self, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None) -> tuple[Tensor, _Ran]:
-        """Results for contiguous inputs, and what ran them.
 
-        Raises:
-            MixedStatesError: if the samples need different state maths.
-            UntraceableError: if torch operations must run it.
-        """
-        assert self.native is not None
-        network, traced = self.native
-        call, out = library.forward_call(state, actions, many, stored)
-        return out, _Ran(call[:4], network, traced.run(network, call, state, actions), self.version)
+class Native(NamedTuple):
+    """A network and the state maths around it."""
 
-
-class _Ran(NamedTuple):
-    """What a gradient needs to know of its forward pass."""
-
-    sizes: tuple[int, int, int, int]  # samples, steps, samples of a tile, threads
     network: library.NativeNetwork
-    maths: library.NativeMaths
+    layers: LayerList
+    traced: TracedProgram
     version: int  # of the weights
+
+
+def _run(
+    native: Native, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None
+) -> tuple[Tensor, tuple, library.NativeMaths]:
+    """Results for contiguous inputs, and what a gradient needs: sizes of the call, and its state maths.
+
+    Raises:
+        MixedStatesError: if the samples need different state maths.
+        UntraceableError: if torch operations must run it.
+    """
+    call, out = library.forward_call(state, actions, many, stored)
+    return out, call[:4], native.traced.run(native.network, call, state, actions)
 
 
 class _Differentiable(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, executor: NativeExecutor, state: Tensor, actions: Tensor, many: bool) -> Tensor:
-        state, actions = state.contiguous(), actions.contiguous()
-        assert executor.native is not None
-        network = executor.native[0]
+    def forward(ctx, executor: NativeExecutor, native: Native, state: Tensor, actions: Tensor, many: bool) -> Tensor:
+        state, actions, network = state.contiguous(), actions.contiguous(), native.network
         numbers = state.shape[:-2].numel() * (actions.shape[-2] if many else 1) * network.kept
         stored = None
         if numbers * network.number.itemsize <= STORED_BYTES:
             stored = executor.pool.take(numbers, network.number)
-        out, ctx.ran = executor.run(state, actions, many, None if stored is None else stored.tensor)
+        out, ctx.sizes, ctx.maths = _run(native, state, actions, many, None if stored is None else stored.tensor)
         ctx.save_for_backward(out if many else state, actions)
-        ctx.executor, ctx.many, ctx.stored = executor, many, stored
+        ctx.executor, ctx.native, ctx.many, ctx.stored = executor, native, many, stored
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         states, actions = ctx.saved_tensors
-        if ctx.ran.version != ctx.executor.version:
+        if ctx.native.version != ctx.executor.version:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
-        sizes, network, maths, _ = ctx.ran
         gradient = gradient.contiguous()  # to live until the call is done
         stored = None if ctx.stored is None else ctx.stored.tensor
-        call, of_state, of_actions = library.adjoint_call(sizes, states, actions, gradient, ctx.many, stored)
-        library.rollout_adjoint(network, maths, call)
-        return None, of_state, of_actions, None
+        call, of_state, of_actions = library.adjoint_call(ctx.sizes, states, actions, gradient, ctx.many, stored)
+        library.rollout_adjoint(ctx.native.network, ctx.maths, call)
+        return None, None, of_state, of_actions, None
 
 
 def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:

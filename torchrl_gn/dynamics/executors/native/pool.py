@@ -14,11 +14,14 @@ class Pool:
 
     def take(self, count: int, dtype: torch.dtype) -> Lease:
         """A buffer of at least ``count`` numbers."""
-        free, self.free = self.free, []  # other threads find none meanwhile
-        for index, buffer in enumerate(free):
+        for _ in range(len(self.free)):
+            try:
+                buffer = self.free.pop(0)  # in one go: no other thread can take it too
+            except IndexError:
+                break
             if count <= buffer.numel() <= 2 * count and buffer.dtype == dtype:
-                self.free = [each for other, each in enumerate(free) if other != index]
                 return Lease(self, buffer)
+            self.free.append(buffer)
         return Lease(self, torch.empty(count, dtype=dtype, device="cpu"))
 
 
@@ -29,4 +32,5 @@ class Lease:
         self.pool, self.tensor = pool, tensor
 
     def __del__(self) -> None:
-        self.pool.free = [*self.pool.free[-1:], self.tensor]
+        self.pool.free.append(self.tensor)
+        del self.pool.free[:-2]

@@ -49,24 +49,24 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
         (released if until > read else expiring).setdefault(max(read, until), []).append(index)
     where = {each.index: register for register, each in enumerate(each for group in groups for each in group)}
     count, free = len(where), []
-    instructions = np.zeros(len(order), dtype=INSTRUCTION)
+    instructions: list[tuple[int, ...]] = []
     constants: dict[float, int] = {}
     for position, index in enumerate(order):
         free += [where[each] for each in released.get(position, ())]
         operation, operands, constant = nodes[index]
-        a, b, c = (*(min(where[operand], _MOST_REGISTERS) for operand in operands), 0, 0, 0)[:3]
+        a, b, c = (*[where[operand] for operand in operands], 0, 0, 0)[:3]
         free += [where[each] for each in expiring.get(position, ())]
         if not free:
             free.append(count)
             count += 1
         where[index] = free.pop()
         k = constants.setdefault(constant, len(constants))
-        instructions[position] = (CODES[operation], min(where[index], _MOST_REGISTERS), a, b, c, 0, k)
+        instructions.append((CODES[operation], where[index], a, b, c, 0, k))
     if count > _MOST_REGISTERS:
         raise UntraceableError(f"The state maths of this scene needs {count} registers.")
     read = {operand for index in order for operand in nodes[index][1]} | {i for outputs in results for i in outputs}
     return Tape(
-        instructions=instructions,
+        instructions=np.array(instructions, dtype=INSTRUCTION),
         constants=np.array(list(constants) or [0.0]),
         phases=tuple(ends),
         inputs=tuple(
@@ -95,7 +95,7 @@ def _schedule(nodes: list, results: list[list[int]], inputs: set[int]) -> tuple[
                     continue
                 missing = [operand for operand in nodes[index][1] if operand not in done]
                 if missing:
-                    stack += reversed(missing)
+                    stack += missing[::-1]
                 else:
                     order.append(index)
                     done.add(index)

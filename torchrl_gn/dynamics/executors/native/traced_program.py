@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import threading
 from dataclasses import replace
@@ -42,6 +43,7 @@ class TracedProgram:
         self.reason: str | None = None  # why torch operations must run it
         self.special: list[library.NativeMaths] = []
         self.general: library.NativeMaths | None = None
+        self._tried_general = False
         self._example: tuple[np.ndarray, Tensor] | None = None  # a finite state and action
         self._lock = threading.Lock()
 
@@ -75,24 +77,25 @@ class TracedProgram:
                 sample = int((left & finite).argmax())
                 state = flat[sample].reshape(states.shape[-2:])
                 self._example = state, actions[sample]
-                self.special.append(self._traced(state, may_be_constant(self.program, state)))
+                try:
+                    self.special.append(self._traced(state, may_be_constant(self.program, state)))
+                except UntraceableError as error:
+                    self.reason = str(error)
+                    raise
             fits = left & self.special[index].fits(flat)
             groups[fits], left = index, left & ~fits
-        if left.any() and self.general is None and self._example is not None:
-            state = self._example[0]
-            self.general = self._traced(state, np.zeros_like(state, dtype=bool))
+        if left.any() and not self._tried_general and self._example is not None:
+            state, self._tried_general = self._example[0], True
+            with contextlib.suppress(UntraceableError):  # torch runs states that need it
+                self.general = self._traced(state, np.zeros_like(state, dtype=bool))
         return groups
 
     def _traced(self, state: np.ndarray, constant: np.ndarray) -> library.NativeMaths:
-        """State maths that agree with torch's on the example; else the reason is kept and raised."""
-        try:
-            with torch.device("cpu"), torch.no_grad():
-                maths = trace_states(self.program, self.layers, state, constant, self.change)
-                native = library.NativeMaths(maths, self.layers)
-                self._compare(native)
-        except UntraceableError as error:
-            self.reason = str(error)
-            raise
+        """State maths that agree with torch's on the example; else UntraceableError."""
+        with torch.device("cpu"), torch.no_grad():
+            maths = trace_states(self.program, self.layers, state, constant, self.change)
+            native = library.NativeMaths(maths, self.layers)
+            self._compare(native)
         return native
 
     def _compare(self, maths: library.NativeMaths) -> None:

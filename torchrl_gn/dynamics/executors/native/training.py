@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import library
-from torchrl_gn.dynamics.executors.native.executor import NativeExecutor
+from torchrl_gn.dynamics.executors.native.executor import Native, NativeExecutor
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
 from torchrl_gn.dynamics.executors.native.traced_program import MixedStatesError
 from torchrl_gn.networks.graph import Graph
@@ -27,10 +27,12 @@ class NativeDelta(NativeExecutor):
 
     def delta(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         """Predicted change ``[*B, N, 12]``, as :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
-        if self.layers is not None and self.program.dtype in library.DTYPES and self._runs(state, action):
-            weights, tables = self.layers.tensors()
+        native = self.running(state, action)
+        if native is not None and native.network.dtype in library.DTYPES:
+            weights, tables = native.layers.tensors()
             try:
-                return _Trained.apply(self, state, action, *weights, *tables), None  # pyright: ignore[reportReturnType]
+                out = _Trained.apply(self, native, state, action, *weights, *tables)
+                return out, None  # pyright: ignore[reportReturnType]
             except (MixedStatesError, UntraceableError):
                 pass
         return eager.delta(self.program, state, action, hidden)
@@ -38,16 +40,16 @@ class NativeDelta(NativeExecutor):
 
 class _Trained(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, executor: NativeDelta, state: Tensor, action: Tensor, *tensors: Tensor | None) -> Tensor:
-        state, action = state.contiguous(), action.contiguous()
-        assert executor.native is not None
-        network, traced = executor.native
+    def forward(
+        ctx, executor: NativeDelta, native: Native, state: Tensor, action: Tensor, *tensors: Tensor | None
+    ) -> Tensor:
+        state, action, network = state.contiguous(), action.contiguous(), native.network
         shape = state.new_empty((*state.shape[:-1], executor.program.layout.delta_size), device="meta")
         call, out = library.forward_call(state, action, False, result=shape)
         sizes = *call[:2], min(library.TILE, call[0]), call[3]  # a tile, and so the sums, whatever the threads
         ctx.stored = executor.pool.take(library.trained_count(network, sizes), network.number)
         call = (*sizes, *call[4:-4], ctx.stored.tensor.data_ptr(), 1, None, None)
-        ctx.maths = traced.run(network, call, state, action)
+        ctx.maths = native.traced.run(network, call, state, action)
         ctx.save_for_backward(state, action)
         ctx.network, ctx.sizes = network, sizes
         return out
@@ -62,4 +64,4 @@ class _Trained(torch.autograd.Function):
         gradient, stored = gradient.contiguous(), ctx.stored.tensor  # to live until the call is done
         call, of_state, of_action = library.adjoint_call(ctx.sizes, state, action, gradient, False, stored)
         library.rollout_adjoint(network, ctx.maths, (*call[:-3], 1, *map(ctypes.addressof, addresses)))
-        return None, of_state, of_action, *weights, *tables
+        return None, None, of_state, of_action, *weights, *tables
