@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import copy
-import operator
-import threading
 import warnings
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -20,6 +17,7 @@ from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor
 from torchrl_gn.dynamics.normalization import scaled, static_graph
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
+from torchrl_gn.dynamics.watched import Watched, is_same, version_of
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
@@ -57,7 +55,7 @@ class SpecializedPredictor(Predictor):
         self.strict, self.executor_name = predictor.strict, executor
         self._dtype = dtype
         self._executor: Executor | None = None
-        self._weights, self._casts = _Watched([]), 0
+        self._weights, self._casts = Watched([]), 0
         self._given: dict[str, tuple[Tensor, int]] = {}
         self._number = operators.register(self)
         # Refuse now what the executor cannot run, not at the first step.
@@ -66,7 +64,7 @@ class SpecializedPredictor(Predictor):
 
     def __getstate__(self) -> dict:
         # A copy folds and compiles for itself.
-        return {**super().__getstate__(), "_executor": None, "_weights": _Watched([]), "_given": {}}
+        return {**super().__getstate__(), "_executor": None, "_weights": Watched([]), "_given": {}}
 
     def __setstate__(self, state: dict) -> None:
         super().__setstate__(state)
@@ -83,7 +81,7 @@ class SpecializedPredictor(Predictor):
 
     def refresh(self) -> None:
         """Take a new snapshot of the weights at the next step."""
-        self._weights = _Watched([])
+        self._weights = Watched([])
 
     def executor(self, parameters: TensorDictBase | None = None) -> Executor:
         """What runs the step, from a snapshot of the weights as they are now.
@@ -105,7 +103,7 @@ class SpecializedPredictor(Predictor):
         modules = list(self.model.modules())
         owners: list[dict[str, Any]] = [module._parameters for module in modules]
         owners += [module._buffers for module in modules]
-        watched, casts = _Watched(owners), self.model.casts  # before they are read: another thread may change them
+        watched, casts = Watched(owners), self.model.casts  # before they are read: another thread may change them
         # Tensors made in inference mode could be neither overwritten nor differentiated outside.
         with torch.inference_mode(False), torch.no_grad():
             program = self.program(parameters)
@@ -116,7 +114,7 @@ class SpecializedPredictor(Predictor):
         self._weights, self._casts = watched, casts
         # Views that share the storage keep it alive: no other tensor can come to lie at its address.
         given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
-        self._given = {name: (value.detach(), _version(value)) for name, value in given.items()}
+        self._given = {name: (value.detach(), version_of(value)) for name, value in given.items()}
 
     def _is_current(self, parameters: TensorDictBase | None) -> bool:
         given = {} if parameters is None else dict(parameters.items())
@@ -124,7 +122,7 @@ class SpecializedPredictor(Predictor):
             self._weights.unchanged()
             and self.model.casts == self._casts
             and given.keys() == self._given.keys()
-            and all(_same(given[name], *kept) for name, kept in self._given.items())
+            and all(is_same(given[name], *kept) for name, kept in self._given.items())
         )
 
     def step(
@@ -256,50 +254,6 @@ def specialize(
             stacklevel=2,
         )
     return SpecializedPredictor(predictor, executor=executor, dtype=dtype)
-
-
-class _Watched:
-    """Tensors of modules, and how often each was changed.
-
-    Read without a Python loop, which would take as long as a step of one state.
-    """
-
-    def __init__(self, owners: Sequence[dict]) -> None:
-        found = [(owner, name, one) for owner in owners for name, one in owner.items() if one is not None]
-        found = [each for each in found if each[1] not in _FOLLOWING]
-        # PyTorch counts no changes of tensors made in inference mode: they are never the same.
-        found = [] if any(one.is_inference() for _, _, one in found) else found
-        self.owners, self.names, self.tensors = zip(*found, strict=True) if found else ((), (), ())
-        self.states = list(map(_STATE, self.tensors))
-
-    def unchanged(self) -> bool:
-        """Whether they are the same tensors with the same numbers; False without any."""
-        now = map(dict.get, self.owners, self.names)
-        return (
-            bool(self.states)
-            and all(map(operator.is_, now, self.tensors))
-            and list(map(_STATE, self.tensors)) == self.states
-        )
-
-
-_TAKING = threading.Lock()  # one thread takes a snapshot, others wait for it
-_FOLLOWING = ("count", "m2", "inverse_std")  # statistics that change with a normaliser's mean and deviation
-_STATE = operator.attrgetter("_version", "dtype")
-
-
-def _version(tensor: Tensor) -> int:
-    # PyTorch counts no changes of tensors made in inference mode: they are never the same.
-    return -1 if tensor.is_inference() else tensor._version
-
-
-def _same(now: Tensor, kept: Tensor, version: int) -> bool:
-    """Whether a tensor, perhaps another view, shows the numbers that were kept."""
-    return (
-        version >= 0
-        and now.data_ptr() == kept.data_ptr()
-        and _version(now) == version
-        and (now.shape, now.stride(), now.dtype) == (kept.shape, kept.stride(), kept.dtype)
-    )
 
 
 def _width(inputs: InputScaling, full: int) -> int:
