@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 import warnings
 from typing import Any
 
@@ -24,6 +25,8 @@ from torchrl_gn.networks.graph import Graph, graph_concat
 from torchrl_gn.networks.snapshot import snapshot
 from torchrl_gn.processor import SlowDtypeWarning, product_speeds
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+_TAKING = threading.Lock()  # one thread takes a snapshot, others wait for it
 
 
 class SpecializedPredictor(Predictor):

@@ -32,12 +32,12 @@ class Watched:
         )
 
 
-_TAKING = threading.Lock()  # one thread takes a snapshot, others wait for it
 _FOLLOWING = ("count", "m2", "inverse_std")  # statistics that change with a normaliser's mean and deviation
 _STATE = operator.attrgetter("_version", "dtype")
 
 
 def version_of(tensor: Tensor) -> int:
+    """How often a tensor was changed in place; -1 if that is not counted."""
     # PyTorch counts no changes of tensors made in inference mode: they are never the same.
     return -1 if tensor.is_inference() else tensor._version
 
