@@ -4,8 +4,8 @@
 
 Measures, on the same rollouts (starts and random controls as in the data sets), GN forward models of several sizes and
 MLPs, trained here for `minutes` each (or `checkpoints=[FOLDER,...]`) and evaluated by message passing (reference),
-specialised (with `fast_matmul`) and, where this processor is fast at it, in bfloat16; and MuJoCo at its own and at
-coarser settings. Errors are against a finely stepped MuJoCo, relative to the persistence baseline, over equal simulated
+specialised and, where this processor is fast at it, in bfloat16; and MuJoCo at its own and at coarser settings.
+Errors are against a finely stepped MuJoCo, relative to the persistence baseline, over equal simulated
 time. Run time is wall time per simulated second of one trajectory, on `threads` threads, at every batch size: medians,
 all methods in turn. A method is on the Pareto front of a batch size if no other is both faster and more accurate.
 

@@ -28,7 +28,7 @@ from torchrl_gn.training import RunFolder
 
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
     """Every model's and baseline's runs, by number of iterations."""
-    options = [f"{name}={cfg[name]}" for name in ("system", "episodes", "steps", "compile", "seed", "threads")]
+    options = [f"{name}={cfg[name]}" for name in ("system", "episodes", "steps", "executor", "seed", "threads")]
     options += [f"simulation_threads={cfg.threads}", "video=false", *as_list(cfg.overrides)]
     models = as_list(cfg.checkpoints) or [None]
     ways = [("gn" if path is None else Path(path).stem, "gn", as_list(cfg.iterations), path) for path in models]

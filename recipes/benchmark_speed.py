@@ -5,10 +5,10 @@
 
 Times one step, rollouts, gradients through a step and through rollouts, and a training step of one forward model
 (random weights, true physical parameters), evaluated in several ways: `reference` (PyG message passing, eager),
-`folded` (what training uses), `specialised`, the other executors, and on top of them oneDNN's matrix products (`fast`)
-and bfloat16 products (where this processor is fast at them). Each way does each piece of work in turn, several times,
-short work many times a turn. The table shows medians, speed-ups over `reference` and jraph, peak memory, and errors
-against the reference in float64.
+`folded` (the bound model, which trains natively), `specialised` (by torch operations), `native` and `compiled`, with
+oneDNN's matrix products in place of torch's (`fast`) and with bfloat16 products (where this processor is fast at them).
+Each way does each piece of work in turn, several times, short work many times a turn. The table shows medians,
+speed-ups over `reference` and jraph, peak memory, and errors against the reference in float64.
 
 `baselines=[jraph,mujoco]` times others in turn with them. `jraph` is the same network with the same weights as jraph
 users write it, under `jax.jit` in float32: the network alone, from graph features to output nodes, which are checked to

@@ -55,7 +55,7 @@ from torchrl_gn.training import RunFolder
 
 SAVE_SECONDS = 60
 # Options that may differ when a run goes on.
-MAY_CHANGE = ("planner", "steps", "compile", "threads", "simulation_threads", "video", "logger", "run_dir")
+MAY_CHANGE = ("planner", "steps", "executor", "threads", "simulation_threads", "video", "logger", "run_dir")
 
 
 class RandomControl(TensorDictModuleBase):

@@ -30,7 +30,7 @@ from torchrl_gn.training import RunFolder, load_pretrained
 
 def planning(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
     """Episodes executed through a model."""
-    options = (f"system={cfg.system}", f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"compile={cfg.compile}")
+    options = (f"system={cfg.system}", f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"executor={cfg.executor}")
     options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
     options += ("video=false", "gn.iterations=3", *as_list(cfg.planning))
     return Run(MPC, folder / f"executed{index}", options, f"planning, round {index}")

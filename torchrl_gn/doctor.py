@@ -121,17 +121,15 @@ def _advice(seconds: dict[str, tuple[float, float]], threads: int, compiler: boo
     products = product_speeds()
     slower = products.slowdown(torch.bfloat16)
     lines = [
-        "specialize(model) for prediction, evaluation and planning",
-        "specialize(model, executor='compiled') for few states at a time and for planning"
-        if compiler
-        else "install g++ for executor='compiled': 5 to 8 times faster steps of few states",
+        "specialize(model) for prediction, evaluation and planning"
+        + (": it runs in C++" if compiler else "; install g++, so that it and training run in C++"),
         f"dtype=torch.bfloat16 for large batches: products {1 / slower:.1f} times as fast, 3 digits"
         if slower < 0.8
         else f"no dtype=torch.bfloat16: products take {slower:.1f} times as long as in float32",
     ]
     if products.onednn_pays:
         gain = products.onednn / products.float32
-        lines.append(f"fast_matmul() around large batches: float32 products {gain:.1f} times as fast")
+        lines.append(f"fast_matmul() around large batches by torch: float32 products {gain:.1f} times as fast")
     else:
         why = "rounds the factors" if products.onednn_error > 1e-5 else "is not faster"
         lines.append(f"no fast_matmul(): oneDNN {why}")

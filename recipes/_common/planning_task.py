@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states, spline_controls
-from torchrl_gn.dynamics import Predictor, specialize
+from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners.plan import check_count
@@ -70,7 +70,7 @@ def shipped_models(cfg: DictConfig) -> list[str]:
 
 
 def bind_model(cfg: DictConfig, scene: Scene):
-    """Bind the trained model to the scene; returns it and its inference model, or None."""
+    """Bind the trained model to the scene, specialised; returns it and its inference model, or None."""
     names = shipped_models(cfg)
     if cfg.checkpoint is None and not names:
         what = f"variants of {cfg.system!r}" if cfg.variants else repr(cfg.system)
@@ -78,20 +78,11 @@ def bind_model(cfg: DictConfig, scene: Scene):
     checkpoint = load_pretrained(cfg.checkpoint or names[0])
     if isinstance(checkpoint.trained, IdentifyingModel):
         bound, inference = checkpoint.trained.bind(scene)
-        return fast_model(bound, cfg.compile), inference
+        return specialize(bound, executor=cfg.executor), inference
     if cfg.variants and not checkpoint.config.get("parametrized"):
         raise ValueError("The model was trained on one system, not on variants: give checkpoint=PATH of one that was.")
     bound = checkpoint.model.bind(scene, parameters_key="parameters" if cfg.variants else None)
-    return fast_model(bound, cfg.compile), None
-
-
-def fast_model(bound: Predictor, compile: bool) -> Predictor:
-    """Specialise the model, and compile it if its core allows it."""
-    try:
-        return specialize(bound, executor="compiled" if compile else "eager")
-    except TypeError:
-        print(f"Planning without compile=true, more slowly: core={bound.model.core_name} cannot be compiled.")
-        return specialize(bound)
+    return specialize(bound, executor=cfg.executor), None
 
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:

@@ -26,7 +26,7 @@ from torchrl_gn.training.run_folder import METRICS_FILE
 RECIPES = Path(__file__).parents[1]
 FORWARD_MODEL, MPC = RECIPES / "forward_model.py", RECIPES / "mpc.py"
 OPTIONS_FILE = "options.json"
-MAY_DIFFER = ("threads=", "compile=", "data.folder=")  # of a finished run
+MAY_DIFFER = ("threads=", "executor=", "data.folder=")  # of a finished run
 
 
 @dataclass(frozen=True)

@@ -253,7 +253,7 @@ class Predictor(TensorDictModuleBase):
 
         ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``; the first state is the start. See :meth:`step`.
         """
-        for action in actions.unbind(-2)[:1]:
+        for action in actions[..., :1, :].unbind(-2):
             check_shapes(self.scene, state, action, parameters)
         states, hidden = self.executor(parameters).rollout(state, actions, self._graph(hidden_state))
         return states, None if hidden is None else hidden.tensordict()

@@ -33,8 +33,10 @@ class SpecializedPredictor(Predictor):
 
     Predicts what the given predictor predicts, from a *snapshot* of its weights and normalisers, made again when one of
     them has changed (an optimiser step, ``load_state_dict``, ``to``). A change through ``.data``, which PyTorch does
-    not count, goes unseen: call :meth:`refresh`. Differentiable in states and actions, never in weights. Reads and
-    writes the same keys. ``print`` shows what was skipped.
+    not count, goes unseen: call :meth:`refresh`. Differentiable in states and actions, never in weights. Native
+    gradients are of first order; that in a component of the state that cannot move is that of copying it. Reads and
+    writes the same keys. ``print`` shows what was skipped and what runs it. ``torch.compile`` takes steps and rollouts
+    as operators.
 
     Samples with parameters of their own (``parameters_key``) are folded once, and again for others: give a rollout's
     steps the same tensors. No gradient flows to them.
@@ -231,8 +233,9 @@ def specialize(
     Args:
         executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"native"`` runs steps, rollouts and their
             gradients in C++ that is built once, 20 s, and kept; where it cannot (a GPU, a recurrent core, parameters of
-            each sample, no compiler), as ``"eager"``, and ``print`` says why. ``"compiled"``, for GPUs, compiles at
-            the first call with every new shape: half a minute, minutes for a gradient.
+            each sample, float16, no compiler), as ``"eager"``, and ``print`` says why. ``"eager"`` runs torch
+            operations anywhere. ``"compiled"``, for GPUs and what native cannot run, compiles at the first call with
+            every new shape: half a minute, minutes for a gradient.
         dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster where the processor
             multiplies it (``torchrl-gn doctor`` tells) and many times slower elsewhere, which warns
             (:class:`~torchrl_gn.processor.SlowDtypeWarning`). States keep their dtype.
@@ -261,7 +264,7 @@ class _Watched:
     Read without a Python loop, which would take as long as a step of one state.
     """
 
-    def __init__(self, owners: Sequence[dict[str, Tensor | None]]) -> None:
+    def __init__(self, owners: Sequence[dict]) -> None:
         found = [(owner, name, one) for owner in owners for name, one in owner.items() if one is not None]
         found = [each for each in found if each[1] not in _FOLLOWING]
         # PyTorch counts no changes of tensors made in inference mode: they are never the same.

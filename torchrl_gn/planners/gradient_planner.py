@@ -158,7 +158,7 @@ class GradientPlanner(RecedingHorizonPlanner):
 
     def _actions(self, scaled: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in the actuators' units."""
-        return scaled * self.half_range + self.middle
+        return torch.addcmul(self.middle, scaled, self.half_range)
 
     @property
     def _recurrent(self) -> bool:
@@ -176,7 +176,7 @@ class GradientPlanner(RecedingHorizonPlanner):
     def predicted_returns(self, starts: TensorDictBase, plan: Tensor) -> Tensor:
         """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` from states ``[B K]``; minus infinity if diverged."""
         states, rewards = self.imagined.imagine(starts, self._actions(plan).flatten(0, 1))
-        finite = states.isfinite().flatten(1).all(1)
+        finite = states.detach().isfinite().flatten(1).all(1)
         total = torch.where(finite, rewards.sum((-2, -1)), -torch.inf).reshape(plan.shape[:2])
         return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
 
@@ -208,6 +208,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         noise = self.noise * self.random_plans(len(plan), count)
         return torch.cat([plan[:, : self.candidates - count], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
 
+    @torch.no_grad()
     def _improve(
         self, entries: TensorDictBase, plan: Tensor, step_size: Tensor, *, resumed: bool
     ) -> tuple[Tensor, Tensor]:
@@ -218,33 +219,31 @@ class GradientPlanner(RecedingHorizonPlanner):
         # The same tensors in every iteration: the model folds their parameters once.
         starts = _repeated(entries, self.candidates)
         best, best_return = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
-        initial_return = best_return
+        initial_return, descent = best_return, -torch.ones_like(best_return)
         # The optimiser sees offsets in units of the step size.
         scale = step_size[..., None, None]
         offset = torch.zeros_like(plan, requires_grad=True)
         optimizer = self.optimizer([offset])
         for iteration in range(self.iterations if resumed else self.warm_up):
+            actions = torch.addcmul(plan, scale, offset).requires_grad_()
             with torch.enable_grad():
-                actions = plan + scale * offset
                 total = self.predicted_returns(starts, actions)
-                depends = total.requires_grad
-                gradient = torch.autograd.grad(-total.sum(), offset, allow_unused=True)[0] if depends else None
-                if gradient is None:
-                    raise ValueError(
-                        f"The rewards that {self.imagined} imagines do not depend on the actions. Train the model, or"
-                        " lengthen the horizon until actions change the reward."
-                    )
+            depends = total.requires_grad
+            gradient = torch.autograd.grad(total, actions, descent, allow_unused=True)[0] if depends else None
+            if gradient is None:
+                raise ValueError(
+                    f"The rewards that {self.imagined} imagines do not depend on the actions. Train the model, or"
+                    " lengthen the horizon until actions change the reward."
+                )
             best, best_return = _keep_better(best, best_return, actions, total)
             initial_return = best_return if iteration == 0 else initial_return
             # A candidate whose gradient overflows stays where it is.
             finite = gradient.isfinite().flatten(2).all(-1)[..., None, None]
-            offset.grad = torch.where(finite, gradient, 0.0)
+            offset.grad = torch.where(finite, scale * gradient, 0.0)
             optimizer.step()
-            with torch.no_grad():
-                offset.copy_(((plan + scale * offset).clamp(-1, 1) - plan) / scale)
-        with torch.no_grad():
-            actions = plan + scale * offset
-            best, best_return = _keep_better(best, best_return, actions, self.predicted_returns(starts, actions))
+            offset.copy_((torch.addcmul(plan, scale, offset).clamp(-1, 1) - plan) / scale)
+        actions = torch.addcmul(plan, scale, offset)
+        best, best_return = _keep_better(best, best_return, actions, self.predicted_returns(starts, actions))
         failed = int((best_return == -torch.inf).all(1).sum())
         if failed:
             fallback = "their last plan is kept" if resumed else "there is no plan yet, and nothing is done"
@@ -265,6 +264,5 @@ def _repeated(entries: TensorDictBase, count: int) -> TensorDictBase:
 
 def _keep_better(best: Tensor, best_return: Tensor, actions: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
     """Update the best candidates and their returns; returns that are not finite never win."""
-    total = total.detach()
     better = total.isfinite() & (total > best_return)
-    return torch.where(better[..., None, None], actions.detach(), best), torch.where(better, total, best_return)
+    return torch.where(better[..., None, None], actions, best), torch.where(better, total, best_return)

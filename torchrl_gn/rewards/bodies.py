@@ -69,14 +69,24 @@ class Bodies(Float64Buffers):
 
     def position(self, state: Tensor) -> Tensor:
         """``[*B, K, 3]`` positions, metres."""
-        nodes = self._nodes(state)
-        position = nodes[..., _POSITION]
-        return position + self._shift(nodes) if self._is_shifted else position
+        return self._position(self._nodes(state))
 
     def orientation(self, state: Tensor) -> Tensor:
         """``[*B, K, 4]`` unit quaternions, w-first, of either sign."""
-        orientation = self._nodes(state)[..., _ORIENTATION]
-        return quaternion.product(orientation, self.rotation.to(state.dtype)) if self._is_rotated else orientation
+        return self._orientation(self._nodes(state))
+
+    def pose(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions and orientations."""
+        nodes = self._nodes(state)
+        return self._position(nodes), self._orientation(nodes)
+
+    def _position(self, nodes: Tensor) -> Tensor:
+        position = nodes[..., _POSITION]
+        return position + self._shift(nodes) if self._is_shifted else position
+
+    def _orientation(self, nodes: Tensor) -> Tensor:
+        orientation = nodes[..., _ORIENTATION]
+        return quaternion.product(orientation, self.rotation.to(nodes.dtype)) if self._is_rotated else orientation
 
     def linear_velocity(self, state: Tensor) -> Tensor:
         """``[*B, K, 3]`` velocities of the frames' origins, m/s."""

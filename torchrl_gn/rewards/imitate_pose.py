@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards.bodies import Bodies, find_body
@@ -79,8 +80,9 @@ class ImitatePose(Reward):
         return task
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        target = self.require_task(task, next_state)
-        away = self.bodies.position(next_state) - self.bodies.position(target)
-        wanted = quaternion.normalize(self.bodies.orientation(target))
-        rotated = quaternion.product(quaternion.conjugate(self.bodies.orientation(next_state)), wanted)[..., 1:]
-        return -torch.cat((away, rotated), dim=-1).square().sum(-1).sum(-1, keepdim=True)
+        position, orientation = self.bodies.pose(next_state)
+        to, target = self.bodies.pose(self.require_task(task, next_state))
+        # The conjugate of the constant target, not of the state: fewer operations to differentiate.
+        back = quaternion.conjugate(normalize(target, dim=-1))
+        rotated = quaternion.product(back, orientation)[..., 1:]
+        return -torch.cat((position - to, rotated), dim=-1).square().sum((-2, -1)).unsqueeze(-1)

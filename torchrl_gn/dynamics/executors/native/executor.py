@@ -116,7 +116,8 @@ class NativeExecutor:
         states = state.reshape(-1, *state.shape[-2:])
         actions = actions.reshape(len(groups), *actions.shape[state.ndim - 2 :])
         places = [(groups == group).nonzero().flatten() for group in groups.unique().tolist()]
-        parts = [(self.rollout if many else self.step)(states[at], actions[at])[0] for at in places]
+        run = self.rollout if many else self.step
+        parts = [run(states[at], actions[at])[0] for at in places]
         out = torch.cat(parts)[torch.cat(places).argsort()]
         return out.view(*state.shape[:-2], *out.shape[1:])
 

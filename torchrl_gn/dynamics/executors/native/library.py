@@ -159,7 +159,7 @@ class NativeMaths:
     def fits(self, states: np.ndarray) -> np.ndarray:
         """Which of flat states ``[count, N * C]`` have these constant channels, as ``gn_rollout`` finds."""
         difference = np.abs(states[:, self.maths.constant] - self.maths.values)
-        return np.all(difference <= 1e-9 * (1 + np.abs(self.maths.values)), axis=1)
+        return np.asarray((difference <= 1e-9 * (1 + np.abs(self.maths.values))).all(1))
 
     def _tape(self, tape: Tape) -> _Tape:
         ends = np.array(tape.phases, dtype=np.int32)

@@ -52,12 +52,13 @@ class _Symbolic(Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
-        kwargs, name = kwargs or {}, function._schema.name.removeprefix("aten::")
+        kwargs, name = dict(kwargs or {}), function._schema.name.removeprefix("aten::")
         if name in OPERATIONS:
-            args, options = tree_map_only(_Symbolic, _unwrapped, (args, kwargs))
+            args = tree_map_only(_Symbolic, _unwrapped, args)
+            kwargs = {key: _unwrapped(value) for key, value in kwargs.items()}
             try:
-                out = OPERATIONS[name](*args, **options)
-                # numpy's 0-d results are objects
+                out = OPERATIONS[name](*args, **kwargs)
+                # Numpy's results without dimensions are no arrays.
                 out = out if isinstance(out, (Tensor, tuple, list)) else as_object(out)
             except NotImplementedError as error:
                 raise UntraceableError(f"The operation {function} has no scalar form here: {error}.") from error
