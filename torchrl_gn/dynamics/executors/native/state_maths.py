@@ -60,7 +60,7 @@ class StateMaths:
         self.results, self.result_size = self.varying, state.size
         self._after: list[Any] = after[~constant].tolist()
         if change:
-            changes = [isinstance(each, Scalar) or each != 0 for each in delta.ravel().tolist()]
+            changes = np.array([isinstance(each, Scalar) or each != 0 for each in delta.ravel()], dtype=bool)
             self.results, self.result_size = np.flatnonzero(changes).astype(np.int32), delta.size
             self._after = delta.ravel()[changes].tolist()
         self._groups: list[list[Scalar]] = [symbols[~constant].tolist(), actions.tolist(), outputs.tolist()]
