@@ -140,6 +140,7 @@ def test_the_example_is_c_and_runs_as_its_header_says(scenes, make_model, tmp_pa
     build(*strict, "-c", folder / "main.c", "-o", tmp_path / "main.o")
 
 
+@pytest.mark.filterwarnings("ignore::torchrl_gn.processor.SlowDtypeWarning")
 def test_c_refuses_what_the_native_executor_cannot_run(scenes, make_model, tmp_path):
     scene = scenes["pendulum"]
     bound = make_model(scene).bind(scene)
