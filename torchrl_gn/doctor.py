@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -16,6 +14,7 @@ from tqdm import tqdm
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import specialize
+from torchrl_gn.dynamics.executors.native.build import find_compiler
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import instruction_sets, processor_name, product_speeds, restrictions, usable_cores
@@ -110,9 +109,10 @@ def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
 
 def _compiler() -> str | None:
     try:
-        command = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++") or "g++"
-        done = subprocess.run([command, "--version"], capture_output=True, text=True, timeout=30)
-    except OSError:
+        if (command := find_compiler()) is None:
+            return None
+        done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=30)
+    except (OSError, ValueError):  # ValueError: quotes of CXX that do not close
         return None
     return done.stdout.splitlines()[0] if done.returncode == 0 and done.stdout else None
 

@@ -57,14 +57,18 @@ class ProductSpeeds:
 def product_speeds() -> ProductSpeeds:
     """Measure products of 1,400 x 128 by 128 x 128 (0.1 s), or read an earlier result from ``~/.cache/torchrl_gn``."""
     key = "\n".join([processor_name(), instruction_sets(), torch.__version__, *restrictions()])
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
-    file = folder / f"products-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
+    file = cache_folder() / f"products-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
     with contextlib.suppress(OSError, ValueError, TypeError):  # missing, damaged, or of another version
         return ProductSpeeds(**json.loads(file.read_text()))
     speeds = _measure()
     with contextlib.suppress(OSError):
         write_json(file, asdict(speeds))
     return speeds
+
+
+def cache_folder() -> Path:
+    """Return the folder of what is measured or built once for a processor; RuntimeError without a home."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
 
 
 def processor_name() -> str:

@@ -55,5 +55,5 @@ def test_operators_pass_torchs_own_checks(scenes, make_model, random_states, ran
     state, action = random_states(scene, 2).requires_grad_(), random_actions(scene, 2).requires_grad_()
     # Not that of gradients under dispatch modes: torch operations run there, and differ in components that cannot move.
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    inputs = (state, action, quick._number, False)
+    inputs = (state, action, quick.number, False)
     torch.library.opcheck(torch.ops.torchrl_gn.rollout.default, inputs, test_utils=checks)

@@ -103,8 +103,8 @@ def export_c(predictor: Predictor, folder: str | os.PathLike, states: Tensor | N
     shape = scene.num_nodes, model.layout.size
     if states.shape[-2:] != shape or not states.numel():
         raise ValueError(f"states must be [*B, {shape[0]}, {shape[1]}], got {list(states.shape)}.")
-    rest = states.reshape(-1, *shape)[0].double().numpy()
     flat = states.reshape(-1, *shape).double().numpy()
+    rest = flat[0]
     constant = may_be_constant(program, rest) & (np.abs(flat - rest) <= 1e-10 * (1 + np.abs(rest))).all(0)
     maths = trace_states(program, layers, rest, constant)
     names = getattr(scene, "actuator_names", [f"command {index}" for index in range(scene.num_actions)])

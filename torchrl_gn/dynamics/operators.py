@@ -8,8 +8,35 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.networks.graph import Graph
+
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.specialized import SpecializedPredictor
+
+
+class OperatorExecutor:
+    """Runs a predictor's steps and rollouts as operators, so that a compiler does not look inside.
+
+    That is, into the check whether the weights changed, and C++.
+    """
+
+    def __init__(self, predictor: SpecializedPredictor) -> None:
+        self.predictor = predictor
+
+    @property
+    def program(self) -> StepProgram:
+        """The step as the compiler can see it."""
+        with torch.no_grad():
+            return Predictor.program(self.predictor)
+
+    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        return torch.ops.torchrl_gn.rollout(state, action, self.predictor.number, False), None
+
+    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        return torch.ops.torchrl_gn.rollout(state, actions, self.predictor.number, True), None
+
 
 _PREDICTORS: weakref.WeakValueDictionary[int, SpecializedPredictor] = weakref.WeakValueDictionary()
 

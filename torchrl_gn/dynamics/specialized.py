@@ -8,7 +8,7 @@ import warnings
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -60,7 +60,7 @@ class SpecializedPredictor(Predictor):
         self._executor: Executor | None = None
         self._weights, self._casts = Watched([]), 0
         self._given: dict[str, tuple[Tensor, int]] = {}
-        self._number = operators.register(self)
+        self.number = operators.register(self)
         # Refuse now what the executor cannot run, not at the first step.
         if not getattr(EXECUTORS[executor], "runs_all", True):
             self.executor()
@@ -71,7 +71,7 @@ class SpecializedPredictor(Predictor):
 
     def __setstate__(self, state: dict) -> None:
         super().__setstate__(state)
-        self._number = operators.register(self)
+        self.number = operators.register(self)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -89,9 +89,12 @@ class SpecializedPredictor(Predictor):
     def executor(self, parameters: TensorDictBase | None = None) -> Executor:
         """What runs the step, from a snapshot of the weights as they are now.
 
-        Within ``torch.compile`` it folds in the compiled code, which then follows the weights.
+        Within ``torch.compile`` steps and rollouts are operators; with parameters of samples, or a hidden state, they
+        fold in the compiled code, which then follows the weights.
         """
         if torch.compiler.is_compiling():
+            if parameters is None and not self.recurrent:
+                return operators.OperatorExecutor(self)  # pyright: ignore[reportReturnType]
             with torch.no_grad():
                 return EagerExecutor(super().program(parameters))
         if self._executor is None or not self._is_current(parameters):
@@ -127,32 +130,6 @@ class SpecializedPredictor(Predictor):
             and given.keys() == self._given.keys()
             and all(is_same(given[name], *kept) for name, kept in self._given.items())
         )
-
-    def step(
-        self,
-        state: Tensor,
-        action: Tensor,
-        parameters: TensorDictBase | None = None,
-        hidden_state: TensorDictBase | None = None,
-    ) -> tuple[Tensor, TensorDict | None]:
-        if self._is_operator(parameters):
-            return torch.ops.torchrl_gn.rollout(state, action, self._number, False), None
-        return super().step(state, action, parameters, hidden_state)
-
-    def rollout(
-        self,
-        state: Tensor,
-        actions: Tensor,
-        parameters: TensorDictBase | None = None,
-        hidden_state: TensorDictBase | None = None,
-    ) -> tuple[Tensor, TensorDict | None]:
-        if self._is_operator(parameters):
-            return torch.ops.torchrl_gn.rollout(state, actions, self._number, True), None
-        return super().rollout(state, actions, parameters, hidden_state)
-
-    def _is_operator(self, parameters: TensorDictBase | None) -> bool:
-        """Whether a compiler must not look inside: into the check whether the weights changed, and C++."""
-        return torch.compiler.is_compiling() and parameters is None and not self.recurrent
 
     def program(
         self, parameters: TensorDictBase | None = None, *, reference: bool = False, reduced: bool = True

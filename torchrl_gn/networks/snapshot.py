@@ -38,6 +38,23 @@ def snapshot(folded: Any, dtype: torch.dtype) -> Any:
 
 def copy_into(old, new) -> bool:
     """Overwrite the tensors of nested tuples and dataclasses, if all else is equal; whether it was."""
+    pairs = _pairs(old, new)
+    if pairs is None:
+        return False
+    with torch.no_grad():
+        for a, b in pairs:
+            a.copy_(b)
+    return True
+
+
+def same(old, new) -> bool:
+    """Whether nested tuples and dataclasses hold equal tensors, and all else is equal."""
+    pairs = _pairs(old, new)
+    return pairs is not None and all(a is b or torch.equal(a, b) for a, b in pairs)
+
+
+def _pairs(old, new) -> list[tuple[Tensor, Tensor]] | None:
+    """Tensors of the same places, shapes, dtypes and devices; None if anything else differs."""
     pairs: list[tuple[Tensor, Tensor]] = []
 
     def collect(a, b) -> bool:
@@ -55,24 +72,4 @@ def copy_into(old, new) -> bool:
             return all(collect(getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
         return a == b
 
-    if not collect(old, new):
-        return False
-    with torch.no_grad():
-        for a, b in pairs:
-            a.copy_(b)
-    return True
-
-
-def same(a: Any, b: Any) -> bool:
-    """Whether nested tuples and dataclasses hold equal tensors and otherwise the same objects."""
-    if a is b:
-        return True
-    if type(a) is not type(b):
-        return False
-    if isinstance(a, Tensor):
-        return a.shape == b.shape and a.dtype == b.dtype and bool(torch.equal(a, b))
-    if isinstance(a, tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    if is_dataclass(a):
-        return all(same(getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
-    return not isinstance(a, torch.nn.Module) and a == b
+    return pairs if collect(old, new) else None

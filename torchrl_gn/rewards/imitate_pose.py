@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards.bodies import Bodies, find_body
@@ -83,6 +82,6 @@ class ImitatePose(Reward):
         position, orientation = self.bodies.pose(next_state)
         to, target = self.bodies.pose(self.require_task(task, next_state))
         # The conjugate of the constant target, not of the state: fewer operations to differentiate.
-        back = quaternion.conjugate(normalize(target, dim=-1))
+        back = quaternion.conjugate(quaternion.normalize(target))
         rotated = quaternion.product(back, orientation)[..., 1:]
         return -torch.cat((position - to, rotated), dim=-1).square().sum((-2, -1)).unsqueeze(-1)

@@ -20,7 +20,7 @@ import torch
 from filelock import FileLock
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.processor import processor_flags, processor_name
+from torchrl_gn.processor import cache_folder, processor_flags, processor_name
 
 SOURCES = sorted(path for path in Path(__file__).parent.iterdir() if path.suffix in (".h", ".cpp"))
 _OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno", "-pthread")
@@ -28,6 +28,12 @@ _OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-fno
 
 class NoCompilerError(FileNotFoundError):
     """There is no C++ compiler, or it failed: the message is one line."""
+
+
+def find_compiler() -> list[str] | None:
+    """Command of the C++ compiler: ``CXX``, which may have arguments, else c++, g++ or clang++; None without one."""
+    command = shlex.split(os.environ.get("CXX", "")) or list(filter(shutil.which, ("c++", "g++", "clang++")))[:1]
+    return command if command and shutil.which(command[0]) else None
 
 
 def load_code() -> ctypes.CDLL:
@@ -51,8 +57,8 @@ def _library_or_reason() -> ctypes.CDLL | str:
 
 
 def _load() -> ctypes.CDLL:
-    compiler = shlex.split(os.environ.get("CXX", "")) or list(filter(shutil.which, ("c++", "g++", "clang++")))[:1]
-    if not compiler or shutil.which(compiler[0]) is None:
+    compiler = find_compiler()
+    if compiler is None:
         raise NoCompilerError("There is no C++ compiler: install g++ for the native executor.")
     options = [*_OPTIONS, *instruction_flags(), *shlex.split(os.environ.get("TORCHRL_GN_CXXFLAGS", ""))]
     version = _run([*compiler, "--version"]).splitlines()[:1]
@@ -60,7 +66,7 @@ def _load() -> ctypes.CDLL:
     digest = hashlib.sha256("\n".join([*parts, *(path.read_text() for path in SOURCES)]).encode())
     name, command = f"native-{digest.hexdigest()[:16]}.so", [*compiler, *options]
     try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
+        folder = cache_folder()
         file = folder / name
         if (library := _opened(file)) is not None:
             return library

@@ -133,15 +133,15 @@ class Native(NamedTuple):
 
 def _run(
     native: Native, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None
-) -> tuple[Tensor, tuple, library.NativeMaths]:
-    """Results for contiguous inputs, and what a gradient needs: sizes of the call, and its state maths.
+) -> tuple[Tensor, library.Call, library.NativeMaths]:
+    """Results for contiguous inputs, and what a gradient needs: the call, and its state maths.
 
     Raises:
         MixedStatesError: if the samples need different state maths.
         UntraceableError: if torch operations must run it.
     """
     call, out = library.forward_call(state, actions, many, stored)
-    return out, call[:4], native.traced.run(native.network, call, state, actions)
+    return out, call, native.traced.run(native.network, call, state, actions)
 
 
 class _Differentiable(torch.autograd.Function):
@@ -152,9 +152,9 @@ class _Differentiable(torch.autograd.Function):
         stored = None
         if numbers * network.number.itemsize <= STORED_BYTES:
             stored = executor.pool.take(numbers, network.number)
-        out, ctx.sizes, ctx.maths = _run(native, state, actions, many, None if stored is None else stored.tensor)
+        out, ctx.call, ctx.maths = _run(native, state, actions, many, None if stored is None else stored.tensor)
         ctx.save_for_backward(out if many else state, actions)
-        ctx.executor, ctx.native, ctx.many, ctx.stored = executor, native, many, stored
+        ctx.executor, ctx.native, ctx.stored = executor, native, stored
         return out
 
     @staticmethod
@@ -165,7 +165,7 @@ class _Differentiable(torch.autograd.Function):
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
         gradient = gradient.contiguous()  # to live until the call is done
         stored = None if ctx.stored is None else ctx.stored.tensor
-        call, of_state, of_actions = library.adjoint_call(ctx.sizes, states, actions, gradient, ctx.many, stored)
+        call, of_state, of_actions = library.adjoint_call(ctx.call, states, actions, gradient, stored)
         library.rollout_adjoint(ctx.native.network, ctx.maths, call)
         return None, None, of_state, of_actions, None
 

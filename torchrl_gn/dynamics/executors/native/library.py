@@ -31,7 +31,6 @@ class _Tape(ctypes.Structure):
         ("constants", _P),
         ("ends", _P),
         ("registers", _I),
-        ("groups", _I),
         ("inputs", _P),
         ("outputs", _P),
     )
@@ -47,7 +46,9 @@ class _Maths(ctypes.Structure):
     )
 
 
-class _Call(ctypes.Structure):
+class Call(ctypes.Structure):
+    """What a call of the C++ code reads, as rollout.h says."""
+
     _fields_ = (
         *((name, _I) for name in ("batch", "steps", "tile", "threads")),
         ("states", _Array),
@@ -71,7 +72,7 @@ def load_library() -> ctypes.CDLL:
         "gn_network_new": (_P, [_I, _P, _P, _P]),
         "gn_network_delete": (None, [_P, _I]),
         "gn_has_bfloat16": (_I, []),
-        "gn_stored": (_I, [_P, _I, _P, _P]),
+        "gn_stored": (_I, [_P, _I, _P]),
         "gn_rollout": (_I, [_P, _I, _P, _P]),
         "gn_rollout_adjoint": (None, [_P, _I, _P, _P]),
     }
@@ -170,72 +171,63 @@ class NativeMaths:
             tape.constants.ctypes.data,
             ends.ctypes.data,
             tape.registers,
-            len(tape.inputs),
             *(ctypes.addressof(table) for table in tables),
         )
 
 
-NOTHING = (None, 0)  # no array
-
-
 def forward_call(
-    state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None, result: Tensor | None = None
-) -> tuple[tuple, Tensor]:
-    """Fields of a call for contiguous inputs, which must live as long as the call, and its result.
+    state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None, shape: Sequence[int] | None = None
+) -> tuple[Call, Tensor]:
+    """A call for contiguous inputs, which must live as long as the call, and its result.
 
-    That is the next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``; or
-    shaped like ``result``.
+    That is the next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``; or of
+    another ``shape``.
     """
-    shape, threads = state.shape, torch.get_num_threads()
-    size = shape[-2] * shape[-1]
+    *batch, nodes, channels = state.shape
+    size, threads = nodes * channels, torch.get_num_threads()
     count, steps = state.numel() // size, actions.shape[-2] if many else 1
-    out_shape = (*shape[:-2], steps + 1, *shape[-2:]) if many else shape if result is None else result.shape
-    out = torch.empty(out_shape, dtype=state.dtype, device="cpu")
+    if shape is None:
+        shape = (*batch, steps + 1, nodes, channels) if many else state.shape
+    out = torch.empty(shape, dtype=state.dtype, device="cpu")
     tile = min(TILE, -(-count // threads))  # such that there are tiles for all threads
-    call = (
-        *(count, steps, tile, threads),
-        *((state.data_ptr(), DTYPES[state.dtype]), size, (actions.data_ptr(), DTYPES[actions.dtype])),
-        *((out.data_ptr(), DTYPES[out.dtype]), many, NOTHING, NOTHING),
-        *(None if stored is None else stored.data_ptr(), 0, None, None),
-    )
-    return call, out
+    fields = (count, steps, tile, threads, _array(state), size, _array(actions), _array(out), many, _NOTHING, _NOTHING)
+    return Call(*fields, None if stored is None else stored.data_ptr()), out
 
 
 def adjoint_call(
-    sizes: tuple, states: Tensor, actions: Tensor, gradient: Tensor, many: bool, stored: Tensor | None
-) -> tuple[tuple, Tensor, Tensor]:
-    """Fields of the call for the gradient of another, whose first fields are ``sizes``; gradients of state and actions.
+    forward: Call, states: Tensor, actions: Tensor, gradient: Tensor, stored: Tensor | None
+) -> tuple[Call, Tensor, Tensor]:
+    """The call for the gradient of a ``forward`` one; gradients of state and actions.
 
-    ``states`` are the start states, or for ``many`` all; all tensors must live as long as the call.
+    ``states`` are the start states, or of many steps all; all tensors must live as long as the call.
     """
-    size = states.shape[-2] * states.shape[-1]
+    many, size = forward.with_start, states.shape[-2] * states.shape[-1]
     shape = (*states.shape[:-3], *states.shape[-2:]) if many else states.shape
     of_state = torch.empty(shape, dtype=states.dtype, device="cpu")
     of_actions = torch.empty_like(actions)
-    call = (
-        *sizes,
-        *((states.data_ptr(), DTYPES[states.dtype]), size * (sizes[1] + 1 if many else 1)),
-        *((actions.data_ptr(), DTYPES[actions.dtype]), (gradient.data_ptr(), DTYPES[gradient.dtype]), many),
-        *((of_state.data_ptr(), DTYPES[states.dtype]), (of_actions.data_ptr(), DTYPES[actions.dtype])),
-        *(None if stored is None else stored.data_ptr(), 0, None, None),
-    )
-    return call, of_state, of_actions
+    sizes, stride = (forward.batch, forward.steps, forward.tile, forward.threads), size * (forward.steps * many + 1)
+    fields = (_array(states), stride, _array(actions), _array(gradient), many, _array(of_state), _array(of_actions))
+    return Call(*sizes, *fields, None if stored is None else stored.data_ptr(), forward.train), of_state, of_actions
 
 
-def rollout(network: NativeNetwork, maths: NativeMaths, call: tuple) -> bool:
-    """Run ``gn_rollout`` on the fields of a call; False if a start state has other constant channels."""
-    reference = ctypes.byref(_Call(*call))
-    return not network.library.gn_rollout(network.pointer, network.kind, maths.reference, reference)
+_NOTHING = (None, 0)  # no array
 
 
-def rollout_adjoint(network: NativeNetwork, maths: NativeMaths, call: tuple) -> None:
-    """Run ``gn_rollout_adjoint`` on the fields of a call."""
+def _array(tensor: Tensor) -> tuple[int, int]:
+    return tensor.data_ptr(), DTYPES[tensor.dtype]
+
+
+def rollout(network: NativeNetwork, maths: NativeMaths, call: Call) -> bool:
+    """Run ``gn_rollout``; False if a start state has other constant channels."""
+    return not network.library.gn_rollout(network.pointer, network.kind, maths.reference, ctypes.byref(call))
+
+
+def rollout_adjoint(network: NativeNetwork, maths: NativeMaths, call: Call) -> None:
+    """Run ``gn_rollout_adjoint``."""
     maths.add_adjoint()
-    reference = ctypes.byref(_Call(*call))
-    network.library.gn_rollout_adjoint(network.pointer, network.kind, maths.reference, reference)
+    network.library.gn_rollout_adjoint(network.pointer, network.kind, maths.reference, ctypes.byref(call))
 
 
-def trained_count(network: NativeNetwork, sizes: tuple) -> int:
-    """Numbers that a step keeps for gradients of weights; ``sizes`` are a call's first fields."""
-    call = _Call(*sizes, train=1)
-    return network.library.gn_stored(network.pointer, network.kind, ctypes.byref(_Maths()), ctypes.byref(call))
+def trained_count(network: NativeNetwork, call: Call) -> int:
+    """Numbers that a training call keeps for its adjoint."""
+    return network.library.gn_stored(network.pointer, network.kind, ctypes.byref(call))

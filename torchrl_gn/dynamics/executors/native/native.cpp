@@ -28,10 +28,10 @@ GN_API void gn_network_delete(void* network, int64_t kind) {
   gn::with_network(network, kind, [](const auto& known) { delete &known; });
 }
 
-// Numbers of the network's dtype that a call keeps for its adjoint.
-GN_API int64_t gn_stored(const void* network, int64_t kind, const gn::Maths* maths, const gn::Call* call) {
+// Numbers of the network's dtype that a training call keeps for its adjoint.
+GN_API int64_t gn_stored(const void* network, int64_t kind, const gn::Call* call) {
   return gn::with_network(network, kind, [&](const auto& known) {
-    return gn::tile_store(*maths, known, *call) * ((call->batch + call->tile - 1) / call->tile);
+    return gn::tile_store(known, *call) * ((call->batch + call->tile - 1) / call->tile);
   });
 }
 

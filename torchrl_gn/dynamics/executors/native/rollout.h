@@ -57,7 +57,7 @@ struct Call {
   int64_t with_start;
   Array grad_state;        // adjoint: [B, size]
   Array grad_actions;      // adjoint: [B, T, A]
-  void* stored;            // what the adjoint needs of the network, as gn_stored() says; null: compute it again
+  void* stored;            // what the adjoint needs: [B * T] slopes and outputs, or if train gn_stored(); null: nothing
   int64_t train;           // of one step all is stored, and the adjoint adds gradients of the weights
   void* const* grad_weights;  // of every layer [out, K]
   void* const* grad_tables;   // and [I, out], or null
@@ -245,10 +245,9 @@ struct Runner {
   }
 };
 
-// Where a call's tiles keep what their adjoint needs: T's of one tile.
+// T's that a tile of a training call keeps for its adjoint.
 template <class Net>
-int64_t tile_store(const Maths& m, const Net& network, const Call& call) {
-  if (!call.train) return (network.stored() + m.outputs) * call.tile * call.steps;
+int64_t tile_store(const Net& network, const Call& call) {
   return network.stored() * call.tile + network.activation_count(call.tile);
 }
 
@@ -317,7 +316,7 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
       for (int64_t tile = part; tile < tiles; tile += parts) {
         const int64_t first = tile * call.tile, count = std::min(call.tile, call.batch - first);
         T* const whole =
-            call.train ? static_cast<T*>(call.stored) + tile * tile_store(m, network, call) : nullptr;
+            call.train ? static_cast<T*>(call.stored) + tile * tile_store(network, call) : nullptr;
         Runner<Net, W, C> runner{m, network, call, first, static_cast<int>(count), r, scratch, whole};
         if (!adjoint) runner.forward();
         else if (!call.train) runner.adjoint(more, kept, sums, nullptr, nullptr);

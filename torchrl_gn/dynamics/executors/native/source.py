@@ -106,7 +106,7 @@ def _tape(name: str, tape: Tape) -> str:
         parts.append(f"const int32_t* const {name}_{which}[] = {{{names}}};")
     parts.append(
         f"const gn::Tape {name} = {{{name}_INSTRUCTIONS, {name}_CONSTANTS, {name}_ENDS, {tape.registers},"
-        f" {len(tape.inputs)}, {name}_INPUTS, {name}_OUTPUTS}};"
+        f" {name}_INPUTS, {name}_OUTPUTS}};"
     )
     return "\n".join(parts)
 

@@ -74,7 +74,6 @@ struct Tape {
   const double* constants;
   const int32_t* ends;  // where each phase ends
   int64_t registers;
-  int64_t groups;
   const int32_t* const* inputs;  // registers of every group
   const int32_t* const* outputs;  // and of every phase's outputs
 };

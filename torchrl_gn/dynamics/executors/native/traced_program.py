@@ -47,7 +47,9 @@ class TracedProgram:
         self._example: tuple[np.ndarray, Tensor] | None = None  # a finite state and action
         self._lock = threading.Lock()
 
-    def run(self, network: library.NativeNetwork, call: tuple, state: Tensor, actions: Tensor) -> library.NativeMaths:
+    def run(
+        self, network: library.NativeNetwork, call: library.Call, state: Tensor, actions: Tensor
+    ) -> library.NativeMaths:
         """Run a call of the library, for contiguous states and actions; return the state maths that all samples fit.
 
         Raises:
@@ -56,7 +58,7 @@ class TracedProgram:
         """
         if not self.special or not library.rollout(network, self.special[0], call):
             with self._lock:
-                groups = self._groups(state, actions.reshape(*call[:2], actions.shape[-1])[:, 0])
+                groups = self._groups(state, actions.reshape(call.batch, call.steps, actions.shape[-1])[:, 0])
             if (groups != groups[0]).any():
                 raise MixedStatesError(groups)
             maths = [*self.special, self.general][groups[0]]
@@ -108,7 +110,7 @@ class TracedProgram:
             if self.change
             else eager.step(program, state, action, None)[0] - state
         )
-        call, found = library.forward_call(state, action, False, result=change)
+        call, found = library.forward_call(state, action, False, shape=change.shape)
         if not library.rollout(network, maths, call):
             raise UntraceableError("The state maths do not fit the state that they were traced for.")
         found = found if self.change else found - state

@@ -44,14 +44,14 @@ class _Trained(torch.autograd.Function):
         ctx, executor: NativeDelta, native: Native, state: Tensor, action: Tensor, *tensors: Tensor | None
     ) -> Tensor:
         state, action, network = state.contiguous(), action.contiguous(), native.network
-        shape = state.new_empty((*state.shape[:-1], executor.program.layout.delta_size), device="meta")
-        call, out = library.forward_call(state, action, False, result=shape)
-        sizes = *call[:2], min(library.TILE, call[0]), call[3]  # a tile, and so the sums, whatever the threads
-        ctx.stored = executor.pool.take(library.trained_count(network, sizes), network.number)
-        call = (*sizes, *call[4:-4], ctx.stored.tensor.data_ptr(), 1, None, None)
+        shape = (*state.shape[:-1], executor.program.layout.delta_size)
+        call, out = library.forward_call(state, action, False, shape=shape)
+        call.train, call.tile = True, min(library.TILE, call.batch)  # a tile, and so the sums, whatever the threads
+        ctx.stored = executor.pool.take(library.trained_count(network, call), network.number)
+        call.stored = ctx.stored.tensor.data_ptr()
         ctx.maths = native.traced.run(network, call, state, action)
         ctx.save_for_backward(state, action)
-        ctx.network, ctx.sizes = network, sizes
+        ctx.network, ctx.call = network, call
         return out
 
     @staticmethod
@@ -62,6 +62,7 @@ class _Trained(torch.autograd.Function):
         weights, tables = ([None if each is None else torch.empty_like(each) for each in part] for part in packed)
         addresses = library.pointers(weights), library.pointers(tables)
         gradient, stored = gradient.contiguous(), ctx.stored.tensor  # to live until the call is done
-        call, of_state, of_action = library.adjoint_call(ctx.sizes, state, action, gradient, False, stored)
-        library.rollout_adjoint(network, ctx.maths, (*call[:-3], 1, *map(ctypes.addressof, addresses)))
+        call, of_state, of_action = library.adjoint_call(ctx.call, state, action, gradient, stored)
+        call.grad_weights, call.grad_tables = map(ctypes.addressof, addresses)
+        library.rollout_adjoint(network, ctx.maths, call)
         return None, None, of_state, of_action, *weights, *tables
