@@ -8,13 +8,14 @@ import warnings
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics import operators
 from torchrl_gn.dynamics.checks import UnseenParameterWarning
 from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor
+from torchrl_gn.dynamics.executors.native.binding import load_binding, make_plan
 from torchrl_gn.dynamics.normalization import scaled, static_graph
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
@@ -60,6 +61,7 @@ class SpecializedPredictor(Predictor):
         self._executor: Executor | None = None
         self._weights, self._casts = Watched([]), 0
         self._given: dict[str, tuple[Tensor, int]] = {}
+        self._plan: Any = None  # of a single step, if it can be called without ctypes
         self.number = operators.register(self)
         # Refuse now what the executor cannot run, not at the first step.
         if not getattr(EXECUTORS[executor], "runs_all", True):
@@ -67,7 +69,7 @@ class SpecializedPredictor(Predictor):
 
     def __getstate__(self) -> dict:
         # A copy folds and compiles for itself.
-        return {**super().__getstate__(), "_executor": None, "_weights": Watched([]), "_given": {}}
+        return {**super().__getstate__(), "_executor": None, "_weights": Watched([]), "_given": {}, "_plan": None}
 
     def __setstate__(self, state: dict) -> None:
         super().__setstate__(state)
@@ -84,7 +86,25 @@ class SpecializedPredictor(Predictor):
 
     def refresh(self) -> None:
         """Take a new snapshot of the weights at the next step."""
-        self._weights = Watched([])
+        self._weights, self._plan = Watched([]), None
+
+    def step(
+        self,
+        state: Tensor,
+        action: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDict | None]:
+        if parameters is not None or hidden_state is not None or torch.compiler.is_compiling():
+            return super().step(state, action, parameters, hidden_state)
+        if self._plan is not None and (after := load_binding().step(self._plan, state, action)) is not None:
+            return after, None
+        out = super().step(state, action)
+        if self._plan is None and not self._given:
+            # Weights before what was made of them: another thread may take a snapshot meanwhile.
+            watched, casts = self._weights, self._casts
+            self._plan = make_plan(self._executor, self.scene, watched, casts, vars(self.model))
+        return out
 
     def executor(self, parameters: TensorDictBase | None = None) -> Executor:
         """What runs the step, from a snapshot of the weights as they are now.
@@ -118,17 +138,20 @@ class SpecializedPredictor(Predictor):
             else:
                 self._executor.update(program)
         self._weights, self._casts = watched, casts
+        self._plan = None
         # Views that share the storage keep it alive: no other tensor can come to lie at its address.
         given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
         self._given = {name: (value.detach(), version_of(value)) for name, value in given.items()}
 
     def _is_current(self, parameters: TensorDictBase | None) -> bool:
-        given = {} if parameters is None else dict(parameters.items())
-        return (
-            self._weights.unchanged()
-            and self.model.casts == self._casts
-            and given.keys() == self._given.keys()
-            and all(is_same(given[name], *kept) for name, kept in self._given.items())
+        model = self._modules["model"]  # not self.model: torch looks that up in a microsecond
+        if not self._weights.unchanged() or model.casts != self._casts:  # pyright: ignore[reportOptionalMemberAccess]
+            return False
+        if parameters is None:
+            return not self._given
+        given = dict(parameters.items())
+        return given.keys() == self._given.keys() and all(
+            is_same(given[str(name)], *kept) for name, kept in self._given.items()
         )
 
     def program(

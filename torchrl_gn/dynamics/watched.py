@@ -20,20 +20,24 @@ class Watched:
         # PyTorch counts no changes of tensors made in inference mode: they are never the same.
         found = [] if any(one.is_inference() for _, _, one in found) else found
         self.owners, self.names, self.tensors = zip(*found, strict=True) if found else ((), (), ())
-        self.states = list(map(_STATE, self.tensors))
+        self.versions = list(map(_VERSION, self.tensors))
+        # A module is cast as a whole: one of its tensors tells.
+        self.samples = list({id(owner): one for owner, _, one in found}.values())
+        self.dtypes = list(map(_DTYPE, self.samples))
 
     def unchanged(self) -> bool:
         """Whether they are the same tensors with the same numbers; False without any."""
         now = map(dict.get, self.owners, self.names)
         return (
-            bool(self.states)
+            bool(self.versions)
             and all(map(operator.is_, now, self.tensors))
-            and list(map(_STATE, self.tensors)) == self.states
+            and list(map(_VERSION, self.tensors)) == self.versions
+            and list(map(_DTYPE, self.samples)) == self.dtypes
         )
 
 
 _FOLLOWING = ("count", "m2", "inverse_std")  # statistics that change with a normaliser's mean and deviation
-_STATE = operator.attrgetter("_version", "dtype")
+_VERSION, _DTYPE = operator.attrgetter("_version"), operator.attrgetter("dtype")
 
 
 def version_of(tensor: Tensor) -> int:

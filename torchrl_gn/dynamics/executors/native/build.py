@@ -13,14 +13,17 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from filelock import FileLock
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.processor import cache_folder, processor_flags, processor_name
+
+L = TypeVar("L")
 
 SOURCES = sorted(path for path in Path(__file__).parent.iterdir() if path.suffix in (".h", ".cpp"))
 _OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno", "-pthread")
@@ -51,61 +54,66 @@ def load_code() -> ctypes.CDLL:
 @functools.cache
 def _library_or_reason() -> ctypes.CDLL | str:
     try:
-        return _load()
+        options = [*_OPTIONS, *instruction_flags(), *shlex.split(os.environ.get("TORCHRL_GN_CXXFLAGS", ""))]
+        parts = (processor_name(), processor_flags())
+        return load("native.cpp", "the native executor", options, parts, lambda file: ctypes.CDLL(str(file)))
     except (OSError, ValueError) as error:
         return str(error)
 
 
-def _load() -> ctypes.CDLL:
+def load(source: str, what: str, options: Sequence[str], parts: Sequence[str], opened: Callable[[Path], L]) -> L:
+    """What ``opened`` makes of the library of a source beside this file, built where none is kept.
+
+    ``what`` says what is built. A library is kept for its sources, compiler, options and ``parts``.
+
+    Raises:
+        NoCompilerError: without a working C++ compiler.
+    """
     compiler = find_compiler()
     if compiler is None:
         raise NoCompilerError("There is no C++ compiler: install g++ for the native executor.")
-    options = [*_OPTIONS, *instruction_flags(), *shlex.split(os.environ.get("TORCHRL_GN_CXXFLAGS", ""))]
     version = _run([*compiler, "--version"]).splitlines()[:1]
-    parts = [*compiler, *version, *options, processor_name(), processor_flags(), sys.platform]
-    digest = hashlib.sha256("\n".join([*parts, *(path.read_text() for path in SOURCES)]).encode())
-    name, command = f"native-{digest.hexdigest()[:16]}.so", [*compiler, *options]
+    key = [*compiler, *version, *options, *parts, sys.platform]
+    digest = hashlib.sha256("\n".join([*key, *(path.read_text() for path in SOURCES)]).encode())
+    name = f"{Path(source).stem}-{digest.hexdigest()[:16]}.so"
+    command = [*compiler, str(Path(__file__).parent / source), *options]
     try:
         folder = cache_folder()
         file = folder / name
-        if (library := _opened(file)) is not None:
-            return library
+        if _is_whole(file):
+            return opened(file)
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / f".{name}.lock"):  # others wait for whoever builds
-            if (library := _opened(file)) is None:
+            if not _is_whole(file):
                 for left in folder.glob(f".{file.stem}.*.so"):  # by a build that was interrupted
                     left.unlink()
-                _build(command, file)
-                library = _opened(file)
-        if library is not None:
-            return library
+                _build(what, command, file)
+        return opened(file)
     except NoCompilerError:
         raise
     except (OSError, RuntimeError):  # no home, or none to write to
         pass
     with tempfile.TemporaryDirectory(prefix="torchrl_gn-") as temporary:
         file = Path(temporary) / name  # code in the home may not be run, either
-        _build(command, file)
-        return ctypes.CDLL(str(file))
+        _build(what, command, file)
+        return opened(file)
 
 
-def _build(command: Sequence[str], file: Path) -> None:
+def _build(what: str, command: Sequence[str], file: Path) -> None:
     """Compile to a file that ends with its SHA-256."""
-    sys.stderr.write("Building the native executor for this processor, once: about 20 s.\n")
-    source = next(path for path in SOURCES if path.suffix == ".cpp")
+    sys.stderr.write(f"Building {what} for this processor, once: about 20 s.\n")
     with atomic_path(file) as temporary:
-        _run([*command, str(source), "-o", str(temporary)])
+        _run([*command, "-o", str(temporary)])
         with temporary.open("ab") as out:
             out.write(hashlib.sha256(temporary.read_bytes()).digest())
 
 
-def _opened(file: Path) -> ctypes.CDLL | None:
-    """The library of a whole file; None if it is missing or damaged, which could end the process."""
+def _is_whole(file: Path) -> bool:
+    """Whether a library is there, and not damaged, which could end the process."""
     with contextlib.suppress(OSError):
         content = file.read_bytes()
-        if hashlib.sha256(content[:-32]).digest() == content[-32:]:
-            return ctypes.CDLL(str(file))
-    return None
+        return hashlib.sha256(content[:-32]).digest() == content[-32:]
+    return False
 
 
 def instruction_flags() -> list[str]:

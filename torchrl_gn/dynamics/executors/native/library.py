@@ -186,9 +186,10 @@ def forward_call(
     *batch, nodes, channels = state.shape
     size, threads = nodes * channels, torch.get_num_threads()
     count, steps = state.numel() // size, actions.shape[-2] if many else 1
-    if shape is None:
-        shape = (*batch, steps + 1, nodes, channels) if many else state.shape
-    out = torch.empty(shape, dtype=state.dtype, device="cpu")
+    if shape is None and many:
+        shape = (*batch, steps + 1, nodes, channels)
+    # A tensor like the state is made faster than one of a shape.
+    out = torch.empty_like(state) if shape is None else torch.empty(shape, dtype=state.dtype, device="cpu")
     tile = min(TILE, -(-count // threads))  # such that there are tiles for all threads
     fields = (count, steps, tile, threads, _array(state), size, _array(actions), _array(out), many, _NOTHING, _NOTHING)
     return Call(*fields, None if stored is None else stored.data_ptr()), out
