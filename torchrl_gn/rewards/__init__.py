@@ -2,16 +2,20 @@
 
 from torchrl_gn.rewards.bodies import Bodies as Bodies
 from torchrl_gn.rewards.bodies import find_body as find_body
+from torchrl_gn.rewards.distance import Distance as Distance
+from torchrl_gn.rewards.distance import TargetDistance as TargetDistance
 from torchrl_gn.rewards.imitate_pose import ImitatePose as ImitatePose
 from torchrl_gn.rewards.imitate_pose import arm_reach as arm_reach
 from torchrl_gn.rewards.reward import FreezeGoal as FreezeGoal
 from torchrl_gn.rewards.reward import Reward as Reward
+from torchrl_gn.rewards.tasks import REWARD_TYPES as REWARD_TYPES
 from torchrl_gn.rewards.tasks import AngularSpeed as AngularSpeed
 from torchrl_gn.rewards.tasks import Balance as Balance
+from torchrl_gn.rewards.tasks import Effort as Effort
 from torchrl_gn.rewards.tasks import Position as Position
 from torchrl_gn.rewards.tasks import Reach as Reach
-from torchrl_gn.rewards.tasks import TargetDistance as TargetDistance
 from torchrl_gn.rewards.tasks import Velocity as Velocity
 from torchrl_gn.rewards.tasks import VerticalDistance as VerticalDistance
 from torchrl_gn.rewards.tasks import available_rewards as available_rewards
 from torchrl_gn.rewards.tasks import make_reward as make_reward
+from torchrl_gn.rewards.weighted_sum import WeightedSum as WeightedSum

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from numbers import Real
 from types import MappingProxyType
 from typing import cast
 
@@ -19,7 +20,8 @@ class Reward(nn.Module):
 
     When planning starts, :meth:`task_of` makes the ``task``, which :meth:`forward` reads at every step of the plan,
     from the episode's ``target`` (:class:`~torchrl_gn.rewards.FreezeGoal`). Environments accept any callable with the
-    signature of :meth:`forward`. Subclasses raise ValueError for bodies that the scene does not have.
+    signature of :meth:`forward`. Rewards add and scale: ``forward + 0.1 * upright``. Subclasses raise ValueError for
+    bodies that the scene does not have.
     """
 
     target_shape: tuple[int, ...] | None = None  # of a target without batch; None if the reward needs none
@@ -67,6 +69,28 @@ class Reward(nn.Module):
         if not fits or task.shape[split:] != shape:
             raise ValueError(f"the task of {name} must be {[*batch, *shape]}, got {list(task.shape)}")
         return task.to(next_state.dtype)
+
+    def __add__(self, other: Reward) -> Reward:
+        """Sum of two rewards, of which one at most needs a target."""
+        return self._sum((1.0, self), (1.0, other)) if isinstance(other, Reward) else NotImplemented
+
+    def __sub__(self, other: Reward) -> Reward:
+        return self._sum((1.0, self), (-1.0, other)) if isinstance(other, Reward) else NotImplemented
+
+    def __mul__(self, factor: float) -> Reward:
+        """The reward times a number."""
+        return self._sum((float(factor), self)) if isinstance(factor, Real) else NotImplemented
+
+    __rmul__ = __mul__
+
+    def __neg__(self) -> Reward:
+        return self._sum((-1.0, self))
+
+    @staticmethod
+    def _sum(*terms: tuple[float, Reward]) -> Reward:
+        from torchrl_gn.rewards.weighted_sum import WeightedSum  # which is a reward
+
+        return WeightedSum(terms)
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={value!r}" for name, value in self.shown.items())

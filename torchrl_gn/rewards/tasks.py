@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
-from typing import Literal, get_args
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import pad
 
 from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards.bodies import Bodies, require_bodies
+from torchrl_gn.rewards.distance import REACHED, Distance
 from torchrl_gn.rewards.imitate_pose import ImitatePose
 from torchrl_gn.rewards.reward import Reward
-from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.rewards.weighted_sum import rewards_from_options
 from torchrl_gn.scenes.scene import Scene
 
 Axis = Literal["x", "y", "z"]
-_REACHED = 1e-9  # metres
 
 
 class Balance(Reward):
@@ -79,7 +79,7 @@ class Reach(Reward):
         to_target = (location - self.bodies.position(state).squeeze(-2))[..., :2]
         # Divide by the largest entry first, so that squares neither overflow nor vanish.
         largest = to_target.abs().amax(-1, keepdim=True)
-        reached = largest < _REACHED
+        reached = largest < REACHED
         scaled = torch.where(reached, 1.0, to_target) / torch.where(reached, 1.0, largest)
         return pad(torch.where(reached, 0.0, scaled / scaled.norm(dim=-1, keepdim=True)), (0, 1))
 
@@ -121,6 +121,23 @@ class Position(Reward):
         return self.bodies.position(next_state)[..., self.component]
 
 
+class Effort(Reward):
+    """Negative mean square of the controls, each relative to the larger of its bounds."""
+
+    scale: Tensor
+
+    def __init__(self, scene: Scene):
+        super().__init__()
+        bounds = np.maximum(np.abs(scene.action_low), np.abs(scene.action_high))
+        if not (np.isfinite(bounds).all() and (bounds > 0).all()):
+            raise ValueError(f"Effort needs bounded controls; scene {scene.name!r} has bounds {bounds.tolist()}.")
+        self.shown = {"scene": scene.name}
+        self.register_buffer("scale", torch.from_numpy(bounds))
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return -(action / self.scale.to(action.dtype)).square().mean(-1, keepdim=True).to(next_state.dtype)
+
+
 class AngularSpeed(Reward):
     """Squared angular speed of a body after the step, rad^2/s^2 (paper: Cheetah "Squared angular speed")."""
 
@@ -144,32 +161,6 @@ class VerticalDistance(Reward):
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         height = self.bodies.position(next_state)[..., 2]
         return (height - self.reference.position(next_state)[..., 2]).square().sum(-1, keepdim=True)
-
-
-class TargetDistance(nn.Module):
-    """The suite's reward for reaching a target: 1 within ``radius`` of the target, less at larger distances.
-
-    At a distance ``d``, ``1 / (1 + (3 (d - radius) / margin)^2)``, as ``dm_control.utils.rewards.tolerance`` with a
-    long tail. ``entry`` of the observation is the vector to the target. The gradient there is 0.
-    """
-
-    def __init__(
-        self, graph: ObservationGraph, entry: str = "to_target", *, radius: float = 0.1, margin: float = 0.5
-    ) -> None:
-        super().__init__()
-        if entry not in graph.observation:
-            raise ValueError(f"Observations of {graph.name!r} have no {entry!r}; there are {list(graph.observation)}.")
-        if not (0 < radius < math.inf and 0 < margin < math.inf):
-            raise ValueError(f"radius={radius} and margin={margin} must be positive and finite.")
-        names = list(graph.observation)
-        start = sum(graph.observation[name] for name in names[: names.index(entry)])
-        self.where, self.radius, self.margin = slice(start, start + graph.observation[entry]), radius, margin
-
-    def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-        square = next_observation[..., self.where].square().sum(-1, keepdim=True)
-        # Clamp before the root: its gradient stays finite at 0.
-        beyond = square.clamp(min=self.radius**2).sqrt() - self.radius
-        return 1 / (1 + (3 * beyond / self.margin).square())
 
 
 def _component(axis: str) -> int:
@@ -201,22 +192,42 @@ _REWARDS: dict[tuple[str, str], Callable[[Scene], Reward]] = {
 }
 
 
+REWARD_TYPES: dict[str, type[Reward]] = {
+    kind.__name__: kind
+    for kind in (AngularSpeed, Balance, Distance, Effort, ImitatePose, Position, Reach, Velocity, VerticalDistance)
+}
+"""Rewards by the names that options have for them."""
+
+
 def available_rewards() -> tuple[tuple[str, str], ...]:
     """Every ``(system, task)`` of :func:`make_reward`; ``"swimmerN"`` stands for any number of links."""
     return tuple(_REWARDS)
 
 
-def make_reward(task: str, scene: Scene) -> Reward:
-    """Build a reward of the paper by its task's name, such as ``"balance"``, for a system's scene or variant.
+def make_reward(task: str | Sequence[Mapping[str, Any]], scene: Scene) -> Reward:
+    """Build a reward: of the paper by its task's name, or a weighted sum from options.
 
     Paper: Walker2d's ``"inverse_verticality"`` is largest for a standing walker, as in the paper's text. For a walker
     on its head use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
-    Raises ValueError for an unknown task (the message lists all), TypeError for a robot known by its joints alone.
+
+    Args:
+        task: a task's name, such as ``"balance"``, for a system's scene or variant; or the terms of a sum, such as
+            ``[{"type": "Velocity", "body": "torso", "axis": "x"}, {"type": "Effort", "weight": 0.1}]``
+            (:data:`REWARD_TYPES`).
+
+    Raises:
+        ValueError: for an unknown task (the message lists all), type or argument.
+        TypeError: for a robot known by its joints alone.
     """
     require_bodies(scene)
+    if not isinstance(task, str):
+        return rewards_from_options(task, scene, REWARD_TYPES)
     system = re.sub(r"^swimmer\d+$", "swimmerN", scene.origin.get("system", scene.name))
     builder = _REWARDS.get((system, task))
     if builder is None:
         known = ", ".join(f"{name} ({of})" for of, name in _REWARDS)
-        raise ValueError(f"no reward {task!r} for scene {scene.name!r}; there are: {known}")
+        raise ValueError(
+            f"no reward {task!r} for scene {scene.name!r}; there are: {known}. For another robot give a list of terms"
+            f" of the types {', '.join(REWARD_TYPES)}."
+        )
     return builder(scene)

@@ -1,0 +1,92 @@
+"""Rewards of reaching a target: of states, and of observations as in the control suite."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_gn.maths import quaternion
+from torchrl_gn.rewards.bodies import Bodies
+from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.scenes.scene import Scene
+
+REACHED = 1e-9  # metres: a target is reached
+
+
+class Distance(Reward):
+    """Negative distance, metres, of a body from a target after the step, to a power.
+
+    The target is ``[3]``, metres, world frame: given here, or that of the episode (:class:`FreezeGoal`). At the target
+    the gradient is zero.
+
+    Args:
+        offset: ``[3]`` of the point in the body's frame, metres.
+        target: ``[3]``; None: each episode brings its own.
+        power: 1, or 2 for a squared distance.
+    """
+
+    goal: Tensor | None
+
+    def __init__(
+        self,
+        scene: Scene,
+        body: str,
+        *,
+        target: Sequence[float] | None = None,
+        offset: Sequence[float] = (0.0, 0.0, 0.0),
+        power: int = 1,
+    ):
+        super().__init__()
+        if power not in (1, 2):
+            raise ValueError(f"power must be 1 or 2, got {power!r}")
+        self.bodies, self.power = Bodies(scene, [body]), power
+        self.shown = {"scene": scene.name, "body": body, "target": None if target is None else tuple(target)}
+        for name, value in (("goal", target), ("offset", offset)):
+            tensor = None if value is None else torch.tensor([float(each) for each in value], dtype=torch.float64)
+            if tensor is not None and (tensor.shape != (3,) or not bool(tensor.isfinite().all())):
+                raise ValueError(f"{'target' if name == 'goal' else name} must be three finite numbers, got {value}")
+            self.register_buffer(name, tensor)
+        self.target_shape = (3,) if target is None else None
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        goal = self.require_task(task, next_state) if self.goal is None else self.goal.to(next_state.dtype)
+        orientation = self.bodies.orientation(next_state).squeeze(-2)
+        offset = cast(Tensor, self.offset).to(next_state.dtype)
+        point = self.bodies.position(next_state).squeeze(-2) + quaternion.rotate(orientation, offset.expand_as(goal))
+        square = (point - goal).square().sum(-1, keepdim=True)
+        if self.power == 2:
+            return -square
+        # The root's gradient is finite but at 0, where it is set to 0.
+        away = square > REACHED**2
+        return -torch.where(away, torch.where(away, square, 1.0).sqrt(), 0.0)
+
+
+class TargetDistance(nn.Module):
+    """The suite's reward for reaching a target: 1 within ``radius`` of the target, less at larger distances.
+
+    At a distance ``d``, ``1 / (1 + (3 (d - radius) / margin)^2)``, as ``dm_control.utils.rewards.tolerance`` with a
+    long tail. ``entry`` of the observation is the vector to the target. The gradient there is 0.
+    """
+
+    def __init__(
+        self, graph: ObservationGraph, entry: str = "to_target", *, radius: float = 0.1, margin: float = 0.5
+    ) -> None:
+        super().__init__()
+        if entry not in graph.observation:
+            raise ValueError(f"Observations of {graph.name!r} have no {entry!r}; there are {list(graph.observation)}.")
+        if not (0 < radius < math.inf and 0 < margin < math.inf):
+            raise ValueError(f"radius={radius} and margin={margin} must be positive and finite.")
+        names = list(graph.observation)
+        start = sum(graph.observation[name] for name in names[: names.index(entry)])
+        self.where, self.radius, self.margin = slice(start, start + graph.observation[entry]), radius, margin
+
+    def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+        square = next_observation[..., self.where].square().sum(-1, keepdim=True)
+        # Clamp before the root: its gradient stays finite at 0.
+        beyond = square.clamp(min=self.radius**2).sqrt() - self.radius
+        return 1 / (1 + (3 * beyond / self.margin).square())
