@@ -7,6 +7,7 @@ Example:
     (7, 16, 5)
 """
 
+from torchrl_gn.scenes.files import MissingMeshWarning as MissingMeshWarning
 from torchrl_gn.scenes.kinematic_tree import KinematicTree as KinematicTree
 from torchrl_gn.scenes.kinematic_tree import tree_states as tree_states
 from torchrl_gn.scenes.load import load_scene as load_scene

@@ -6,6 +6,7 @@ import base64
 import difflib
 import os
 import warnings
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -14,6 +15,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from torchrl_gn.scenes.build import build_scene
+from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
@@ -31,7 +33,8 @@ def load_scene(
 
     Args:
         source: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"swimmerN"`` with N of at least
-            3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), the path of an MJCF file, MJCF text, or an ``MjSpec``.
+            3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), the path of an MJCF file, ``"package://NAME/PATH"`` of one in
+            an installed Python package, MJCF text, or an ``MjSpec``. Visual meshes may be missing, which warns.
         timestep: control step, seconds, a multiple of the physics step; default: the paper's for its systems, one
             physics step for other models.
         name: name of the scene; default: that of the system, file or model.
@@ -52,6 +55,8 @@ def load_scene(
         raise TypeError("load_scene needs MJCF, not a compiled MjModel; give its file, text or MjSpec.")
     if not isinstance(source, (str, os.PathLike)):
         raise TypeError(f"load_scene takes a name, a path, MJCF text or an MjSpec, got {type(source).__name__}.")
+    if isinstance(source, str) and is_package_path(source):
+        source = package_path(source)
     if isinstance(source, str) and not _is_mjcf(source):
         system = find_system(source)
         if system is not None:
@@ -115,13 +120,22 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
         label = "string" if path is None else f"file {path}"
         raise SceneError(f"MuJoCo cannot read the MJCF {label}: {error}") from error
     text, folder = (str(source), Path()) if path is None else (path.read_text(), path.parent)
+    if dropped := drop_missing_visuals(spec, lambda file: (folder / file).is_file()):
+        few = ", ".join(dropped[:3]) + ", ..." * (len(dropped) > 3)
+        warnings.warn(
+            f"{len(dropped)} visual meshes of {path or 'the MJCF text'} are missing ({few}): drawn without them.",
+            MissingMeshWarning,
+            stacklevel=3,
+        )
     return spec, {"mjcf": _inline(text, folder), "assets": _assets(spec, folder)}
 
 
 def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
     """Parse what :func:`_read_mjcf` stored."""
-    assets = {name: base64.b64decode(content) for name, content in origin["assets"].items()}
-    return mujoco.MjSpec.from_string(origin["mjcf"], assets=assets)
+    assets = {name: zlib.decompress(base64.b64decode(content)) for name, content in origin["assets"].items()}
+    spec = mujoco.MjSpec.from_string(origin["mjcf"], assets=assets)
+    drop_missing_visuals(spec, lambda file: str(file) in assets)
+    return spec
 
 
 def _is_mjcf(source: str) -> bool:
@@ -150,7 +164,7 @@ def _inline_children(element: ElementTree.Element, folder: Path) -> None:
 
 
 def _assets(spec: mujoco.MjSpec, folder: Path) -> dict[str, str]:
-    """Encode the files that a model reads, by the path under which MuJoCo asks for them."""
+    """Encode and compress the files that a model reads, by the path under which MuJoCo asks for them."""
     textures = [texture.file for texture in spec.textures]
     textures += [file for texture in spec.textures for file in texture.cubefiles]
     wanted = [(spec.meshdir, mesh.file) for mesh in [*spec.meshes, *spec.hfields, *spec.skins]]
@@ -159,5 +173,5 @@ def _assets(spec: mujoco.MjSpec, folder: Path) -> dict[str, str]:
     for directory, file in wanted:
         path = folder / directory / file
         if file and path.is_file():
-            assets[str(Path(directory, file))] = base64.b64encode(path.read_bytes()).decode("ascii")
+            assets[str(Path(directory, file))] = base64.b64encode(zlib.compress(path.read_bytes())).decode("ascii")
     return assets

@@ -1,0 +1,77 @@
+"""Files of MJCF models: where they are, and what can do without them."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+
+_PACKAGE = "package://"
+
+
+class MissingMeshWarning(UserWarning):
+    """A model's visual meshes are missing: the scene moves as it should, and is drawn without them."""
+
+
+def is_package_path(source: str) -> bool:
+    """Whether a source names a file of an installed Python package."""
+    return source.startswith(_PACKAGE)
+
+
+def package_path(source: str) -> Path:
+    """Path of ``package://NAME/PATH``, a file of an installed Python package.
+
+    Raises:
+        ValueError: if no file is named.
+        FileNotFoundError: if the package is not installed, or has no such file.
+    """
+    package, _, rest = source.removeprefix(_PACKAGE).partition("/")
+    if not package or not rest:
+        raise ValueError(f"{source!r} must be {_PACKAGE}NAME/PATH, a file of an installed Python package.")
+    spec = importlib.util.find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        raise FileNotFoundError(f"{source} needs the Python package {package!r}, which is not installed.")
+    path = Path(next(iter(spec.submodule_search_locations))) / rest
+    if not path.is_file():
+        raise FileNotFoundError(f"The installed package {package!r} has no file {rest!r}.")
+    return path
+
+
+def drop_missing_visuals(spec: mujoco.MjSpec, exists: Callable[[Path], bool]) -> list[str]:
+    """Remove the geoms of missing meshes where nothing but the picture depends on them; return the meshes' names.
+
+    That is, where no geom of the mesh can collide, and its bodies have an inertia of their own. Meshes that matter
+    stay, and MuJoCo names them.
+    """
+    missing = {
+        mesh.name or Path(mesh.file).stem
+        for mesh in spec.meshes
+        if mesh.file and not exists(Path(spec.meshdir, mesh.file))
+    }
+    users: dict[str, list] = {name: [] for name in missing}
+    for body in spec.bodies:
+        for geom in body.geoms:
+            if geom.meshname in missing:
+                users[geom.meshname].append((body, geom))
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    droppable = [
+        name
+        for name in sorted(missing)
+        if all(
+            not geom.contype and not geom.conaffinity and geom.name not in paired and body.explicitinertial
+            for body, geom in users[name]
+        )
+    ]
+    for name in droppable:
+        for _, geom in users[name]:
+            _delete(spec, geom)
+    for mesh in [mesh for mesh in spec.meshes if (mesh.name or Path(mesh.file).stem) in droppable]:
+        _delete(spec, mesh)
+    return droppable
+
+
+def _delete(spec: mujoco.MjSpec, element) -> None:
+    # MuJoCo before 3.3.3 deletes by the element itself.
+    spec.delete(element) if hasattr(spec, "delete") else element.delete()
