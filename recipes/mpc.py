@@ -12,6 +12,9 @@ planner:
 - cem_true, mppi_true: TorchRL's planners on MuJoCo
 - random, nothing: random controls, no controls
 
+Any other robot (`system=PATH`) needs a model (`checkpoint=PATH`) and a task: `horizon`, `steps`, and as `reward` a list
+of terms, as in `[{type: Velocity, body: torso, axis: x}, {type: Effort, weight: 0.1}]` (docs/planning.md).
+
 A checkpoint of an inference model first identifies the system from random controls. `variants=true` gives every episode
 its own random variant of the system; it needs a checkpoint trained on variants (the package has some for pendulum and
 cheetah). The same `run_dir` goes on with the saved episodes, also with more steps or planners.
@@ -43,13 +46,22 @@ from tqdm import tqdm
 
 from _common import clean_exit, finish_run, open_log, refuse_other_options, with_help
 from _common.episodes import Episodes, film, planned_state, summarize
-from _common.planning_task import ON_MODEL, bind_model, draw_targets, fill_in, make_scenes, shipped_models, start_states
+from _common.planning_task import (
+    ON_MODEL,
+    bind_model,
+    draw_targets,
+    fill_in,
+    make_scenes,
+    reward_of,
+    shipped_models,
+    start_states,
+)
 from torchrl_gn.data import spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.rewards import FreezeGoal, make_reward
+from torchrl_gn.rewards import FreezeGoal
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import RunFolder
 
@@ -140,7 +152,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
     scene, scenes = make_scenes(cfg)
-    reward = make_reward(cfg.reward, scene)
+    reward = reward_of(cfg, scene)
     env = SceneEnv(scenes, reward, num_threads=cfg.simulation_threads, seed=cfg.seed)
     # Identify variants first whoever plans, so that all planners have the same starts.
     needed = set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint or (cfg.variants and shipped_models(cfg))
@@ -148,7 +160,8 @@ def main(cfg: DictConfig) -> None:
     imagined = None if bound is None else ModelEnv(bound, reward)
     run = RunFolder(cfg.run_dir, "mpc")
     refuse_other_options(cfg, run, MAY_CHANGE)
-    tracker = open_log(cfg, run, label=f"mpc-{scene.name}-{cfg.reward}")
+    task = cfg.reward if isinstance(cfg.reward, str) else "own"
+    tracker = open_log(cfg, run, label=f"mpc-{scene.name}-{task}")
     start = start_states(cfg, env, bound, inference)
     target = draw_targets(cfg, reward, scene, start["state"])
     if target is not None:
@@ -177,7 +190,7 @@ def main(cfg: DictConfig) -> None:
         curves[name] = episodes["reward"]
         if cfg.video:
             film(episodes, scenes[0], cfg.horizon, run.file(f"{name}.gif"))
-    plot_rewards(curves, run.file("rewards.png"), timestep=scene.timestep, ylabel=f"{cfg.reward} reward")
+    plot_rewards(curves, run.file("rewards.png"), timestep=scene.timestep, ylabel=f"{task} reward")
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]  # without empty ones
     rows, widths = list(zip(*columns, strict=True)), [max(map(len, column)) for column in columns]
     for row in rows:

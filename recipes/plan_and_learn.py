@@ -1,14 +1,16 @@
 """Train a model on episodes planned with it, round by round.
 
     python recipes/plan_and_learn.py [system=cheetah] [rounds=3] [key=value ...]
+    python recipes/plan_and_learn.py +robot=go1
 
 A planner drives a system into states that random control never reaches; there the learned model is wrong. This recipe
 runs planned episodes (recipes/mpc.py), trains the model further with them as half of its data (recipes/forward_model.py
 start_from=... data.extra=...), and plans again; every round from new starts. Finished rounds are kept; the same run_dir
-goes on, with more rounds too. No figure of the paper. Results: docs/results.md.
+goes on, with more rounds too. Without a model of the system it first trains one on random controls. `+robot=NAME` is a
+real robot with its task, one of recipes/config/robot. No figure of the paper. Results: docs/results.md.
 
 Writes config.yaml, metrics.json, the table as table.md, rewards over time as rewards.png, and each round's episodes
-(executed<round>) and model (learned<round>) with their logs to its run folder. All options:
+(executed<round>) and model (learned<round>, with its error table) to its run folder. All options:
 recipes/config/plan_and_learn.yaml.
 """
 
@@ -22,37 +24,54 @@ from omegaconf import DictConfig
 from safetensors.torch import load_file
 
 from _common import as_list, clean_exit, open_log, with_help
-from _common.sweeps import FORWARD_MODEL, MPC, Run, refuse_changes, report_sweep, run_all
+from _common.sweeps import FORWARD_MODEL, MPC, Run, override, refuse_changes, report_sweep, run_all
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder, load_pretrained
+from torchrl_gn.training import RunFolder, load_pretrained, pretrained_names
+
+
+def task_options(cfg: DictConfig) -> list[str]:
+    """Options of the system and its task, as recipes/mpc.py takes them."""
+    options = [f"system={override(cfg.system)}", f"timestep={override(cfg.timestep)}"]
+    return options + [f"{key}={override(cfg[key])}" for key in ("reward", "horizon") if cfg[key] is not None]
 
 
 def planning(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
-    """Episodes executed through a model."""
-    options = (f"system={cfg.system}", f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"executor={cfg.executor}")
+    """Episodes executed through a model; in the last round baselines beside it."""
+    options = (*task_options(cfg), f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"executor={cfg.executor}")
     options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
-    options += ("video=false", "gn.iterations=3", *as_list(cfg.planning))
+    last = index == cfg.rounds
+    options += (f"video={str(last).lower()}", "gn.iterations=3", *as_list(cfg.planning))
+    if last:
+        options += (f"planner={override(['gn', *cfg.baselines])}",)
     return Run(MPC, folder / f"executed{index}", options, f"planning, round {index}")
 
 
-def learning(cfg: DictConfig, folder: Path, index: int, model: str, executed: list[Run]) -> Run:
-    """A training that goes on from a model, with episodes as half of its data."""
-    extra = ",".join(str(run.folder / "gn.safetensors") for run in executed)
-    options = (f"system={cfg.system}", f"start_from={model}", f"data.extra=[{extra}]")
-    options += ("steps=null", f"minutes={cfg.minutes}")
-    options += (f"clock={cfg.clock}", f"lr={cfg.lr}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
-    options += (f"data.folder={folder / 'data' if cfg.data_dir is None else cfg.data_dir}", *as_list(cfg.training))
-    return Run(FORWARD_MODEL, folder / f"learned{index}", options, f"learning, round {index}")
+def learning(cfg: DictConfig, folder: Path, index: int, model: str | None, executed: list[Run]) -> Run:
+    """A training that goes on from a model, with episodes as half of its data; without a model, from random data."""
+    data = folder / "data" if cfg.data_dir is None else cfg.data_dir
+    options = (f"system={override(cfg.system)}", f"timestep={override(cfg.timestep)}", f"data.folder={data}")
+    options += ("steps=null", f"clock={cfg.clock}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
+    if model is None:
+        options += (f"minutes={cfg.first_minutes}",)
+    else:
+        extra = ",".join(str(run.folder / "gn.safetensors") for run in executed)
+        options += (f"start_from={model}", f"data.extra=[{extra}]", f"minutes={cfg.minutes}", f"lr={cfg.lr}")
+    # The model's own options hold for one that is begun with.
+    more = [each for each in as_list(cfg.training) if model is None or not each.startswith("model.")]
+    return Run(FORWARD_MODEL, folder / f"learned{index}", (*options, *more), f"learning, round {index}")
 
 
-def make_runs(cfg: DictConfig, folder: Path, model: str) -> tuple[list[Run], list[Run]]:
-    """Every round's learning, of which the first has none, and planned episodes."""
-    learned: list[Run] = []
-    executed = [planning(cfg, folder, 0, model)]
-    for index in range(1, cfg.rounds + 1):
-        learned.append(learning(cfg, folder, index, model, executed))
-        model = str(learned[-1].folder)
+def make_runs(cfg: DictConfig, folder: Path, model: str | None) -> tuple[list[Run | None], list[Run]]:
+    """Every round's learning, None if there is nothing to learn before the first episodes, and planned episodes."""
+    learned: list[Run | None] = [None if model else learning(cfg, folder, 0, None, [])]
+    executed: list[Run] = []
+    for index in range(cfg.rounds + 1):
+        if index:
+            learned.append(learning(cfg, folder, index, model, executed))
+        if (learn := learned[-1]) is not None:
+            model = str(learn.folder)
+        assert model is not None
         executed.append(planning(cfg, folder, index, model))
     return learned, executed
 
@@ -62,18 +81,19 @@ def make_runs(cfg: DictConfig, folder: Path, model: str) -> tuple[list[Run], lis
 @clean_exit
 def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "plan_and_learn")
-    model = cfg.checkpoint or cfg.system
-    load_pretrained(model)  # refused before anything is written
+    model = cfg.checkpoint or (cfg.system if cfg.system in pretrained_names() else None)
+    if model is not None:
+        load_pretrained(model)  # refused before anything is written
+    scene = load_scene(cfg.system, timestep=cfg.timestep)
     learned, executed = make_runs(cfg, folder.path.resolve(), model)  # named in the options, which may not change
-    refuse_changes([*learned, *executed])
+    refuse_changes([run for run in (*learned, *executed) if run is not None])
     tracker = open_log(cfg, folder)
     lines = ["| round | mean reward (std over starts) | ms a step | one-step error | 100 steps |", "|---" * 5 + "|"]
     metrics: dict[str, float] = {}
     failed: list[Run] = []
     for index, execution in enumerate(executed):
         errors = {}
-        if index:
-            learn = learned[index - 1]
+        if (learn := learned[index]) is not None:
             failed = run_all([learn], 1, desc=learn.name)
             if failed:
                 break
@@ -84,16 +104,22 @@ def main(cfg: DictConfig) -> None:
         if failed:
             break
         measured = execution.numbers(math.nan)  # not one: a reward where every episode became unstable
-        found = {name.removeprefix("gn/"): value for name, value in measured.items() if name.startswith("gn/")}
-        metrics |= {f"round {index}/{name}": value for name, value in found.items()}
-        reward = f"{found['mean_reward']:.3g} ({found['mean_reward_std']:.2g})"
-        cells = [f"{value:.1e}" for value in errors.values()] or ["", ""]
-        lines.append(f"| {index} | {reward} | {found['planning_ms']:.0f} | " + " | ".join(cells) + " |")
+        for planner in ("gn", *(cfg.baselines if index == cfg.rounds else ())):
+            of = {
+                name.removeprefix(f"{planner}/"): value
+                for name, value in measured.items()
+                if name.startswith(f"{planner}/")
+            }
+            label = f"round {index}" if planner == "gn" else planner
+            metrics |= {f"{label}/{name}": value for name, value in of.items()}
+            reward = f"{of['mean_reward']:.3g} ({of['mean_reward_std']:.2g})"
+            cells = [f"{value:.1e}" for value in errors.values()] if planner == "gn" and errors else ["", ""]
+            lines.append(f"| {label} | {reward} | {of['planning_ms']:.0f} | " + " | ".join(cells) + " |")
     kept = [run for run in executed if run.metrics is not None]
     rewards = [load_file(run.folder / "gn.safetensors")["reward"] for run in kept]
     if rewards:
         curves = {f"round {index}": values for index, values in enumerate(rewards)}
-        plot_rewards(curves, folder.file("rewards.png"), timestep=load_scene(cfg.system).timestep, ylabel="reward")
+        plot_rewards(curves, folder.file("rewards.png"), timestep=scene.timestep, ylabel="reward")
     report_sweep(folder, lines, {}, metrics, failed, tracker, seed=cfg.seed)
 
 

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, ListConfig, open_dict
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -15,7 +15,7 @@ from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.rewards import Reward
+from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
 from torchrl_gn.training import load_pretrained, pretrained_names
 
@@ -25,17 +25,17 @@ ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", 
 def fill_in(cfg: DictConfig) -> None:
     """Fill options that are null with the paper's task of the system, and check them."""
     name = re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system
-    if name not in cfg.tasks:
+    task = cfg.tasks.get(name, {})
+    if not task and (isinstance(cfg.reward, str) or None in (cfg.reward, cfg.horizon, cfg.steps)):
         raise ValueError(
-            f"{cfg.system!r} is no system of the paper; this recipe has rewards of {list(cfg.tasks)} alone. With a"
-            " reward and a model of your own it takes a few lines of Python: 'Plan with a model of your own' in"
-            " docs/planning.md and docs/guides/write-a-reward.md."
+            f"{cfg.system!r} is no system of the paper, whose tasks this recipe has ({list(cfg.tasks)}). For another"
+            " robot give its task: reward='[{type: Velocity, body: torso, axis: x}]' (docs/planning.md, 'Plan for your"
+            " own robot'), horizon=20 and steps=200, say."
         )
-    task = cfg.tasks[name]
     defaults = [
-        (cfg, "reward", task["rewards"][0]),
-        (cfg, "horizon", task["horizon"]),
-        (cfg, "steps", task["steps"]),
+        (cfg, "reward", task.get("rewards", [None])[0]),
+        (cfg, "horizon", task.get("horizon")),
+        (cfg, "steps", task.get("steps")),
         (cfg.gn, "iterations", task.get("iterations", 3)),
     ]
     for part, key, value in defaults:
@@ -54,7 +54,7 @@ def fill_in(cfg: DictConfig) -> None:
 
 def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
     """Load the standard scene, and with ``variants=true`` a random variant for every episode."""
-    scene = load_scene(cfg.system)
+    scene = load_scene(cfg.system, timestep=cfg.timestep)
     if not cfg.variants:
         return scene, [scene]
     rng = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(2,)))
@@ -83,6 +83,11 @@ def bind_model(cfg: DictConfig, scene: Scene):
         raise ValueError("The model was trained on one system, not on variants: give checkpoint=PATH of one that was.")
     bound = checkpoint.model.bind(scene, parameters_key="parameters" if cfg.variants else None)
     return specialize(bound, executor=cfg.executor), None
+
+
+def reward_of(cfg: DictConfig, scene: Scene) -> Reward:
+    """The task's reward, by name or of terms."""
+    return make_reward(cfg.reward if isinstance(cfg.reward, str) else OmegaConf.to_container(cfg.reward), scene)
 
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:

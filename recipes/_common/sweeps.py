@@ -83,6 +83,17 @@ def folder_name(text: str) -> str:
     return re.sub(r"[^\w.%-]+", "_", text).strip("_")
 
 
+def override(value: Any) -> str:
+    """A value as Hydra reads it on a command line."""
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{override(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, str):
+        return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    if isinstance(value, Sequence):
+        return "[" + ",".join(map(override, value)) + "]"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> list[Run]:
     """Run what is not done yet, several at a time, with a progress bar.
 
