@@ -147,8 +147,9 @@ def test_a_recurrent_model_plans_too_and_videos_show_plans(tmp_path, call):
 def test_bad_options_are_named(tmp_path, call):
     for option, message in (
         ("planner=gradient", "There is no planner 'gradient'"),
-        ("system=two_poles", "'two_poles' is no system of the paper; this recipe has rewards of ['pendulum', "),
-        ("system=my.xml", "'Plan with a model of your own' in docs/planning.md"),
+        ("system=two_poles", "'two_poles' is no system of the paper, whose tasks this recipe has (['pendulum', "),
+        ("system=my.xml", "'Plan for your own robot'"),
+        ("system=my.xml reward=[{type:Effort}] horizon=3", "is no system of the paper"),
         ("steps=0", "steps must be at least 1, got 0"),
         ("steps=2.5", "steps must be a whole number, got 2.5"),
         ("horizon=0", "horizon must be at least 1"),

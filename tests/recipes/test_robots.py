@@ -1,0 +1,74 @@
+"""The robots of recipes/config/robot: their models load and their tasks can be planned for."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+import torch
+
+from _common.planning_task import reward_of
+from _common.sweeps import override
+from torchrl_gn.data import Simulator, sample_start_states
+from torchrl_gn.scenes import load_scene
+
+from .conftest import ROOT
+
+ROBOTS = sorted(path.stem for path in (ROOT / "recipes/config/robot").glob("*.yaml"))
+PENDULUM = ROOT / "tests/zoo/pole.xml"
+
+
+@pytest.mark.filterwarnings("ignore::torchrl_gn.scenes.MissingMeshWarning")
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_robot_loads_and_has_a_task(compose, monkeypatch, name):
+    monkeypatch.chdir(ROOT)
+    config = compose("plan_and_learn", f"+robot={name}")
+    if config.system.startswith("package://"):
+        pytest.importorskip(config.system.removeprefix("package://").split("/")[0])
+    scene = load_scene(config.system, timestep=config.timestep)
+    reward = reward_of(config, scene)
+    state = Simulator(scene).observe(sample_start_states(scene, 3, 0))
+    action = torch.zeros(3, scene.num_actions, dtype=torch.float64)
+    found = reward(state, action, state)
+    assert found.shape == (3, 1) and found.isfinite().all()
+    assert config.steps >= 100  # the length of training's trajectories
+
+
+def test_values_come_back_as_hydra_reads_them(compose):
+    reward = [
+        {"type": "Distance", "body": "robot0:it's", "target": [0.5, -1.0, 2.0]},
+        {"type": "Effort", "weight": 0.1},
+    ]
+    config = compose(
+        "mpc", f"reward={override(reward)}", f"system={override('a/b c.xml')}", f"timestep={override(None)}"
+    )
+    assert [dict(term) for term in config.reward] == reward
+    assert config.system == "a/b c.xml" and config.timestep is None
+
+
+@pytest.mark.slow
+def test_a_robot_of_ones_own_learns_from_the_first_model_on(tmp_path, run):
+    shutil.copy(PENDULUM, tmp_path / "my pole.xml")
+    options = (
+        f"system={override(str(tmp_path / 'my pole.xml'))}",
+        "timestep=0.01",
+        "reward=[{type:Balance,bodies:[rod]}]",
+        "horizon=3",
+        "steps=100",
+        "episodes=2",
+        "rounds=1",
+        "first_minutes=0.02",
+        "minutes=0.02",
+        "baselines=[nothing]",
+        "planning=['gn.iterations=1','gn.warm_up=1','gn.samples=2']",
+        "training=['data.train=20','data.validation=5','data.test=5','model.hidden=8']",
+        f"run_dir={tmp_path / 'run'}",
+    )
+    code, output, errors = run(*options, recipe="plan_and_learn")
+    assert code == 0, errors
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert {f"{of}/mean_reward" for of in ("round 0", "round 1", "nothing")} <= set(metrics)
+    assert "| nothing |" in output and (tmp_path / "run/executed1/gn.gif").exists()
+    code, _, errors = run(*options, recipe="plan_and_learn")
+    assert code == 0, errors

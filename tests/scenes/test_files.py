@@ -1,0 +1,82 @@
+"""Files of models: of installed packages, and visual meshes that are missing."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+from torchrl_gn.scenes import MissingMeshWarning, SceneError, load_scene, scene_from_description
+
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 .7 0\nv 0 0 .3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+SKIN = "<geom type='mesh' mesh='skin' contype='0' conaffinity='0'/>"
+MODEL = (
+    "<mujoco><compiler meshdir='meshes'/><asset><mesh name='skin' file='skin.obj'/></asset><worldbody>"
+    "<body><joint/>{inertial}<geom size='.1'/>{visual}</body></worldbody></mujoco>"
+)
+INERTIAL = "<inertial pos='0 0 0' mass='1' diaginertia='1 1 1'/>"
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Folder of an importable package."""
+    folder = tmp_path / "robots_of_mine"
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    (folder / "arm.xml").write_text(MODEL.format(inertial=INERTIAL, visual=SKIN))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield folder
+    sys.modules.pop("robots_of_mine", None)
+
+
+def test_a_file_of_a_package(package):
+    (package / "meshes/skin.obj").write_text(CORNERS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = load_scene("package://robots_of_mine/arm.xml")
+        again = scene_from_description(json.loads(json.dumps(scene.description())))
+    assert scene.name == "arm" and scene.model.nmesh == again.model.nmesh == 1
+    np.testing.assert_array_equal(scene.model.mesh_vert, again.model.mesh_vert)
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "message"),
+    [
+        ("package://robots_of_mine/leg.xml", FileNotFoundError, "package 'robots_of_mine' has no file 'leg.xml'"),
+        ("package://no_such_package/a.xml", FileNotFoundError, "'no_such_package', which is not installed"),
+        ("package://robots_of_mine", ValueError, "must be package://NAME/PATH"),
+    ],
+)
+def test_what_a_package_has_not_got(package, source, error, message):
+    with pytest.raises(error, match=message):
+        load_scene(source)
+
+
+def test_missing_visual_meshes_are_left_out(package):
+    (package / "meshes/skin.obj").write_text(CORNERS)
+    whole = load_scene(package / "arm.xml")
+    (package / "meshes/skin.obj").unlink()
+    with pytest.warns(MissingMeshWarning, match=r"1 visual meshes of .*arm.xml are missing \(skin\)"):
+        scene = load_scene(package / "arm.xml")
+    assert scene.model.nmesh == 0 and scene.model.ngeom == whole.model.ngeom - 1
+    assert scene.fingerprint() == whole.fingerprint()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert scene_from_description(scene.description()).fingerprint() == scene.fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("inertial", "visual"),
+    [
+        ("", SKIN),  # the mesh gives mass
+        (INERTIAL, SKIN.replace("contype='0'", "contype='1'")),
+        (INERTIAL, SKIN + SKIN.replace("conaffinity='0'", "conaffinity='2'")),
+    ],
+)
+def test_a_missing_mesh_that_matters_is_refused(package, inertial, visual):
+    (package / "arm.xml").write_text(MODEL.format(inertial=inertial, visual=visual))
+    with pytest.raises(SceneError, match="skin.obj"):
+        load_scene(package / "arm.xml")
