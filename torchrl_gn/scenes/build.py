@@ -20,6 +20,8 @@ _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the sta
     mujoco.mjtSensor.mjSENS_FRAMEANGVEL,
 )
 
+_LARGEST = 1e30  # static feature; networks read float32
+
 
 def build_scene(
     spec: mujoco.MjSpec,
@@ -101,17 +103,17 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
 
 
 def _refuse_non_finite(static: StaticGraph, name: str, nodes: tuple[str, ...], pairs: tuple[EdgePair, ...]) -> None:
-    """Raise for NaN and infinity (damping="nan"), which MuJoCo compiles with only a warning."""
+    """Raise for NaN, infinity (damping="nan") and numbers beyond float32, which MuJoCo compiles."""
     parts = (
         (static.nodes, static.node_names, [f"body {node!r}" for node in nodes]),
         (static.edges, static.edge_names, [f"{pair.element} {pair.name!r}" for pair in pairs for _ in range(2)]),
         (static.globals_[None], static.global_names, ["the options"]),
     )
     for values, features, owners in parts:
-        for row, column in np.argwhere(~np.isfinite(values)):
+        for row, column in np.argwhere(~(np.abs(values) < _LARGEST)):
             raise SceneError(
                 f"{features[column]} of {owners[row]} in scene {name!r} is {values[row, column]};"
-                " give finite numbers in the model."
+                f" give finite numbers below {_LARGEST:g} in the model."
             )
 
 
