@@ -48,7 +48,8 @@ def random_states() -> Callable[..., Tensor]:
 def random_actions() -> Callable[..., Tensor]:
     def draw(scene: Scene, *batch: int, seed: int = 0) -> Tensor:
         generator = torch.Generator().manual_seed(seed)
-        low, high = (torch.as_tensor(bound) for bound in (scene.action_low, scene.action_high))
+        bounds = (torch.as_tensor(bound) for bound in (scene.action_low, scene.action_high))
+        low, high = (bound.nan_to_num(neginf=-1.0, posinf=1.0) for bound in bounds)
         return low + (high - low) * torch.rand(*batch, scene.num_actions, generator=generator, dtype=torch.float64)
 
     return draw

@@ -658,14 +658,14 @@ def test_state_maths_with_too_many_registers(quick, inputs, monkeypatch):
 
 
 def zoo_cases() -> list:
-    few = ("arm", "everything", "odd", "soft", "tumbler", "parallel_hinges")
+    few = ("arm", "everything", "odd", "soft", "tumbler", "parallel_hinges", "quadrotor", "linkage")
     return [pytest.param(name, marks=[] if name in few else pytest.mark.slow) for name in ZOO]
 
 
 @pytest.mark.parametrize("name", zoo_cases())
 def test_every_scene_is_traced(make_model, random_states, random_actions, name):
     scene = zoo.load(name)
-    axes = () if scene.edge_action.ndim != 1 or scene.state_size != 13 else (JointAxes(), Contacts())
+    axes = () if scene.state_size != 13 else (JointAxes().resolved(scene), Contacts())
     for options in ({}, {"features": (BodyState(encoding="quaternion"), Controls(), *axes), "integrate": False}):
         if options and not axes:
             continue

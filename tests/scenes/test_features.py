@@ -104,14 +104,15 @@ def test_parent_relative_frames_rebuild_the_reference_pose(source):
 def test_edge_features(source):
     scene = zoo.load(source)
     np.testing.assert_array_equal(_column(scene, "edges", "direction"), [1, -1] * (scene.num_edges // 2))
-    motorized = scene.edge_action >= 0
+    edge_action = scene.edge_action.squeeze(1)
+    motorized = edge_action >= 0
     np.testing.assert_array_equal(_column(scene, "edges", "motorized"), motorized)
     np.testing.assert_array_equal(_column(scene, "edges", "jnt_type").sum(axis=1), 1)
     for kind in ("gaintype", "biastype", "dyntype"):
         np.testing.assert_array_equal(_column(scene, "edges", f"actuator_{kind}").sum(axis=1), motorized)
     bounds = _column(scene, "edges", "actuator_ctrlrange")
-    np.testing.assert_array_equal(bounds[motorized, 0], scene.action_low[scene.edge_action[motorized]])
-    np.testing.assert_array_equal(bounds[motorized, 1], scene.action_high[scene.edge_action[motorized]])
+    np.testing.assert_array_equal(bounds[motorized, 0], scene.action_low[edge_action[motorized]])
+    np.testing.assert_array_equal(bounds[motorized, 1], scene.action_high[edge_action[motorized]])
     actuator = [name.startswith("actuator_") for name in scene.static.edge_names]
     assert not scene.static.edges[~motorized][:, actuator].any()
 
@@ -132,7 +133,7 @@ def test_odd_model_has_the_expected_graph():
     assert scene.node_names == ("world", "arm", "ball", "body6")
     assert scene.parent.tolist() == [-1, 0, 1, 0]
     assert scene.senders.tolist() == [0, 1, 0, 1, 1, 2, 0, 3]
-    assert scene.edge_action.tolist() == [0, 0, -1, -1, -1, -1, -1, -1]
+    assert scene.edge_action.tolist() == [[0], [0], [-1], [-1], [-1], [-1], [-1], [-1]]
     assert {name: a.node for name, a in scene.attachments.items()} == {"shelf": 0, "late": 1}
     damping = _column(scene, "edges", "dof_damping")
     np.testing.assert_array_equal(damping[:4], [0.3, 0.3, 0, 0])

@@ -44,17 +44,8 @@ def test_loading_leaves_a_spec_as_it_was():
 @pytest.mark.parametrize(
     ("actuators", "rest", "named"),
     [
-        ('<motor name="pull" tendon="t" ctrlrange="-1 1"/>', _TENDON, ["'pull'", "tendon"]),
-        ('<motor name="jet" site="s" ctrlrange="-1 1"/>', "", ["'jet'", "site"]),
-        ('<adhesion name="glue" body="second" ctrlrange="0 1"/>', "", ["'glue'", "body"]),
-        ('<motor name="m" joint="a"/>', "", ["'m'", "ctrlrange"]),
-        (
-            '<motor name="m" joint="a" ctrlrange="-1 1"/><velocity name="v" joint="a" ctrlrange="-1 1"/>',
-            "",
-            ["'m'", "'v'", "'a'"],
-        ),
         ('<intvelocity name="i" joint="a" ctrlrange="-1 1" actrange="-1 1"/>', "", ["'i'", "activation"]),
-        ('<motor joint="a" ctrlrange="-1 1"/><motor tendon="t" ctrlrange="-1 1"/>', _TENDON, ["'actuator1'"]),
+        ('<motor joint="a"/><general tendon="t" dyntype="filter" dynprm="1"/>', _TENDON, ["'actuator1'"]),
         pytest.param(
             '<motor name="late" joint="a" ctrlrange="-1 1" delay=".01" nsample="9"/>',
             "",
@@ -77,15 +68,6 @@ def test_other_suite_domains_work(domain):
     assert scene.num_edges == 2 * scene.model.njnt
     assert scene.num_actions == scene.model.nu > 0
     assert scene.timestep == scene.model.opt.timestep
-
-
-@pytest.mark.parametrize(
-    ("domain", "element"),
-    [("quadruped", "yaw_front_left"), ("fish", "fins_flap"), ("point_mass", "t1"), ("manipulator", "grasp")],
-)
-def test_other_suite_domains_are_refused_by_name(domain, element):
-    with pytest.raises(UnsupportedSceneError, match=element):
-        load_scene(model_file(f"suite/{domain}.xml"))
 
 
 def test_humanoid_has_one_edge_type_for_its_free_joint():

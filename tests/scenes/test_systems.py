@@ -48,7 +48,7 @@ def test_every_joint_is_a_pair_of_opposite_edges(name):
     np.testing.assert_array_equal(scene.receivers[down], scene.senders[up])
     np.testing.assert_array_equal(scene.senders[down], scene.parent[scene.receivers[down]])
     np.testing.assert_array_equal(scene.edge_action[down], scene.edge_action[up])
-    used = scene.edge_action[down]
+    used = scene.edge_action[down].squeeze(1)
     assert sorted(used[used >= 0]) == list(range(scene.num_actions))
     for action, joint in ((a, j) for j, a in enumerate(used) if a >= 0):
         assert scene.model.actuator_trnid[action, 0] == joint

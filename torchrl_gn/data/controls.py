@@ -19,6 +19,7 @@ def spline_controls(
 
     Cubic splines through knots that are uniform within each action's bounds, from a random phase on, clipped to the
     bounds. ``knot_interval`` is in control steps; the paper does not give it. ``rng`` is a generator or a seed.
+    SceneError if an action has no bounds.
     """
     if num < 0 or steps < 0:
         raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")
@@ -26,6 +27,7 @@ def spline_controls(
     rng = np.random.default_rng(rng)
     if num == 0 or steps == 0 or scene.num_actions == 0:
         return np.zeros((num, steps, scene.num_actions))
+    scene.require_bounds()
 
     from scipy.interpolate import CubicSpline  # here, as importing it takes a second
 

@@ -19,6 +19,14 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
 
 _OBJECT, _GEOM, _WRAP, _JOINT = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtWrap, mujoco.mjtJoint
+_TRANSMISSION = mujoco.mjtTrn
+
+_TARGETS = {
+    _TRANSMISSION.mjTRN_TENDON: _OBJECT.mjOBJ_TENDON,
+    _TRANSMISSION.mjTRN_SITE: _OBJECT.mjOBJ_SITE,
+    _TRANSMISSION.mjTRN_SLIDERCRANK: _OBJECT.mjOBJ_SITE,
+    _TRANSMISSION.mjTRN_BODY: _OBJECT.mjOBJ_BODY,
+}
 
 _OPTIONS = (
     *("timestep", "gravity", "wind", "density", "viscosity", "impratio"),
@@ -29,7 +37,7 @@ _OVERRIDES = ("o_margin", "o_solref", "o_solimp", "o_friction")
 _REPORTING_FLAGS = {"mjDSBL_SENSOR", "mjENBL_ENERGY", "mjENBL_FWDINV"}  # no effect on motion
 _JOINTS = ("stiffness", "stiffnesspoly", "margin", "solref", "solimp", "actgravcomp")
 _DOFS = ("damping", "dampingpoly", "armature", "frictionloss", "solref", "solimp")
-_ACTUATORS = ("gear", "gainprm", "biasprm", "ctrlrange", "armature", "damping", "dampingpoly")
+_ACTUATORS = ("gear", "gainprm", "biasprm", "ctrlrange", "armature", "damping", "dampingpoly", "cranklength")
 _CONTACTS = ("friction", "solref", "solimp", "solmix", "margin", "gap", "condim", "priority", "contype", "conaffinity")
 _GEOMS = (*_CONTACTS, "adhesion", "surfacevel", "fluid")
 _PAIRS = ("friction", "solref", "solreffriction", "solimp", "margin", "gap", "dim", "adhesion")
@@ -120,8 +128,12 @@ def _actuators(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
         types = [kind(getattr(model, f"actuator_{name}")[motor]).name for name, kind in kinds]
         group = int(model.actuator_group[motor])
         off = group >= 0 and model.opt.disableactuator >> group & 1
-        joint = names.joints[int(model.actuator_trnid[motor, 0])]
-        yield " ".join([of, joint, *types, *["off"] * bool(off)])
+        kind, ends = _TRANSMISSION(model.actuator_trntype[motor]), model.actuator_trnid[motor].tolist()
+        joints = (_TRANSMISSION.mjTRN_JOINT, _TRANSMISSION.mjTRN_JOINTINPARENT)
+        joint = [names.joints[ends[0]]] if kind in joints else []
+        yield " ".join([of, *joint, *types, *["off"] * bool(off)])
+        for at in ends if not joint else ():
+            yield from names.element(_TARGETS.get(kind), at)
         yield from _arrays(of, model, "actuator", motor, _ACTUATORS)
         yield from _limits(of, model, "actuator", motor, ("forcerange", "forcelimited"))
 

@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_gn.scenes.topology import Topology
 
 _TOLERANCE = 1e-9
-_Disable = mujoco.mjtDisableBit
+_Disable, _Trn = mujoco.mjtDisableBit, mujoco.mjtTrn
 
 
 def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> np.ndarray:
@@ -73,7 +73,7 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
     if model.jnt_limited[joint] or any(np.any(table[joint]) for table in stiffness if table is not None):
         return True
     gains, biases = mujoco.mjtGain, mujoco.mjtBias
-    for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
+    for actuator in actuators_of(model, joint):
         gain = gains(model.actuator_gaintype[actuator])
         bias = biases(model.actuator_biastype[actuator])
         known = gain in (gains.mjGAIN_FIXED, gains.mjGAIN_AFFINE) and bias in (biases.mjBIAS_NONE, biases.mjBIAS_AFFINE)
@@ -109,7 +109,7 @@ def can_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
 
 
 def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -> bool:
-    """Whether an equality constraint or tendon acts on the world or on one of ``joints``."""
+    """Whether an equality constraint, a tendon or a pair of sites acts on the world or on one of ``joints``."""
     constrained = not model.opt.disableflags & (_Disable.mjDSBL_EQUALITY | _Disable.mjDSBL_CONSTRAINT)
     if constrained and any(_equality_acts(model, graph, equality, joints) for equality in range(model.neq)):
         return True
@@ -124,7 +124,15 @@ def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -
                 return True
             case wrap.mjWRAP_SPHERE | wrap.mjWRAP_CYLINDER if fixed_geom[element]:
                 return True
-    return False
+    between_sites = np.isin(model.actuator_trntype, [int(kind) for kind in (_Trn.mjTRN_SITE, _Trn.mjTRN_SLIDERCRANK)])
+    ends = model.actuator_trnid[between_sites]
+    return bool(fixed_site[ends[ends[:, 1] >= 0]].any())
+
+
+def actuators_of(model: mujoco.MjModel, joint: int) -> np.ndarray:
+    """Ids of the actuators that act on a joint, other than through tendons."""
+    direct = np.isin(model.actuator_trntype, [int(kind) for kind in (_Trn.mjTRN_JOINT, _Trn.mjTRN_JOINTINPARENT)])
+    return np.flatnonzero(direct & (model.actuator_trnid[:, 0] == joint))
 
 
 def _equality_acts(model: mujoco.MjModel, graph: Topology, equality: int, joints: set[int]) -> bool:
@@ -198,7 +206,7 @@ def _isotropic(model: mujoco.MjModel, slides: list[int], rest: np.ndarray, acros
     directions = np.array([(rest @ model.jnt_axis[slide])[across] for slide in slides])
     if directions.shape != (2, 2) or np.abs(directions @ directions.T - np.eye(2)).max() > _TOLERANCE:
         return False
-    if np.isin(model.actuator_trnid[:, 0], slides).any():
+    if any(len(actuators_of(model, slide)) for slide in slides):
         return False
     dofs = model.jnt_dofadr[slides]
     names = ("dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss")

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from torchrl_gn.scenes.build import build_scene
+from torchrl_gn.scenes.control_bounds import ActionBounds, plain_bounds
 from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
@@ -28,6 +29,7 @@ def load_scene(
     timestep: float | None = None,
     name: str | None = None,
     parameters: Mapping[str, float] | None = None,
+    action_bounds: ActionBounds | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -40,17 +42,22 @@ def load_scene(
         name: name of the scene; default: that of the system, file or model.
         parameters: parameters of a variant (:func:`~torchrl_gn.scenes.parameter_ranges`), also beyond their ranges; the
             others are the standard system's.
+        action_bounds: of an MJCF model, ``{actuator: (low, high)}``, or one pair for all that have no bounds of their
+            own (``ctrlrange``, a motor's ``forcerange``, the range of a position servo's joint).
 
     Raises:
         ValueError: if the name or a parameter is unknown; FileNotFoundError if the file does not exist.
         SceneError: if the MJCF is invalid or ``timestep`` does not fit.
         UnsupportedSceneError: if the graph cannot represent an element, which the message names.
     """
+    is_system = isinstance(source, str) and not _is_mjcf(source) and find_system(source) is not None
+    if action_bounds is not None and (is_system or parameters is not None):
+        raise ValueError(f"{source!r} has bounds of its own; action_bounds go with MJCF models.")
     if parameters is not None:
         return make_variant(source, parameters, timestep=timestep, name=name)
     if isinstance(source, mujoco.MjSpec):
         spec: Any = source
-        return build_scene(spec, name=name or spec.modelname, timestep=timestep)
+        return build_scene(spec, name=name or spec.modelname, timestep=timestep, action_bounds=action_bounds)
     if isinstance(source, mujoco.MjModel):
         raise TypeError("load_scene needs MJCF, not a compiled MjModel; give its file, text or MjSpec.")
     if not isinstance(source, (str, os.PathLike)):
@@ -65,7 +72,9 @@ def load_scene(
             raise ValueError(_unknown(source))
     spec, origin = _read_mjcf(source if isinstance(source, str) else Path(source))
     own_name = spec.modelname if isinstance(source, str) and _is_mjcf(source) else Path(source).stem
-    return build_scene(spec, name=name or own_name, timestep=timestep, origin=origin)
+    if action_bounds is not None:
+        origin["action_bounds"] = plain_bounds(action_bounds)
+    return build_scene(spec, name=name or own_name, timestep=timestep, action_bounds=action_bounds, origin=origin)
 
 
 def scene_from_description(description: dict) -> Scene:
@@ -80,13 +89,14 @@ def scene_from_description(description: dict) -> Scene:
     if system and "parameters" in description:
         scene = make_variant(system.name, description["parameters"], timestep=timestep, name=name)
     else:
-        keys = ("system",) if system else ("mjcf", "assets")
+        keys = ("system", "mjcf", "assets", "action_bounds")
         scene = build_scene(
             system.build() if system else _rebuild_mjcf(description),
             name=name,
             timestep=timestep,
             settle_steps=description["settle_steps"],
-            origin={key: description[key] for key in keys},
+            action_bounds=description.get("action_bounds"),
+            origin={key: description[key] for key in keys if key in description},
         )
     if scene.fingerprint() != description["fingerprint"]:
         warnings.warn(

@@ -84,13 +84,14 @@ def topology(scene: Scene) -> dict[str, object]:
 
 
 def joint_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Node ``[J]`` that each joint's axis is fixed to, and the unit axis ``[J, 3]`` in its frame.
+    """Node ``[E / 2]`` that the axis of each pair's joint is fixed to, and the unit axis ``[E / 2, 3]`` in its frame.
 
     The node is the parent if no rotation precedes the joint on its body, else the child (approximate for the middle one
-    of three hinges). Axes of balls and free joints are 0.
+    of three hinges). Axes of balls, free joints and pairs without joint are 0.
     """
     model, kind = scene.model, mujoco.mjtJoint
-    nodes, axes = scene.receivers[::2].copy(), np.zeros((model.njnt, 3))
+    nodes = scene.receivers[::2].copy()
+    axes = np.zeros((len(nodes), 3))
     rotated: set[int] = set()
     for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])

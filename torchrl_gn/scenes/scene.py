@@ -12,7 +12,7 @@ import numpy as np
 from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.fingerprint import physics
 from torchrl_gn.scenes.invariance import YawFrame
-from torchrl_gn.scenes.topology import JointAnchors
+from torchrl_gn.scenes.topology import EdgePair, JointAnchors, named
 
 
 class SceneError(ValueError):
@@ -53,26 +53,28 @@ class Scene:
     """One physical system as a graph, read from a MuJoCo model.
 
     A node is a group of bodies welded together, its state the frame of the group's root body. Node 0 is the world.
-    Every joint gives two directed edges, parent to child, then child to parent.
+    Every joint gives two directed edges, parent to child, then child to parent; more pairs follow for actuators and
+    equality constraints between other nodes.
     """
 
     name: str
     model: mujoco.MjModel  # its last sensors are the frame sensors of the nodes; warm starts are off
     node_names: tuple[str, ...]  # "world" first
-    joint_names: tuple[str, ...]  # in edge order, E / 2
+    joint_names: tuple[str, ...]  # [J] in the order of the edges
     actuator_names: tuple[str, ...]  # in the order of mjData.ctrl
     body: np.ndarray  # [N] MuJoCo id of each node's root body
     parent: np.ndarray  # [N] parent node; the world's is -1
+    pairs: tuple[EdgePair, ...]  # [E / 2] of edges 2 i and 2 i + 1; the joints' come first
     senders: np.ndarray  # [E]
     receivers: np.ndarray  # [E]
-    edge_action: np.ndarray  # [E] action at the edge's joint, -1 without motor
+    edge_action: np.ndarray  # [E, C] actions at each edge, -1 where fewer than C, the most (or 1)
     static: StaticGraph
     movable: np.ndarray  # [N, 12] bool: position 3, rotation 3, linear velocity 3, angular velocity 3; world frame
     translation_invariant: np.ndarray  # [3] bool, world axes along which the dynamics do not depend on position
     yaw_frame: YawFrame | None  # if the dynamics do not depend on the yaw
     joint_anchors: JointAnchors
     contact_points: ContactPoints | None
-    action_low: np.ndarray  # [A]
+    action_low: np.ndarray  # [A] -inf where unbounded
     action_high: np.ndarray  # [A]
     substeps: int  # physics steps in one control step
     attachments: dict[str, Attachment] = field(default_factory=dict)  # named bodies that are not the root of a node
@@ -116,6 +118,20 @@ class Scene:
         """``[N]`` bool, nodes with a movable component."""
         return np.any(self.movable, axis=1)
 
+    @property
+    def unbounded(self) -> tuple[str, ...]:
+        """Names of actuators whose actions have no bounds."""
+        bounded = np.isfinite(self.action_low) & np.isfinite(self.action_high)
+        return tuple(name for name, known in zip(self.actuator_names, bounded, strict=True) if not known)
+
+    def require_bounds(self) -> None:
+        """SceneError, which names them, if some actions have no bounds to draw from."""
+        if self.unbounded:
+            raise SceneError(
+                f"Actuators {list(self.unbounded)} of scene {self.name!r} have no bounds to draw actions from."
+                " Give them a ctrlrange, or load the scene with action_bounds={name: (low, high)}."
+            )
+
     def description(self) -> dict:
         """JSON-able values that rebuild the scene; SceneError if it is of an ``MjSpec``, whose XML rounds numbers."""
         if not self.origin:
@@ -151,14 +167,31 @@ class Scene:
             rows.append((name, parent, f"{mass[node]:.4g}", *free, ", ".join(welded) or "-"))
         lines += _table(rows)
         rows = [("joint", "type", "between", "action", "bounds")]
-        for joint, name in enumerate(self.joint_names):
-            kind = mujoco.mjtJoint(self.model.jnt_type[joint]).name.removeprefix("mjJNT_").lower()
-            parent, child = (self.node_names[ends[2 * joint]] for ends in (self.senders, self.receivers))
-            action = int(self.edge_action[2 * joint])
-            motor = "-" if action < 0 else f"{action}: {self.actuator_names[action]}"
-            bounds = "-" if action < 0 else f"[{self.action_low[action]:.4g}, {self.action_high[action]:.4g}]"
-            rows.append((name, kind, f"{parent} - {child}", motor, bounds))
-        return "\n".join(lines + _table(rows))
+        for pair, slots in zip(self.pairs, self.edge_action[::2].tolist(), strict=True):
+            actions = [action for action in slots if action >= 0]
+            motors = ", ".join(f"{action}: {self.actuator_names[action]}" for action in actions)
+            bounds = ", ".join(f"[{self.action_low[a]:.4g}, {self.action_high[a]:.4g}]" for a in actions)
+            between = f"{self.node_names[pair.first]} - {self.node_names[pair.second]}"
+            rows.append((pair.name, pair.kind, between, motors or "-", bounds or "-"))
+        return "\n".join([*lines, *_table(rows), *self._notes()])
+
+    def _notes(self) -> list[str]:
+        """What the edges do not show."""
+        model, kind = self.model, mujoco.mjtObj
+        idle = [name for action, name in enumerate(self.actuator_names) if action not in self.edge_action]
+        driven = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]
+        tendons = [named(model, kind.mjOBJ_TENDON, tendon) for tendon in range(model.ntendon) if tendon not in driven]
+        shown = {pair.name for pair in self.pairs if pair.element == "constraint"}
+        equalities = [named(model, kind.mjOBJ_EQUALITY, one) for one in np.flatnonzero(model.eq_active0)]
+        mocap = [named(model, kind.mjOBJ_BODY, body) for body in np.flatnonzero(model.body_mocapid >= 0)]
+        notes = {
+            "no bounds": self.unbounded,
+            "actuators that move nothing": idle,
+            "passive tendons, without edges": tendons,
+            "constraints without edges": [name for name in equalities if name not in shown],
+            "mocap bodies, fixed at the pose of the model": mocap,
+        }
+        return [f"  {what}: {', '.join(names)}" for what, names in notes.items() if names]
 
 
 def _axes(flags: np.ndarray, none: str = "-") -> str:

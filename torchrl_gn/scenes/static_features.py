@@ -8,6 +8,10 @@ Every scene has the same columns. Paper: differences from its list are
 * a node's mass, inertia, ipos and iquat are composites of its bodies, in the root body's frame; pos and quat are
   relative to the parent node's root;
 * one-hot types and option bits are named after the enumerations of the installed MuJoCo.
+
+Scenes with more than motors at joints have further columns: those of actuators again for the second and further
+control slots of an edge, named ``name/1``, ``name/2``, ...; ``actuator_trntype`` of every slot if some actuator acts
+through other than a joint; and ``eq_...`` if a constraint has edges. Edges without joint have zeros for its columns.
 """
 
 from __future__ import annotations
@@ -19,27 +23,29 @@ import numpy as np
 
 from torchrl_gn.scenes.scene import StaticGraph
 from torchrl_gn.scenes.topology import Topology, offset
+from torchrl_gn.scenes.transmissions import Transmissions, anchors
 
 Columns = list[tuple[str, np.ndarray]]
 
 
-def static_graph(model: mujoco.MjModel, graph: Topology, actuator_of_joint: np.ndarray, timestep: float) -> StaticGraph:
-    """Static features; ``actuator_of_joint`` ``[J]`` is -1 without motor, ``timestep`` the control step in seconds."""
+def static_graph(model: mujoco.MjModel, graph: Topology, acting: Transmissions, timestep: float) -> StaticGraph:
+    """Static features; ``timestep`` is the control step in seconds."""
     nodes, node_names = _join(_node_columns(model, graph), len(graph.body))
-    joints, joint_names = _join(_joint_columns(model, actuator_of_joint), model.njnt)
+    pairs, pair_names = _join(_pair_columns(model, graph, acting), len(acting.pairs))
     globals_, global_names = _join(_global_columns(model, timestep), 1)
-    direction = np.tile([1.0, -1.0], model.njnt)
-    edges = np.concatenate([direction[:, None], np.repeat(joints, 2, axis=0)], axis=1)
-    return StaticGraph(nodes, edges, globals_[0], node_names, ("direction", *joint_names), global_names)
+    direction = np.tile([1.0, -1.0], len(pairs))
+    edges = np.concatenate([direction[:, None], np.repeat(pairs, 2, axis=0)], axis=1)
+    return StaticGraph(nodes, edges, globals_[0], node_names, ("direction", *pair_names), global_names)
 
 
 def _join(columns: Columns, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Concatenate ``[rows]`` and ``[rows, k]`` columns; the latter are named ``name[i]``."""
+    """Concatenate ``[rows]`` and ``[rows, k]`` columns; the latter are named ``name[i]``, or ``name[i]/slot``."""
     arrays, names = [], []
     for name, values in columns:
         values = np.asarray(values, dtype=np.float64)
         arrays.append(values.reshape(rows, -1))
-        names += [name] if values.ndim < 2 else [f"{name}[{i}]" for i in range(values.shape[1])]
+        base, slash, slot = name.partition("/")
+        names += [name] if values.ndim < 2 else [f"{base}[{i}]{slash}{slot}" for i in range(values.shape[1])]
     return np.concatenate(arrays, axis=1), tuple(names)
 
 
@@ -49,7 +55,7 @@ def _members(enum: type, prefix: str) -> list[tuple[str, int]]:
 
 def is_member(name: str) -> bool:
     """Whether a feature is one type of several or one flag, such as ``"actuator_biastype[SO3]"``."""
-    return re.fullmatch(r"(\w+type|enableflags|disableflags)\[[A-Z]\w*\]", name) is not None
+    return re.fullmatch(r"(\w+type|enableflags|disableflags)\[[A-Z]\w*\](/\d+)?", name) is not None
 
 
 def _one_hot(name: str, values: np.ndarray, enum: type, prefix: str) -> Columns:
@@ -116,21 +122,49 @@ def _composite(
     return mass, inertia, center, iquat
 
 
-def _joint_columns(model: mujoco.MjModel, actuator_of_joint: np.ndarray) -> Columns:
-    motorized = actuator_of_joint >= 0
-    dof = model.jnt_dofadr
+def _pair_columns(model: mujoco.MjModel, graph: Topology, acting: Transmissions) -> Columns:
+    motorized = acting.action >= 0
+    dof, count = model.jnt_dofadr, len(acting.pairs)
     vectors = ("axis", "pos", "solimp", "solref", "stiffness", "limited", "range", "margin")
-    columns: Columns = [
-        ("motorized", motorized.astype(float)),
+    joints: Columns = [
         *_one_hot("jnt_type", model.jnt_type, mujoco.mjtJoint, "mjJNT_"),
         *[(f"jnt_{name}", getattr(model, f"jnt_{name}")) for name in vectors],
         *[(f"dof_{name}", getattr(model, f"dof_{name}")[dof]) for name in ("damping", "armature", "frictionloss")],
     ]
-    for name, values in _actuator_columns(model):
-        per_joint = np.zeros((model.njnt, *values.shape[1:]))
-        per_joint[motorized] = values[actuator_of_joint[motorized]]
-        columns.append((name, per_joint))
-    return columns
+    is_joint = np.arange(count) < model.njnt
+    columns: Columns = [(name, _placed(values, is_joint)) for name, values in joints]
+    actuators = _actuator_columns(model)
+    for slot, (acts, actuator) in enumerate(zip(motorized.T, acting.action.T, strict=True)):
+        own: Columns = [("motorized", acts.astype(float))]
+        for name, values in actuators:
+            exerted = acting.gear[acts, slot] if name == "actuator_gear" else values[actuator[acts]]
+            own.append((name, _placed(exerted, acts)))
+        suffixed = [(f"{name}/{slot}", values) for name, values in own]
+        columns = [own[0], *columns, *own[1:]] if slot == 0 else [*columns, *suffixed]
+    return columns + _constraint_columns(model, graph, acting.equality)
+
+
+def _placed(values: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Rows of ``values`` at the pairs ``where`` ``[P]``, bool; zeros elsewhere."""
+    placed = np.zeros((len(where), *values.shape[1:]))
+    placed[where] = values
+    return placed
+
+
+def _constraint_columns(model: mujoco.MjModel, graph: Topology, equality: np.ndarray) -> Columns:
+    constrained, which = equality >= 0, equality[equality >= 0]
+    if not len(which):
+        return []
+    ends = [
+        [point for _, point in sorted(anchors(model, graph, one), key=lambda end: end[0])] for one in which.tolist()
+    ]
+    first, second = np.array(ends).transpose(1, 0, 2)
+    columns: Columns = [
+        *_one_hot("eq_type", model.eq_type[which], mujoco.mjtEq, "mjEQ_"),
+        *[("eq_first_anchor", first), ("eq_second_anchor", second)],
+        *[("eq_solref", model.eq_solref[which]), ("eq_solimp", model.eq_solimp[which])],
+    ]
+    return [(name, _placed(values, constrained)) for name, values in columns]
 
 
 def _actuator_columns(model: mujoco.MjModel) -> Columns:
@@ -138,9 +172,12 @@ def _actuator_columns(model: mujoco.MjModel) -> Columns:
         *("biasprm", "cranklength", "ctrllimited", "ctrlrange", "dynprm", "forcelimited", "forcerange"),
         *("gainprm", "gear", "acc0", "length0", "lengthrange"),
     )
+    joint = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
+    others = not np.isin(model.actuator_trntype, list(map(int, joint))).all()
     return [
         *_one_hot("actuator_biastype", model.actuator_biastype, mujoco.mjtBias, "mjBIAS_"),
         *_one_hot("actuator_dyntype", model.actuator_dyntype, mujoco.mjtDyn, "mjDYN_"),
         *_one_hot("actuator_gaintype", model.actuator_gaintype, mujoco.mjtGain, "mjGAIN_"),
         *[(f"actuator_{name}", getattr(model, f"actuator_{name}")) for name in vectors],
+        *(_one_hot("actuator_trntype", model.actuator_trntype, mujoco.mjtTrn, "mjTRN_") if others else ()),
     ]

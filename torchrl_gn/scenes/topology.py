@@ -9,25 +9,48 @@ import numpy as np
 
 
 @dataclass(frozen=True)
+class EdgePair:
+    """Two directed edges between nodes, of a joint, an actuator or an equality constraint."""
+
+    name: str  # of the joint, actuator or constraint
+    kind: str  # "hinge", "slide", "ball", "free"; "tendon", "site", "slidercrank", "body"; "connect", "weld"
+    first: int  # node; a joint's parent
+    second: int  # node; a joint's child
+
+    @property
+    def element(self) -> str:
+        """What the pair belongs to: a joint, an actuator or a constraint."""
+        others = {"tendon": "actuator", "site": "actuator", "slidercrank": "actuator", "body": "actuator"}
+        return {**others, "connect": "constraint", "weld": "constraint"}.get(self.kind, "joint")
+
+
+@dataclass(frozen=True)
 class Topology:
     """Graph structure of a model, without any parameter."""
 
     body: np.ndarray  # [N] root body of each node, ascending, world first
     node_of_body: np.ndarray  # [nbody] node of each body
     parent: np.ndarray  # [N] parent node, -1 for the world
-    senders: np.ndarray  # [E] edges 2 j and 2 j + 1 are joint j's: parent to child, then child to parent
-    receivers: np.ndarray  # [E]
+    pairs: tuple[EdgePair, ...]  # of the joints
 
 
 def topology(model: mujoco.MjModel) -> Topology:
     """Graph structure of a compiled model; bodies fixed to the world, mocap bodies too, belong to node 0."""
-    body = np.unique(model.body_weldid).astype(np.int64)
-    node_of_body = np.searchsorted(body, model.body_weldid)
+    weld = np.where(model.body_mocapid[model.body_weldid] >= 0, 0, model.body_weldid)
+    body = np.unique(weld).astype(np.int64)
+    node_of_body = np.searchsorted(body, weld)
     parent = node_of_body[model.body_parentid[body]]
     parent[0] = -1
-    child_of_joint = node_of_body[model.jnt_bodyid]
-    pairs = np.stack([parent[child_of_joint], child_of_joint], axis=1)  # [J, 2] parent, child
-    return Topology(body, node_of_body, parent, pairs.flatten(), pairs[:, ::-1].flatten())
+    pairs = []
+    for joint, child in enumerate(node_of_body[model.jnt_bodyid].tolist()):
+        kind = mujoco.mjtJoint(model.jnt_type[joint]).name.removeprefix("mjJNT_").lower()
+        pairs.append(EdgePair(named(model, mujoco.mjtObj.mjOBJ_JOINT, joint), kind, int(parent[child]), child))
+    return Topology(body, node_of_body, parent, tuple(pairs))
+
+
+def named(model: mujoco.MjModel, kind: mujoco.mjtObj, element: int) -> str:
+    """Name of an element, or one made of its kind and number."""
+    return mujoco.mj_id2name(model, kind, int(element)) or f"{kind.name.removeprefix('mjOBJ_').lower()}{element}"
 
 
 def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The controls as features of their joints' edges."""
+"""The controls as features of the edges at which they act."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Controls(Feature):
-    """Controls that act at each edge's joint."""
+    """Controls that act at each edge."""
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    per_joint: int | None = None  # most controls that act at one joint; None: as in the scene
+    per_joint: int | None = None  # most controls that act at one edge; None: as in the scene
 
     def resolved(self, scene: Scene) -> Controls:
-        return self if self.per_joint is not None else replace(self, per_joint=_controls_per_joint(scene))
+        return self if self.per_joint is not None else replace(self, per_joint=controls_per_edge(scene))
 
     def size(self, layout: StateLayout) -> int:
         return 1 if self.per_joint is None else self.per_joint
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        there, here = _controls_per_joint(scene), self.size(layout)
+        there, here = controls_per_edge(scene), self.size(layout)
         if there != here:
             raise ValueError(
-                f"The model reads {here} controls at each joint, scene {scene.name!r} has {there}: build the model with"
+                f"The model reads {here} controls at each edge, scene {scene.name!r} has {there}: build the model with"
                 " ForwardModel.for_scene."
             )
         return _Bound()
@@ -46,12 +46,13 @@ class _Bound(nn.Module):
         return inputs.controls
 
 
-def _controls_per_joint(scene: Scene) -> int:
-    return 1 if scene.edge_action.ndim == 1 else int(scene.edge_action.shape[1])
+def controls_per_edge(scene: Scene) -> int:
+    """Most controls ``C`` that act at one edge of a scene, or 1."""
+    return int(scene.edge_action.shape[1])
 
 
 class ControlInputs(Float64Buffers):
-    """Actions at the edges of the joints that they act on, for one scene."""
+    """Actions at the edges that they act on, for one scene."""
 
     action_low: Tensor
     action_high: Tensor
@@ -60,11 +61,10 @@ class ControlInputs(Float64Buffers):
     def __init__(self, scene: Scene) -> None:
         super().__init__()
         edge_action = torch.as_tensor(scene.edge_action).long()
-        edge_action = edge_action.unsqueeze(-1) if edge_action.ndim == 1 else edge_action  # [E, C]
         values = {
             "action_low": torch.as_tensor(scene.action_low),
             "action_high": torch.as_tensor(scene.action_high),
-            # A column of zeros behind the actions stands for joints without actuator.
+            # A column of zeros behind the actions stands for edges without actuator.
             "edge_action": torch.where(edge_action < 0, scene.num_actions, edge_action),
         }
         self.constants(values)

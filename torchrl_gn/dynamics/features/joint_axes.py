@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
+from torchrl_gn.dynamics.features.controls import controls_per_edge
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
@@ -20,21 +21,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class JointAxes(Feature):
-    """Each joint's axis in the canonical frame, and the control along it.
+    """Each joint's axis in the canonical frame, and every control along it.
 
     The network need not learn to rotate them. Paper: it sees the control alone.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
+    per_joint: int = 1  # most controls that act at one edge
+
+    def resolved(self, scene: Scene) -> JointAxes:
+        return replace(self, per_joint=controls_per_edge(scene))
+
     def size(self, layout: StateLayout) -> int:
-        return 6
+        return 3 + 3 * self.per_joint
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        if "orientation" not in layout.names or scene.edge_action.ndim != 1:
+        if "orientation" not in layout.names:
             raise ValueError(
-                f"JointAxes needs states with orientations and one control at each joint; scene {scene.name!r} has"
-                " others: leave the feature out."
+                f"JointAxes needs states with orientations; scene {scene.name!r} has others: leave the feature out."
+            )
+        if (there := controls_per_edge(scene)) != self.per_joint:
+            raise ValueError(
+                f"The model reads {self.per_joint} controls along each axis, scene {scene.name!r} has {there}:"
+                " build the model with ForwardModel.for_scene."
             )
         return _Bound(scene)
 
@@ -51,4 +61,5 @@ class _Bound(Float64Buffers):
         assert matrices is not None
         axis = inputs.parameters.joint_axis.to(matrices.dtype).unsqueeze(-1)
         axes = (matrices[..., self.joint_node, :, :] @ axis).squeeze(-1)
-        return torch.cat((axes, inputs.controls * axes), dim=-1)
+        along = [control * axes for control in inputs.controls.split(1, dim=-1)]
+        return torch.cat((axes, *along), dim=-1)

@@ -1,0 +1,111 @@
+"""Scenes of any MJCF: with every kind of actuator, and random ones, which load or are refused by name."""
+
+from __future__ import annotations
+
+import collections
+import re
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_gn.data import Simulator, sample_start_states, spline_controls
+from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.scenes import Scene, SceneError, load_scene
+
+from .. import zoo
+from ..random_mjcf import random_mjcf
+
+HIDDEN_8 = {"latent": 8, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Inertia matrix is too close to singular:UserWarning"),
+    pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenParameterWarning"),  # of one that moves little
+]
+SEEDS = 40
+BLOCK = 50  # of a slow test
+
+
+def simulate(scene: Scene, count: int = 4, steps: int = 5) -> tuple[Tensor, Tensor]:
+    """States ``[n, T + 1, N, 13]`` and actions ``[n, T, A]`` of those of ``count`` simulations that are stable."""
+    rng = np.random.default_rng(0)
+    low, high = np.nan_to_num(scene.action_low, neginf=-1.0), np.nan_to_num(scene.action_high, posinf=1.0)
+    actions = rng.uniform(low, high, (count, steps, scene.num_actions))
+    rollout = Simulator(scene, 1).rollout(sample_start_states(scene, count, rng), actions)
+    return rollout["state"][rollout["stable"]], torch.as_tensor(actions)[rollout["stable"]]
+
+
+def fitted_model(scene: Scene, states: Tensor, actions: Tensor, seed: int = 0) -> ForwardModel:
+    """A small model with random weights that has seen some transitions."""
+    torch.manual_seed(seed)
+    model = ForwardModel.for_scene(scene, **HIDDEN_8)
+    bound = model.bind(scene)
+    update_parameter_normalizers(bound)
+    before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
+    update_dynamic_normalizers(bound, before, actions.flatten(0, 1), after)
+    return model.requires_grad_(False)
+
+
+def difference(model: ForwardModel, scene: Scene, states: Tensor, actions: Tensor, executor: str) -> float:
+    """Norm of an executor's difference from message passing, relative to the predicted changes."""
+    expected = model.bind(scene, reference=True).delta(states[:, 0], actions[:, 0])
+    found = specialize(model.bind(scene), executor=executor).delta(states[:, 0], actions[:, 0])
+    assert expected.isfinite().all() and found.isfinite().all()
+    return float((found - expected).norm() / expected.norm().clamp(min=1e-30))
+
+
+@pytest.mark.parametrize("executor", ["eager", "native"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-5)])
+@pytest.mark.parametrize("name", ["quadrotor", "gripper", "tendon_arm", "linkage"])
+def test_every_executor_predicts_scenes_with_other_actuators(name, dtype, tolerance, executor):
+    scene = zoo.load(name)
+    states, actions = simulate(scene)
+    model = fitted_model(scene, states, actions).to(dtype)
+    assert difference(model, scene, states, actions, executor) <= tolerance
+    leaf = actions[:1, 0].clone().requires_grad_()
+    model.bind(scene).delta(states[:1, 0], leaf).square().sum().backward()
+    assert leaf.grad is not None and (leaf.grad != 0).all()  # every action reaches some node
+
+
+def check(seed: int, executor: str) -> str:
+    """Load and predict a random model; what came of it."""
+    text = random_mjcf(seed)
+    try:
+        scene = load_scene(text)
+    except SceneError as error:
+        return refusal(str(error), text)
+    assert str(scene) and load_scene(text).fingerprint() == scene.fingerprint()
+    if scene.unbounded:
+        with pytest.raises(SceneError, match="action_bounds"):
+            spline_controls(scene, 1, 2, 0)
+        assert not load_scene(text, action_bounds=(-1, 1)).unbounded
+    states, actions = simulate(scene)
+    if not len(states):
+        return "unstable"
+    assert states.isfinite().all()
+    model = fitted_model(scene, states, actions, seed).double()
+    error = difference(model, scene, states, actions, executor)
+    assert error <= 1e-10, f"seed {seed}: {executor} differs by {error}"
+    return "loaded"
+
+
+def refusal(message: str, text: str) -> str:
+    """The message without names and numbers; AssertionError if it names neither an element nor its line."""
+    names = set(re.findall(r'name="(\w+)"', text))
+    quoted = set(re.findall(r"'(\w+)'", message))
+    located = re.search(r"line \d+|'(world|(joint|body|actuator)\d+)'|has no joint", message)
+    assert quoted & names or located, message
+    return re.sub(r"'\w*'|[\d.-]+", "#", message.replace("\n", " "))
+
+
+def test_random_models_load_or_are_refused_by_name():
+    outcomes = collections.Counter(check(seed, "eager") for seed in range(SEEDS))
+    assert outcomes["loaded"] > SEEDS / 2 and len(outcomes) > 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(0, 1000, BLOCK))
+def test_more_random_models(first):
+    outcomes = collections.Counter(check(seed, "native") for seed in range(first, first + BLOCK))
+    assert outcomes["loaded"] > BLOCK / 3

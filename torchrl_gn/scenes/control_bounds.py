@@ -1,0 +1,72 @@
+"""Bounds of the controls: the model's, those that follow from forces and joints, or the user's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+ActionBounds = Mapping[str, Sequence[float]] | Sequence[float]
+"""``(low, high)`` of actuators by name, or one pair for all that have no other bounds."""
+
+
+def set_control_bounds(
+    model: mujoco.MjModel, names: Sequence[str], chosen: ActionBounds | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds ``[A]`` of the controls, infinite where there are none; sets the finite ones in the model, which clamps.
+
+    In this order: those ``chosen`` by name; ``ctrlrange``; the control at which a motor's force reaches its
+    ``forcerange``; the range of a position servo's joint; the pair ``chosen`` for all. ValueError if a name is unknown
+    or a pair is not two finite numbers in ascending order.
+    """
+    by_name = {name: _checked(pair, name) for name, pair in chosen.items()} if isinstance(chosen, Mapping) else {}
+    if unknown := [name for name in by_name if name not in names]:
+        raise ValueError(f"action_bounds name {unknown}, which are none of the actuators {list(names)}.")
+    for_all = None if chosen is None or isinstance(chosen, Mapping) else _checked(chosen, "all actuators")
+    bounds = np.tile([-np.inf, np.inf], (len(names), 1))
+    for actuator, name in enumerate(names):
+        if name not in by_name and model.actuator_ctrllimited[actuator]:
+            bounds[actuator] = model.actuator_ctrlrange[actuator]
+            continue
+        found = by_name.get(name) or _implied(model, actuator) or for_all
+        if found is not None:
+            bounds[actuator] = model.actuator_ctrlrange[actuator] = found
+            model.actuator_ctrllimited[actuator] = 1
+    return bounds[:, 0].copy(), bounds[:, 1].copy()
+
+
+def plain_bounds(chosen: ActionBounds) -> dict[str, list[float]] | list[float]:
+    """The same bounds as JSON-able values."""
+    if isinstance(chosen, Mapping):
+        return {name: list(_checked(pair, name)) for name, pair in chosen.items()}
+    return list(_checked(chosen, "all actuators"))
+
+
+def _checked(pair: Sequence[float], of: str) -> tuple[float, float]:
+    if isinstance(pair, str) or len(pair) != 2 or not -np.inf < float(pair[0]) < float(pair[1]) < np.inf:
+        raise ValueError(f"action_bounds of {of} must be two finite numbers, low then high, got {pair!r}.")
+    return float(pair[0]), float(pair[1])
+
+
+def _implied(model: mujoco.MjModel, actuator: int) -> tuple[float, float] | None:
+    """Bounds that follow from the limit of a motor's force, or of a position servo's joint."""
+    gain, bias = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator]
+    kind, joint = model.actuator_biastype[actuator], int(model.actuator_trnid[actuator, 0])
+    if model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED or gain == 0:
+        return None
+    if kind == mujoco.mjtBias.mjBIAS_NONE and model.actuator_forcelimited[actuator]:
+        ends = model.actuator_forcerange[actuator] / gain
+    elif (
+        (kind == mujoco.mjtBias.mjBIAS_AFFINE and bias[0] == 0 and bias[1] == -gain)
+        and model.actuator_trntype[actuator] in _JOINTS
+        and (model.jnt_limited[joint] and model.jnt_type[joint] in _SCALAR)
+    ):
+        ends = model.jnt_range[joint] * model.actuator_gear[actuator, 0]
+    else:
+        return None
+    low, high = sorted(map(float, ends))
+    return (low, high) if low < high else None
