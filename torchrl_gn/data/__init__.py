@@ -17,4 +17,6 @@ from torchrl_gn.data.replay import WindowSampler as WindowSampler
 from torchrl_gn.data.replay import trajectory_buffer as trajectory_buffer
 from torchrl_gn.data.simulate import Simulator as Simulator
 from torchrl_gn.data.simulate import UnstableSimulationError as UnstableSimulationError
+from torchrl_gn.data.start_poses import StartPoses as StartPoses
+from torchrl_gn.data.start_poses import StartPoseWarning as StartPoseWarning
 from torchrl_gn.data.start_states import sample_start_states as sample_start_states
