@@ -19,6 +19,7 @@ def spline_controls(
 
     Cubic splines through knots that are uniform within each action's bounds, from a random phase on, clipped to the
     bounds. ``knot_interval`` is in control steps; the paper does not give it. ``rng`` is a generator or a seed.
+    SceneError if an action has no bounds.
     """
     if num < 0 or steps < 0:
         raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")
@@ -26,6 +27,7 @@ def spline_controls(
     rng = np.random.default_rng(rng)
     if num == 0 or steps == 0 or scene.num_actions == 0:
         return np.zeros((num, steps, scene.num_actions))
+    scene.require_bounds()
 
     from scipy.interpolate import CubicSpline  # here, as importing it takes a second
 
@@ -34,11 +36,16 @@ def spline_controls(
     phase = rng.uniform(0.0, 1.0, (num, 1))  # each sequence has its own, so none calls the spline
     spline = CubicSpline(np.arange(knots), values, bc_type="natural")
     time = _MARGIN + phase + np.arange(steps) / knot_interval  # [num, T], in knots
-    segment = np.minimum(time.astype(np.int64), knots - 2)
-    x = (time - segment)[..., None]
-    cubic = spline.c[:, segment, np.arange(num)[:, None]]  # [4, num, T, A]
-    controls = ((cubic[0] * x + cubic[1]) * x + cubic[2]) * x + cubic[3]
-    return np.clip(controls, scene.action_low, scene.action_high)
+    return np.clip(evaluate_cubics(spline.c, time[..., None]), scene.action_low, scene.action_high)
+
+
+def evaluate_cubics(coefficients: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Values ``[n, T, A]`` of splines ``[4, K - 1, n, A]`` at their own times, in knots, ``[n, T, A]`` or of 1."""
+    segment = np.clip(time.astype(np.int64), 0, coefficients.shape[1] - 1)
+    x = time - segment
+    row, column = np.arange(coefficients.shape[2])[:, None, None], np.arange(coefficients.shape[3])
+    cubic = coefficients[:, segment, row, column]  # [4, n, T, A]
+    return ((cubic[0] * x + cubic[1]) * x + cubic[2]) * x + cubic[3]
 
 
 def check_knot_interval(knot_interval: float) -> None:

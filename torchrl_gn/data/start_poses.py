@@ -88,9 +88,8 @@ class StartPoses:
 
     def _load_reference(self) -> None:
         model, data = self.model, self._data
-        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, key) for key in range(model.nkey)]
-        if names:
-            mujoco.mj_resetDataKeyframe(model, data, next((names.index(n) for n in _KEYFRAMES if n in names), 0))
+        if (key := reference_keyframe(model)) is not None:
+            mujoco.mj_resetDataKeyframe(model, data, key)
         data.time, data.qvel[:] = 0.0, 0.0
         mujoco.mj_normalizeQuat(model, data.qpos)
         for joint in np.flatnonzero((model.jnt_limited != 0) & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))):
@@ -116,8 +115,8 @@ class StartPoses:
         instead = "may too" if best is depths else "are around a random pose that has less overlap"
         warnings.warn(
             f"The reference pose of scene {self.scene.name!r} has {_geom(self.model, first)} {1e3 * depth:.3g} mm deep"
-            f" in {_geom(self.model, second)}. Start states {instead}; give the model a keyframe 'home' without overlaps, or exclude"
-            " contacts that mean nothing.",
+            f" in {_geom(self.model, second)}. Start states {instead}; give the model a keyframe 'home' without"
+            " overlaps, or exclude contacts that mean nothing.",
             StartPoseWarning,
             stacklevel=2,
         )
@@ -214,6 +213,12 @@ class StartPoses:
             if -distance > self._allowed.get(pair, 0.0) + _DEPTH:
                 depths[pair] = max(depths.get(pair, 0.0), -float(distance))
         return depths
+
+
+def reference_keyframe(model: mujoco.MjModel) -> int | None:
+    """The keyframe ``home``, else ``stand``, else the first, or None if there is none."""
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, key) for key in range(model.nkey)]
+    return next((names.index(name) for name in _KEYFRAMES if name in names), 0 if names else None)
 
 
 def _bases(model: mujoco.MjModel, touching: np.ndarray) -> list[_Base]:

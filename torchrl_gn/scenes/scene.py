@@ -116,6 +116,20 @@ class Scene:
         """``[N]`` bool, nodes with a movable component."""
         return np.any(self.movable, axis=1)
 
+    @property
+    def unbounded(self) -> tuple[str, ...]:
+        """Names of actuators whose actions have no bounds."""
+        bounded = np.isfinite(self.action_low) & np.isfinite(self.action_high)
+        return tuple(name for name, known in zip(self.actuator_names, bounded, strict=True) if not known)
+
+    def require_bounds(self) -> None:
+        """SceneError, which names them, if some actions have no bounds to draw from."""
+        if self.unbounded:
+            raise SceneError(
+                f"Actuators {list(self.unbounded)} of scene {self.name!r} have no bounds to draw actions from."
+                " Give them a ctrlrange, or load the scene with action_bounds={name: (low, high)}."
+            )
+
     def description(self) -> dict:
         """JSON-able values that rebuild the scene; SceneError if it is of an ``MjSpec``, whose XML rounds numbers."""
         if not self.origin:
