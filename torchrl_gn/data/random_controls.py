@@ -14,7 +14,8 @@ from torchrl_gn.data.start_poses import reference_keyframe
 
 ActuatorKind = Literal["motor", "position", "velocity"]
 
-_SPEEDS = {mujoco.mjtJoint.mjJNT_HINGE: math.pi, mujoco.mjtJoint.mjJNT_SLIDE: 1.0}  # rad/s, m/s; of position targets
+_JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # of targets, rad/s or m/s
 _SCALES = (0.2, 1.0)  # of motors, velocity targets and the speed of position targets, by sequence
 _WIDTHS = (0.05, 1.0)  # of the interval of position targets, as a share of the bounds
 _REVERSALS = (1.0, 4.0)  # time between reversals of velocity targets, in knot intervals
@@ -135,8 +136,8 @@ def _fastest_targets(model: mujoco.MjModel) -> np.ndarray:
     fastest = np.ptp(model.actuator_ctrlrange, axis=1)
     for actuator in range(model.nu):
         joint, slope = model.actuator_trnid[actuator, 0], model.actuator_biasprm[actuator, 1]
-        by_joint = model.actuator_trntype[actuator] in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-        if slope and by_joint and (speed := _SPEEDS.get(mujoco.mjtJoint(model.jnt_type[joint]))):
+        by_joint = model.actuator_trntype[actuator] in _JOINT_TRANSMISSIONS
+        if slope and by_joint and (speed := _SPEEDS.get(int(model.jnt_type[joint]))):
             a_unit = abs(model.actuator_gear[actuator, 0] * slope / model.actuator_gainprm[actuator, 0])
             fastest[actuator] = min(fastest[actuator], speed * a_unit)
     return fastest
