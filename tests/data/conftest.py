@@ -17,7 +17,8 @@ def repelled_hinge(threshold: float, timestep: float = 1e-7) -> Scene:
             <geom size=".01" mass="1e-9"/>
           </body></worldbody>
           <actuator><motor joint="a" ctrllimited="true" ctrlrange="-1 1"/></actuator>
-        </mujoco>"""
+        </mujoco>""",
+        timestep=timestep,
     )
 
 

@@ -123,7 +123,7 @@ def test_actions_outside_the_bounds_are_clamped(pendulum: Scene) -> None:
 
 
 def test_scene_without_actuators() -> None:
-    scene = zoo.load("falling")
+    scene = zoo.load("falling", timestep=0.01)
     physics, _ = _inputs(scene, 2, 1)
     result = Simulator(scene, 1).rollout(physics, np.zeros((2, 10, 0)))
     fallen = result["state"][:, -1, 1, 2] - result["state"][:, 0, 1, 2]

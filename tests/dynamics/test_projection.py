@@ -42,7 +42,7 @@ def gaps(scene, state):
 
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_true_changes_are_linked_already(make_model, name):
-    scene = zoo.load(name)
+    scene = zoo.load(name, timestep=0.002 if name == "creature" else None)
     trajectories = collect_trajectories(scene, 2, 20)
     state, after = trajectories["state"][:, :-1], trajectories["state"][:, 1:]
     assert max(gaps(scene, state)) < 1e-12
@@ -65,7 +65,7 @@ def test_pinned_bodies_stay_together(make_model, random_actions, name):
 
 
 def test_parallel_hinges_at_one_place_share_their_turn_in_single_precision_too(make_model, random_states):
-    scene = zoo.load("parallel_hinges")
+    scene = zoo.load("parallel_hinges", timestep=0.002)
     bound = make_model(scene, fitted=False).bind(scene)
     assert isinstance(bound.projection, GeneralizedProjection)
     state = collect_trajectories(scene, 20, 5, seed=0)["state"][:, -1]

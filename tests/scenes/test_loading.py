@@ -67,7 +67,7 @@ def test_other_suite_domains_work(domain):
     assert scene.static.edge_names == load_scene("pendulum").static.edge_names
     assert scene.num_edges == 2 * scene.model.njnt
     assert scene.num_actions == scene.model.nu > 0
-    assert scene.timestep == scene.model.opt.timestep
+    assert scene.timestep == 0.02
 
 
 def test_humanoid_has_one_edge_type_for_its_free_joint():
@@ -118,6 +118,15 @@ def test_broken_file_is_named_with_mujocos_message(tmp_path):
 def test_control_step_must_be_whole_physics_steps(timestep):
     with pytest.raises(SceneError, match="whole multiple of the physics step"):
         load_scene("swimmer6", timestep=timestep)
+
+
+@pytest.mark.parametrize(
+    ("physics", "control"),
+    [(2, 20), (4, 20), (5, 20), (6, 18), (8, 16), (9, 18), (11, 22), (13, 13), (14, 14), (25, 25), (30, 30), (0.1, 20)],
+)
+def test_default_control_step_is_near_20_ms(physics, control):
+    scene = load_scene(GOOD.replace("<worldbody>", f'<option timestep="{physics / 1000}"/><worldbody>', 1))
+    assert scene.timestep == pytest.approx(control / 1000, rel=1e-12)
 
 
 def test_control_step_can_be_chosen():

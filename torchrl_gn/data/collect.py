@@ -1,15 +1,18 @@
-"""Collect trajectories under random control, in memory."""
+"""Collect trajectories under random control or a policy, in memory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
 import numpy as np
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 
-from torchrl_gn.data.controls import spline_controls
+from torchrl_gn.data.policy_rollout import Policy, policy_rollout
+from torchrl_gn.data.random_controls import random_controls
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
@@ -18,6 +21,13 @@ from torchrl_gn.scenes.scene import Scene
 CHUNK = 250  # sequences per derived seed; data depend on it, so it never changes
 _ATTEMPTS = 20
 _MAX_REJECTED = 0.1
+_BOUNDS: dict[str, Callable[[Tensor], Tensor]] = {  # of states [..., 13]
+    "lowest": lambda state: state[..., 2],
+    "highest": lambda state: state[..., 2],
+    "distance": lambda state: state[..., :3].norm(dim=-1),
+    "speed": lambda state: state[..., 7:10].norm(dim=-1),
+    "angular_speed": lambda state: state[..., 10:13].norm(dim=-1),
+}
 
 
 def collect_trajectories(
@@ -28,15 +38,26 @@ def collect_trajectories(
     *,
     split: int = 0,
     knot_interval: float = 10.0,
+    policy: Policy | None = None,
+    bounds: Mapping[str, float] | None = None,
+    redrawn: dict[str, int] | None = None,
     simulator: Simulator | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> TensorDict:
-    """Simulate a scene from :func:`~torchrl_gn.data.sample_start_states` under random control (paper, SM "Datasets").
+    """Simulate a scene from :func:`~torchrl_gn.data.sample_start_states` under random control or a policy.
+
+    Paper: SM "Datasets". Sequences that become unstable or leave the bounds are drawn again.
 
     Args:
         scene: the scene, or variants of one, which the sequences take in turn.
         split: index of an independent split; data sets use 0, 1, 2.
-        knot_interval: as of :func:`~torchrl_gn.data.spline_controls`.
+        knot_interval: as of :func:`~torchrl_gn.data.random_controls`, which acts without a policy.
+        policy: TorchRL policy, or a function of a TensorDict ``[n]`` of ``state``, ``physics``, ``is_init`` and, of
+            variants, ``variant`` that writes ``action`` ``[n, A]`` or returns it; ``n`` is at most 250. States have the
+            dtype and device of its parameters. It explores (``ExplorationType.RANDOM``) and is seeded by ``seed``.
+        bounds: of every moving body: ``lowest`` and ``highest`` position along z, ``distance`` from the world's origin
+            [m], ``speed`` [m/s], ``angular_speed`` [rad/s]. Default: none.
+        redrawn: receives the number of redrawn sequences, ``unstable`` and ``outside`` the bounds.
         simulator: simulator of the same scenes, to reuse its threads.
         progress: called with the numbers of sequences done and wanted.
 
@@ -45,18 +66,24 @@ def collect_trajectories(
         ``[num, T+1, S]``; with variants also ``parameters`` (:class:`~torchrl_gn.scenes.PhysicalParameters`).
 
     Raises:
-        UnstableSimulationError: over a tenth, and over ten, of 250 simulations are unstable; fewer are redrawn.
+        UnstableSimulationError: over a tenth, and over ten, of 250 simulations are unstable, or some leave the bounds
+            twenty times in a row.
     """
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
+    check_bounds(bounds)
     simulator = simulator or Simulator(scene)
     if simulator.scenes != ((scene,) if isinstance(scene, Scene) else tuple(scene)):
         raise ValueError(f"simulator is of another {simulator.scene.name!r} than the scene; give both the same.")
-    chunks = []
+    chunks, options = [], {"knot_interval": knot_interval, "policy": policy, "bounds": bounds}
+    redrawn = {} if redrawn is None else redrawn
+    redrawn.update(unstable=0, outside=0)
     for first in range(0, num, CHUNK):
         count = min(CHUNK, num - first)
         variant = np.arange(first, first + count) % len(simulator.scenes)
-        chunk, _ = collect_chunk(simulator, variant, steps, seed, (split, first // CHUNK), knot_interval=knot_interval)
+        chunk, rejected = collect_chunk(simulator, variant, steps, seed, (split, first // CHUNK), **options)
+        for cause, again in rejected.items():
+            redrawn[cause] += again
         if not isinstance(scene, Scene):
             chunk["parameters"] = variant_parameters(simulator.scenes, variant)
         chunks.append(chunk)
@@ -73,30 +100,65 @@ def variant_parameters(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDi
 
 
 def collect_chunk(
-    simulator: Simulator, variant: np.ndarray, steps: int, seed: int, key: tuple[int, ...], *, knot_interval: float
-) -> tuple[TensorDict, int]:
-    """Simulate sequences ``[count]`` of the scenes ``variant`` ``[count]``; returns also the number of redrawn ones."""
+    simulator: Simulator,
+    variant: np.ndarray,
+    steps: int,
+    seed: int,
+    key: tuple[int, ...],
+    *,
+    knot_interval: float,
+    policy: Policy | None = None,
+    bounds: Mapping[str, float] | None = None,
+) -> tuple[TensorDict, dict[str, int]]:
+    """Simulate sequences ``[count]`` of the scenes ``variant`` ``[count]``; returns also how many were redrawn."""
     scene, count = simulator.scene, len(variant)
-    result, rejected, pending = None, 0, torch.arange(count)
+    result, pending, rejected = None, torch.arange(count), {"unstable": 0, "outside": 0}
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*key, attempt)))
         own = variant[pending.numpy()]
         start, bad_starts = draw_start_states(simulator, own, rng)
-        action = spline_controls(scene, len(pending), steps, rng, knot_interval=knot_interval)
-        drawn = simulator.rollout(start, action, own)
-        drawn["action"] = torch.from_numpy(action)
+        if policy is None:
+            action = random_controls(simulator, start, steps, rng, knot_interval=knot_interval, variant=own)
+            drawn = simulator.rollout(start, action, own)
+            drawn["action"] = torch.from_numpy(action)
+        else:
+            drawn = policy_rollout(simulator, start, steps, policy, own, int(rng.integers(2**31)))
         stable = drawn.pop("stable")
+        inside = _inside(drawn["state"][:, :, torch.from_numpy(scene.predicted)], bounds or {})
         if result is None:
             result = drawn
         else:
             result[pending] = drawn
-        pending = pending[~stable]
-        rejected += len(pending) + bad_starts
-        if rejected > max(_MAX_REJECTED * count, 10):
-            break
+        pending = pending[~(stable & inside)]
+        rejected["unstable"] += int((~stable).sum()) + bad_starts
+        rejected["outside"] += int((stable & ~inside).sum())
+        if rejected["unstable"] > max(_MAX_REJECTED * count, 10):
+            raise UnstableSimulationError(
+                f"{rejected['unstable']} simulations of {scene.name!r} became unstable while drawing {count} sequences"
+                f" of {steps} steps. Use a smaller physics step in the model, smaller action bounds, or"
+                f" {'a larger knot_interval' if policy is None else 'another policy'}."
+            )
         if not len(pending):
             return result, rejected
     raise UnstableSimulationError(
-        f"{rejected} simulations of {scene.name!r} became unstable while drawing {count} sequences of {steps} steps. "
-        "Use a smaller physics step in the model, smaller action bounds, or a larger knot_interval."
+        f"{len(pending)} of {count} sequences of {scene.name!r} with {steps} steps left the bounds {dict(bounds or {})}"
+        f" or became unstable {_ATTEMPTS} times in a row. Use wider bounds, fewer steps or smaller actions."
     )
+
+
+def check_bounds(bounds: Mapping[str, float] | None) -> None:
+    """Raise ValueError for unknown or NaN bounds."""
+    for name, value in (bounds or {}).items():
+        if name not in _BOUNDS:
+            raise ValueError(f"bounds have no {name!r}; use some of {list(_BOUNDS)}.")
+        if math.isnan(value):
+            raise ValueError(f"bounds[{name!r}] must be a number, got {value}")
+
+
+def _inside(state: Tensor, bounds: Mapping[str, float]) -> Tensor:
+    """Whether sequences ``[n]`` of moving bodies ``[n, T+1, N, 13]`` stay within the bounds."""
+    inside = torch.ones(len(state), dtype=torch.bool)
+    for name, bound in bounds.items():
+        values = _BOUNDS[name](state).flatten(1)
+        inside &= ((values >= bound) if name == "lowest" else (values <= bound)).all(1)
+    return inside

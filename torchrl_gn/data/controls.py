@@ -36,11 +36,16 @@ def spline_controls(
     phase = rng.uniform(0.0, 1.0, (num, 1))  # each sequence has its own, so none calls the spline
     spline = CubicSpline(np.arange(knots), values, bc_type="natural")
     time = _MARGIN + phase + np.arange(steps) / knot_interval  # [num, T], in knots
-    segment = np.minimum(time.astype(np.int64), knots - 2)
-    x = (time - segment)[..., None]
-    cubic = spline.c[:, segment, np.arange(num)[:, None]]  # [4, num, T, A]
-    controls = ((cubic[0] * x + cubic[1]) * x + cubic[2]) * x + cubic[3]
-    return np.clip(controls, scene.action_low, scene.action_high)
+    return np.clip(evaluate_cubics(spline.c, time[..., None]), scene.action_low, scene.action_high)
+
+
+def evaluate_cubics(coefficients: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Values ``[n, T, A]`` of splines ``[4, K - 1, n, A]`` at their own times, in knots, ``[n, T, A]`` or of 1."""
+    segment = np.clip(time.astype(np.int64), 0, coefficients.shape[1] - 1)
+    x = time - segment
+    row, column = np.arange(coefficients.shape[2])[:, None, None], np.arange(coefficients.shape[3])
+    cubic = coefficients[:, segment, row, column]  # [4, n, T, A]
+    return ((cubic[0] * x + cubic[1]) * x + cubic[2]) * x + cubic[3]
 
 
 def check_knot_interval(knot_interval: float) -> None:

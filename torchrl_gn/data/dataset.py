@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from operator import index
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.data.collect import CHUNK, collect_chunk, variant_parameters
+from torchrl_gn.data.collect import CHUNK, check_bounds, collect_chunk, variant_parameters
 from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
 from torchrl_gn.data.simulate import Simulator
@@ -21,6 +21,8 @@ from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.physical_parameters import ParameterNames, take_columns
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters
+
+_DRAWS = 2  # version of the start states and controls of models from MJCF
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class TrajectoryDataset:
     train: TensorDict
     validation: TensorDict
     test: TensorDict
-    rejected: dict[str, int]  # unstable, redrawn simulations of each split
+    rejected: dict[str, int]  # redrawn simulations of each split
     manifest: dict = field(repr=False)  # seed, steps, package versions, checksums
     features: ParameterNames | None = field(default=None, repr=False)  # columns of ``parameters``, for binding a model
 
@@ -59,6 +61,7 @@ def create_dataset(
     *,
     variants: int | None = None,
     knot_interval: float = 10.0,
+    bounds: Mapping[str, float] | None = None,
     num_threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     map_chunks: Callable[[Callable, Iterable], Iterable] = map,
@@ -70,7 +73,7 @@ def create_dataset(
     Args:
         variants: number of random variants that the sequences of each split take in turn, no split another's.
             Default: all are of the scene itself. The paper does not give it.
-        knot_interval: as of :func:`~torchrl_gn.data.spline_controls`.
+        knot_interval, bounds: as of :func:`~torchrl_gn.data.collect_trajectories`.
         progress: called with sequences done and wanted, after every chunk.
         map_chunks: works like ``map``, such as ``imap`` of a pool or of a :class:`~torchrl_gn.training.RayCluster`.
 
@@ -86,6 +89,7 @@ def create_dataset(
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     check_knot_interval(knot_interval)
+    check_bounds(bounds)
     ranges = {} if variants is None else parameter_ranges(_system(scene))
     files = DatasetFiles(Path(path))
     request = {
@@ -99,6 +103,10 @@ def create_dataset(
         "variants": None if variants is None else index(variants),
         "parameters": {name: [one.low, one.high] for name, one in ranges.items()},
     }
+    if "system" not in scene.origin:
+        request["draws"] = _DRAWS
+    if bounds:
+        request["bounds"] = {name: float(value) for name, value in bounds.items()}
     with files.lock():
         if not files.find(request):
             features = None if variants is None else asdict(ParameterNames.of(scene))
@@ -188,12 +196,12 @@ def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple)
         # Built chunk by chunk: thousands of models at once would take gigabytes.
         distinct, variant = np.unique(parameters, axis=0, return_inverse=True)
         scenes, variant = _variants(scene, distinct), variant.reshape(-1)  # some versions of NumPy keep the axis
-    options = {name: request[name] for name in ("steps", "seed", "knot_interval")}
+    options = {name: request.get(name) for name in ("steps", "seed", "knot_interval", "bounds")}
     rows, rejected = collect_chunk(Simulator(scenes, num_threads), variant, key=key, **options)
     if parameters is not None:
         rows["parameters"] = variant_parameters(scenes, variant)
         rows["variant_parameters"] = torch.from_numpy(parameters)
-    return rows, rejected
+    return rows, sum(rejected.values())
 
 
 def _system(scene: Scene) -> str:

@@ -58,8 +58,8 @@ class DatasetFiles:
             return False
         self.read()
         there = self.manifest["request"]
-        if differing := [key for key in request if there.get(key) != request[key]]:
-            what = ", ".join(f"{key} is {there.get(key)}, not {request[key]}" for key in differing)
+        if differing := [key for key in {**request, **there} if there.get(key) != request.get(key)]:
+            what = ", ".join(f"{key} is {there.get(key)}, not {request.get(key)}" for key in differing)
             raise self.error(f"another data set is there ({what}). Use another folder, or delete this one.")
         for split in filter(self.rows_done, SPLITS):
             self.open(split, checksums=True)

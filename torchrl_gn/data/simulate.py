@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -49,6 +50,7 @@ class Simulator:
         self.memory = min(2**23 * num_threads, 2**28) if memory is None else memory
         self._pool = Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.scene.model) for _ in range(num_threads)]
+        self.start_poses: dict[int, Any] = {}  # of each variant from MJCF, once states of it were drawn
 
     def rollout(
         self, physics: Tensor | np.ndarray, actions: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None

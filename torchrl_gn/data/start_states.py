@@ -1,4 +1,4 @@
-"""Start states of simulations: the suite's reset distributions, vectorised."""
+"""Start states of simulations: the suite's reset distributions for its systems, start poses for other models."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
+from torchrl_gn.data.start_poses import StartPoses
 from torchrl_gn.scenes.scene import Scene
 
 _ATTEMPTS = 10
 
 
 def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) -> np.ndarray:
-    """Draw full MuJoCo states ``[n, S]``, float64 (``mjSTATE_FULLPHYSICS``), as the suite's resets do.
+    """Draw full MuJoCo states ``[n, S]``, float64 (``mjSTATE_FULLPHYSICS``).
+
+    Models from MJCF: :class:`~torchrl_gn.data.StartPoses`. The paper's systems as the suite's resets:
 
     - Cartpole: slider uniform in 0.1 m, hinge in 0.034 rad either side, velocities with standard deviation 0.01.
     - Cheetah: limited joints uniform in their limits.
-    - Others: limited joints uniform in their limits, unlimited hinges in [-pi, pi], rotations of balls and free joints
-      uniform; all else as in ``qpos0``, at rest.
+    - Others: limited joints uniform in their limits, unlimited hinges in [-pi, pi]; all else as in ``qpos0``, at rest.
     - JACO, not in the suite: as others, redrawn while bodies overlap (4 %), which would spin at over 100 rad/s.
 
     Then simulates ``scene.settle_steps`` physics steps without control, keeps the time, and redraws unstable states;
@@ -62,6 +64,14 @@ def _draw_apart(simulator: Simulator, variant: np.ndarray, rng: np.random.Genera
 
 
 def _draw_each(simulator: Simulator, variant: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    if "system" not in simulator.scene.origin:
+        states = np.empty((len(variant), simulator.scene.physics_size))
+        for which in np.unique(variant):
+            rows = variant == which
+            if which not in simulator.start_poses:
+                simulator.start_poses[which] = StartPoses(simulator.scenes[which])
+            states[rows] = simulator.start_poses[which].draw(int(rows.sum()), rng)
+        return states
     if len(simulator.scenes) == 1:
         return _draw(simulator.scene, len(variant), rng)
     rows = [_draw(simulator.scenes[which], 1, rng) for which in variant]
@@ -85,28 +95,16 @@ def _draw(scene: Scene, n: int, rng: np.random.Generator) -> np.ndarray:
         qpos[:, 1:] = rng.uniform(-0.034, 0.034, (n, model.nq - 1))
         qvel[:] = 0.01 * rng.standard_normal((n, model.nv))
     else:
-        _randomize_joints(model, qpos, rng, rotational=scene.origin.get("system") != "cheetah")
+        _randomize_joints(model, qpos, rng, unlimited=scene.origin.get("system") != "cheetah")
     return states
 
 
-def _randomize_joints(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Generator, *, rotational: bool) -> None:
-    """Randomise in place as the suite's ``randomize_limited_and_rotational_joints``, but with uniform rotations."""
+def _randomize_joints(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Generator, *, unlimited: bool) -> None:
+    """Randomise hinges and slides in place as the suite's ``randomize_limited_and_rotational_joints``."""
     kind, n = mujoco.mjtJoint, len(qpos)
     for joint in range(model.njnt):
-        first, low, high = model.jnt_qposadr[joint], *model.jnt_range[joint]
-        match model.jnt_type[joint], bool(model.jnt_limited[joint]):
-            case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE), True):
-                qpos[:, first] = rng.uniform(low, high, n)
-            case kind.mjJNT_BALL, True:
-                axis, half = _unit(rng.standard_normal((n, 3))), 0.5 * rng.uniform(0.0, high, (n, 1))
-                qpos[:, first : first + 4] = np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
-            case kind.mjJNT_HINGE, False if rotational:
-                qpos[:, first] = rng.uniform(-np.pi, np.pi, n)
-            case kind.mjJNT_BALL, False if rotational:
-                qpos[:, first : first + 4] = _unit(rng.standard_normal((n, 4)))
-            case kind.mjJNT_FREE, _ if rotational:
-                qpos[:, first + 3 : first + 7] = _unit(rng.standard_normal((n, 4)))
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        first = model.jnt_qposadr[joint]
+        if model.jnt_limited[joint]:
+            qpos[:, first] = rng.uniform(*model.jnt_range[joint], n)
+        elif unlimited and model.jnt_type[joint] == kind.mjJNT_HINGE:
+            qpos[:, first] = rng.uniform(-np.pi, np.pi, n)

@@ -19,6 +19,7 @@ _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the sta
     mujoco.mjtSensor.mjSENS_FRAMELINVEL,
     mujoco.mjtSensor.mjSENS_FRAMEANGVEL,
 )
+_CONTROL_STEP, _LONGEST_CONTROL_STEP = 0.02, 0.025  # seconds, by default
 
 _LARGEST = 1e30  # static feature; networks read float32
 
@@ -36,7 +37,7 @@ def build_scene(
 
     Works on a copy of the model: adds the frame sensors of every node last, names their unnamed bodies, switches
     sensors on, and warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone.
-    Without ``timestep`` [s] a control step is one physics step. Raises as :func:`~torchrl_gn.scenes.load_scene`.
+    Default ``timestep`` [s] and errors as of :func:`~torchrl_gn.scenes.load_scene`.
     """
     model, graph = _compile(spec, name)
     transmissions = find_transmissions(model, graph)
@@ -120,7 +121,8 @@ def _refuse_non_finite(static: StaticGraph, name: str, nodes: tuple[str, ...], p
 def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
     physics = model.opt.timestep
     if timestep is None:
-        return 1
+        nearest = max(1, round(_CONTROL_STEP / physics))
+        return nearest - 1 if nearest > 1 and nearest * physics > _LONGEST_CONTROL_STEP * (1 + 1e-9) else nearest
     substeps = round(timestep / physics) if np.isfinite(timestep) else 0
     if substeps < 1 or abs(substeps * physics - timestep) > 1e-6 * physics:
         raise SceneError(

@@ -37,8 +37,8 @@ def load_scene(
         source: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"swimmerN"`` with N of at least
             3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), the path of an MJCF file, ``"package://NAME/PATH"`` of one in
             an installed Python package, MJCF text, or an ``MjSpec``. Visual meshes may be missing, which warns.
-        timestep: control step, seconds, a multiple of the physics step; default: the paper's for its systems, one
-            physics step for other models.
+        timestep: control step, seconds, a multiple of the physics step; default: the paper's for its systems, the
+            multiple nearest to 20 ms and at most 25 ms for other models (one physics step if that is longer).
         name: name of the scene; default: that of the system, file or model.
         parameters: parameters of a variant (:func:`~torchrl_gn.scenes.parameter_ranges`), also beyond their ranges; the
             others are the standard system's.

@@ -1,0 +1,150 @@
+"""Start states of models from MJCF: keyframes, joint limits, contacts, the ground, equality constraints."""
+
+from __future__ import annotations
+
+import warnings
+
+import mujoco
+import numpy as np
+import pytest
+
+from torchrl_gn.data import StartPoseWarning, sample_start_states
+from torchrl_gn.scenes import Scene, load_scene
+
+ROBOT = """
+<mujoco model="robot">
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <geom name="table" type="box" size=".3 .3 .2" pos="1 0 .2"/>
+    <body name="cup" pos="1 0 .45"><freejoint/><geom name="cup" type="cylinder" size=".04 .05"/></body>
+    <body name="base" pos="0 0 .6"><freejoint/><geom type="box" size=".15 .1 .05"/>
+      <body name="thigh" pos=".1 0 0">
+        <joint name="hip" axis="0 1 0" range="-100 100"/><geom type="capsule" size=".03" fromto="0 0 0 0 0 -.25"/>
+        <body name="shin" pos="0 0 -.25">
+          <joint name="knee" axis="0 1 0" range="-150 0"/><geom type="capsule" size=".03" fromto="0 0 0 0 0 -.3"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <keyframe>
+    <key name="crouch" qpos="1 0 .45 1 0 0 0  0 0 .4 1 0 0 0  .8 -1.6"/>
+    <key name="home" qpos="1.1 .1 .45 1 0 0 0  0 0 .7 1 0 0 0  .4 -.8" qvel="0 0 0 0 0 0 1 1 1 1 1 1 1 1"/>
+  </keyframe>
+</mujoco>
+"""
+HOME = np.array([1.1, 0.1, 0.45, 1, 0, 0, 0, 0, 0, 0.7, 1, 0, 0, 0, 0.4, -0.8])
+
+
+def _qpos(scene: Scene, n: int = 300, seed: int = 0) -> np.ndarray:
+    states, nq = sample_start_states(scene, n, seed), scene.model.nq
+    assert not states[:, 0].any() and not states[:, 1 + nq : 1 + nq + scene.model.nv].any()
+    return states[:, 1 : 1 + nq]
+
+
+def _contacts(scene: Scene, qpos: np.ndarray) -> mujoco.MjData:
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(scene.model, data)
+    return data
+
+
+def test_starts_do_not_collide_and_stand_on_the_ground() -> None:
+    scene = load_scene(ROBOT)
+    qpos = _qpos(scene)
+    hip, knee = qpos[:, 14], qpos[:, 15]
+    assert hip.min() < -1.5 and hip.max() > 1 and knee.min() < -2.4 and knee.max() > -0.2
+    near = (abs(hip - 0.4) < 0.3 * 2.2) & (abs(knee + 0.8) < 0.3 * 1.9)
+    assert 0.5 < near.mean() < 0.8  # half of the starts, and some of the others
+    np.testing.assert_allclose(qpos[:, 2], 0.45, atol=1e-12)  # the cup stays on its table
+    assert (abs(qpos[:, :2] - [1.1, 0.1]) < 0.07).all() and np.ptp(qpos[:, 0]) > 0.05
+    for cup_or_base in (qpos[:, 3:7], qpos[:, 10:14]):
+        yaw = 2 * np.arctan2(cup_or_base[:, 3], cup_or_base[:, 0])
+        assert np.histogram(np.angle(np.exp(1j * yaw)), 4, (-np.pi, np.pi))[0].min() > 30
+    upright = np.empty(9)
+    feet = []
+    for row in qpos:
+        data = _contacts(scene, row)
+        assert data.contact.dist.min(initial=0.0) > -1.0001e-3
+        mujoco.mju_quat2Mat(upright, row[10:14])
+        assert upright[8] > np.cos(0.75)
+        distances = [mujoco.mj_geomDistance(scene.model, data, 0, geom, 9.0, None) for geom in (3, 4, 5)]
+        feet.append(min(distances))
+    data = _contacts(scene, HOME)
+    np.testing.assert_allclose(feet, mujoco.mj_geomDistance(scene.model, data, 0, 5, 9.0, None), atol=1e-9)
+
+
+@pytest.mark.parametrize(("old", "new", "knee"), [("home", "stand", -0.8), ("home", "end", -1.6), ("<key", "<!--", 0)])
+def test_reference_pose_is_a_keyframe(old: str, new: str, knee: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``stand`` comes after ``home``, then the first."""
+    monkeypatch.setattr("torchrl_gn.data.start_poses._WIDE_SHARE", 0.0)
+    monkeypatch.setattr("torchrl_gn.data.start_poses._NEAR", 1e-9)
+    text = ROBOT.replace(old, new) if new != "<!--" else ROBOT[: ROBOT.index("<keyframe>")] + "</mujoco>"
+    assert _qpos(load_scene(text), 3)[:, 15] == pytest.approx(knee, abs=1e-6)
+
+
+def test_a_base_in_the_ground_is_lifted_until_it_touches() -> None:
+    scene = load_scene(ROBOT.replace("0 0 .7 1", "0 0 .2 1"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", StartPoseWarning)
+        qpos = _qpos(scene, 50)
+    for row in qpos:
+        lowest = min(_contacts(scene, row).contact.dist, default=1.0)
+        assert lowest == pytest.approx(0.0, abs=1e-6) or lowest == 1.0
+
+
+def test_planar_bases_are_lifted() -> None:
+    scene = load_scene(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 .5">
+          <joint name="z" type="slide" axis="0 0 -1"/><joint name="pitch" axis="0 1 0"/>
+          <geom type="capsule" size=".05" fromto="0 0 -.4 0 0 .4"/></body></worldbody></mujoco>"""
+    )
+    qpos = _qpos(scene)
+    assert np.ptp(qpos[:, 1]) > 6
+    height = 0.5 - qpos[:, 0] - 0.4 * abs(np.cos(qpos[:, 1])) - 0.05
+    np.testing.assert_allclose(height, 0.05, atol=1e-9)  # as in the reference pose
+
+
+def test_a_reference_pose_that_penetrates_is_told_and_avoided() -> None:
+    arm = """<mujoco model="bent"><worldbody><body><geom name="post" type="box" size=".05 .05 .4" pos="0 0 .4"/>
+      <body pos="0 0 1"><joint axis="0 1 0"/><geom type="capsule" size=".03" fromto="0 0 0 .4 0 0"/>
+        <body pos=".4 0 0"><joint axis="0 1 0"/><geom name="fore" type="capsule" size=".03" fromto="0 0 0 .4 0 0"/>
+      </body></body></body></worldbody><keyframe><key qpos=".5 2.5"/></keyframe></mujoco>"""
+    told = r"'bent' has geom '(post|fore)' \d+.* mm deep in geom .* {} .* keyframe 'home'"
+    scene = load_scene(arm)
+    with pytest.warns(StartPoseWarning, match=told.format("are around a random pose")):
+        qpos = _qpos(scene, 100)
+    assert all(_contacts(scene, row).contact.dist.min(initial=0.0) > -1.0001e-3 for row in qpos)
+    inside = load_scene(arm.replace('".05 .05 .4"', '".05 .05 .62"').replace(".5 2.5", "0 0"))  # in every pose
+    with pytest.warns(StartPoseWarning, match="has a geom of body 'body2' .* mm deep in geom 'post'"):
+        assert np.ptp(_qpos(inside, 50), axis=0).min() > 1
+
+
+def test_equality_constraints_hold() -> None:
+    """A parallelogram closed by a connection, and a finger that follows another."""
+    scene = load_scene(
+        """<mujoco><option gravity="0 0 0"/><worldbody>
+          <body name="a"><joint name="a" axis="0 1 0"/><geom size=".02" pos="0 0 .3"/>
+            <body name="bar" pos="0 0 .3"><joint name="bar" axis="0 1 0"/><geom size=".02" pos=".2 0 0"/></body></body>
+          <body name="b" pos=".4 0 0"><joint name="b" axis="0 1 0"/><geom size=".02" pos="0 0 .3"/></body>
+          <body pos="2 0 0"><joint name="left" type="slide" range="0 .1"/><geom size=".01"/></body>
+          <body pos="3 0 0"><joint name="right" type="slide" range="-.2 .2"/><geom size=".01"/></body>
+        </worldbody><equality>
+          <connect body1="bar" body2="b" anchor=".4 0 0"/><joint joint1="right" joint2="left" polycoef="0 -2 0 0 0"/>
+        </equality></mujoco>"""
+    )
+    qpos = _qpos(scene, 50)
+    np.testing.assert_allclose(qpos[:, 4], -2 * qpos[:, 3], atol=1e-3)
+    tip = np.stack([0.3 * np.sin(qpos[:, 0]) + 0.4 * np.cos(qpos[:, 0] + qpos[:, 1])], -1)
+    np.testing.assert_allclose(tip[:, 0], 0.4 + 0.3 * np.sin(qpos[:, 2]), atol=1e-3)
+    assert np.ptp(qpos[:, 0]) > 2 and np.ptp(qpos[:, 3]) > 0.08
+
+
+def test_what_touches_nothing_turns_in_place() -> None:
+    body = '<body pos="1 2 3"><freejoint/><geom size=".1" type="box" {}/></body>'
+    for rest in ('<option gravity="0 0 0"/>', '<option><flag contact="disable"/></option>', ""):
+        geom = "" if rest else 'contype="0" conaffinity="0"'
+        world = f'<worldbody><geom type="plane" size="1 1 1"/>{body.format(geom)}</worldbody>'
+        qpos = _qpos(load_scene(f"<mujoco>{rest}{world}</mujoco>".replace('size=".1"', 'size=".1 .1 .1"')), 400)
+        if not rest or "contact" in rest:
+            assert (qpos[:, :3] == [1, 2, 3]).all()
+        assert qpos[:, 3].min() < 0.2

@@ -1,0 +1,310 @@
+"""Start poses of models that users bring: around a keyframe or the reference pose, free of collisions."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.scene import Scene
+
+_WIDE_SHARE = 0.5  # share of the starts that may be anywhere within the joint limits
+_NEAR = 0.3  # largest perturbation of the others, as a share of that
+_TILT = 0.5  # rad, of the base of a robot
+_DEPTH = 1e-3  # metres that two geoms may overlap, more than in the reference pose
+_REDRAWS, _SHRINKS, _SHRINK = 8, 16, 0.7  # attempts at full size, then at sizes that fall to 0.3 %
+_EQUALITY_STEPS, _EQUALITY_ERROR = 20, 1e-4
+_SEARCH = 100  # random poses, if the reference pose penetrates
+_FAR = 1e3  # metres at which a plane is still looked for
+_KEYFRAMES = ("home", "stand")
+_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+
+class StartPoseWarning(UserWarning):
+    """The reference pose of a model penetrates something."""
+
+
+@dataclass(frozen=True)
+class _Base:
+    """A body that moves up and down freely above planes."""
+
+    height: int  # its address in qpos
+    up: float  # world height of a unit of qpos
+    geoms: list[tuple[int, np.ndarray]]  # each plane, and the geoms of the body and what it carries that can touch it
+
+
+class StartPoses:
+    """Draw collision-free states at rest of one model.
+
+    The reference pose is the keyframe ``home``, else ``stand``, else the first, else ``qpos0``; a joint beyond its
+    limits moves to the nearest, or to their middle if it is far beyond. Half of the draws perturb it widely: joints
+    uniform within their limits, unlimited hinges and balls in every direction. The others stay within 30 % of that.
+
+    - Free bodies turn about the vertical and shift by up to their size; bases of robots tilt by up to 0.5 rad. Without
+      gravity, or where they can touch nothing fixed, they stay in place in any orientation.
+    - Bodies that move up and down freely keep the reference pose's distance to planes below, or touch them.
+    - Equality constraints hold, by Gauss-Newton steps from the draw.
+    - Draws with geoms over 1 mm deeper in each other than in the reference pose are redrawn, then shrunk towards it.
+    """
+
+    def __init__(self, scene: Scene):
+        self.scene, self.model = scene, scene.model
+        self._data = mujoco.MjData(self.model)
+        self._load_reference()
+        self._touching = _may_touch(self.model)
+        self._bases = _bases(self.model, self._touching)
+        self._equality_error = _EQUALITY_ERROR
+        self._equality_error = max(_EQUALITY_ERROR, self._hold_equalities())
+        self._clearance = [max(_clearance(self.model, self._data, base), 0.0) for base in self._bases]
+        self._lift()
+        self._reference = self._data.qpos.copy()
+        self._allowed: dict[tuple[int, int], float] = {}
+        if depths := self._depths():
+            self._avoid(depths)
+        self._rest = np.empty(scene.physics_size)
+        mujoco.mj_getState(self.model, self._data, self._rest, _PHYSICS)
+
+    def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """States ``[n, S]``, float64."""
+        states = np.tile(self._rest, (n, 1))
+        wide = rng.random(n) < _WIDE_SHARE
+        spread = np.where(wide, 1.0, _NEAR * rng.random(n))
+        pending = np.arange(n)
+        for attempt in range(_REDRAWS + _SHRINKS):
+            if not len(pending):
+                break
+            size = _SHRINK ** max(0, attempt - _REDRAWS)
+            changes = size * self._perturbations(spread[pending], rng)
+            collided = []
+            for row, change in zip(pending, changes, strict=True):
+                if self._place(change):
+                    states[row, 1 : 1 + self.model.nq] = self._data.qpos
+                else:
+                    collided.append(row)
+            pending = np.array(collided, dtype=np.int64)
+        return states  # what still collides stays in the reference pose
+
+    def _load_reference(self) -> None:
+        model, data = self.model, self._data
+        if (key := reference_keyframe(model)) is not None:
+            mujoco.mj_resetDataKeyframe(model, data, key)
+        data.time, data.qvel[:] = 0.0, 0.0
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        for joint in np.flatnonzero((model.jnt_limited != 0) & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))):
+            address, (low, high) = model.jnt_qposadr[joint], model.jnt_range[joint]
+            inside = np.clip(data.qpos[address], low, high)
+            far = abs(inside - data.qpos[address]) > 0.05 * (high - low)
+            data.qpos[address] = (low + high) / 2 if far else inside
+
+    def _avoid(self, depths: dict[tuple[int, int], float]) -> None:
+        """Replace a reference pose that penetrates by the best of random ones, allow what is left, and warn."""
+        (first, second), depth = max(depths.items(), key=lambda item: item[1])
+        best, found = depths, self._reference
+        for change in self._perturbations(np.ones(_SEARCH), np.random.default_rng(0)):
+            free = self._place(change)
+            left = {} if free else self._depths()
+            if sum(left.values()) < sum(best.values()):
+                best, found = left, self._data.qpos.copy()
+            if free:
+                break
+        self._allowed, self._reference = best, found
+        self._data.qpos[:] = found
+        mujoco.mj_kinematics(self.model, self._data)
+        instead = "may too" if best is depths else "are around a random pose that has less overlap"
+        warnings.warn(
+            f"The reference pose of scene {self.scene.name!r} has {_geom(self.model, first)} {1e3 * depth:.3g} mm deep"
+            f" in {_geom(self.model, second)}. Start states {instead}; give the model a keyframe 'home' without"
+            " overlaps, or exclude contacts that mean nothing.",
+            StartPoseWarning,
+            stacklevel=2,
+        )
+
+    def _perturbations(self, spread: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Changes of the reference pose ``[n, nv]``, as of ``mj_integratePos`` over one second."""
+        model, kind, n = self.model, mujoco.mjtJoint, len(spread)
+        changes = np.zeros((n, model.nv))
+        for joint in range(model.njnt):
+            first, dof, (low, high) = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_range[joint]
+            match model.jnt_type[joint], bool(model.jnt_limited[joint]):
+                case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE), True):
+                    changes[:, dof] = spread * (rng.uniform(low, high, n) - self._reference[first])
+                case kind.mjJNT_HINGE, False:
+                    changes[:, dof] = spread * rng.uniform(-np.pi, np.pi, n)
+                case kind.mjJNT_BALL, limited:
+                    here = self._reference[first : first + 4]
+                    turned = _ball(rng, n, high if limited else None)
+                    changes[:, dof : dof + 3] = spread[:, None] * _rotation_between(here, turned)
+                case kind.mjJNT_FREE, _:
+                    changes[:, dof : dof + 6] = self._free_body(joint, spread[:, None], rng)
+        return changes
+
+    def _free_body(self, joint: int, spread: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Shift in world axes and rotation in the body's ``[n, 6]`` of a free joint."""
+        model, n = self.model, len(spread)
+        body, first = model.jnt_bodyid[joint], model.jnt_qposadr[joint]
+        change, vertical = np.zeros((n, 6)), np.zeros((n, 3))
+        here = self._reference[first + 3 : first + 7]
+        carried = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+        fixed = model.body_weldid[model.geom_bodyid] == 0
+        if not (model.opt.gravity.any() and self._touching[np.ix_(carried, fixed)].any()):
+            change[:, 3:] = spread * _rotation_between(here, _ball(rng, n, None))
+            return change
+        geoms = np.flatnonzero(model.geom_bodyid == body)
+        size = model.geom_rbound[geoms].max(initial=0.0)
+        change[:, :2] = spread * size * rng.uniform(-1.0, 1.0, (n, 2))
+        vertical[:, 2] = rng.uniform(-np.pi, np.pi, n)
+        if (model.body_rootid[model.jnt_bodyid] == model.body_rootid[body]).sum() > 1:  # it carries other joints
+            vertical[:, :2] = spread * _TILT * rng.uniform(-1.0, 1.0, (n, 2))
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, here)
+        change[:, 3:] = vertical @ rotation.reshape(3, 3)  # in the body's axes
+        return change
+
+    def _place(self, change: np.ndarray) -> bool:
+        """Move to the changed reference pose; returns whether it may be a start."""
+        model, data = self.model, self._data
+        data.qpos[:] = self._reference
+        mujoco.mj_integratePos(model, data.qpos, change, 1.0)
+        if self._hold_equalities() > self._equality_error:
+            return False
+        self._lift()
+        return not self._depths()
+
+    def _lift(self) -> None:
+        """Move bases up or down to their clearance, and update the kinematics."""
+        for base, wanted in zip(self._bases, self._clearance, strict=True):
+            now = _clearance(self.model, self._data, base)
+            if np.isfinite(now):
+                self._data.qpos[base.height] += (wanted - now) / base.up
+        mujoco.mj_kinematics(self.model, self._data)
+
+    def _hold_equalities(self) -> float:
+        """Update the kinematics after Gauss-Newton steps onto equality constraints; returns the error that is left."""
+        model, data = self.model, self._data
+        if not data.eq_active.any():
+            mujoco.mj_kinematics(model, data)
+            return 0.0
+        worst = np.inf
+        for _ in range(_EQUALITY_STEPS):
+            mujoco.mj_fwdPosition(model, data)
+            rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+            error = data.efc_pos[: data.nefc][rows]
+            worst = float(np.abs(error).max(initial=0.0))
+            if worst <= self._equality_error:
+                break
+            jacobian = _constraint_jacobian(model, data)[rows]
+            mujoco.mj_integratePos(model, data.qpos, -np.linalg.pinv(jacobian) @ error, 1.0)
+        return worst
+
+    def _depths(self) -> dict[tuple[int, int], float]:
+        """Depth of each pair of geoms that overlap by more than 1 mm beyond what is allowed; needs the kinematics."""
+        model, data = self.model, self._data
+        mujoco.mj_comPos(model, data)
+        if model.nflex:
+            mujoco.mj_flex(model, data)
+        mujoco.mj_collision(model, data)
+        deep = data.contact.dist < -_DEPTH
+        if not deep.any():
+            return {}
+        depths: dict[tuple[int, int], float] = {}
+        for pair, distance in zip(map(tuple, data.contact.geom[deep].tolist()), data.contact.dist[deep], strict=True):
+            if -distance > self._allowed.get(pair, 0.0) + _DEPTH:
+                depths[pair] = max(depths.get(pair, 0.0), -float(distance))
+        return depths
+
+
+def reference_keyframe(model: mujoco.MjModel) -> int | None:
+    """The keyframe ``home``, else ``stand``, else the first, or None if there is none."""
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, key) for key in range(model.nkey)]
+    return next((names.index(name) for name in _KEYFRAMES if name in names), 0 if names else None)
+
+
+def _bases(model: mujoco.MjModel, touching: np.ndarray) -> list[_Base]:
+    """Bodies with a free joint, or with an unlimited vertical slide on the world, above planes that they can touch."""
+    kind, bases = mujoco.mjtJoint, []
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    planes = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (data.geom_xmat[:, 8] > 0.5))
+    for joint in range(model.njnt):
+        body, up = model.jnt_bodyid[joint], 1.0
+        if model.body_weldid[model.body_parentid[body]] != 0:
+            continue
+        height = int(model.jnt_qposadr[joint])
+        if model.jnt_type[joint] == kind.mjJNT_FREE:
+            height += 2
+        elif model.jnt_type[joint] == kind.mjJNT_SLIDE and not model.jnt_limited[joint]:
+            up = float(data.xaxis[joint, 2])
+            if abs(up) < 0.99:
+                continue
+        else:
+            continue
+        carried = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+        geoms = [(int(plane), np.flatnonzero(carried & touching[plane])) for plane in planes]
+        if any(len(each) for _, each in geoms):
+            bases.append(_Base(height, up, geoms))
+    return bases
+
+
+def _clearance(model: mujoco.MjModel, data: mujoco.MjData, base: _Base) -> float:
+    """Least vertical distance to planes, metres; infinite if there is none near."""
+    least, position = np.inf, data.geom_xpos
+    for plane, geoms in base.geoms:
+        normal = data.geom_xmat[plane, 2::3]
+        bound = (position[geoms] - position[plane]) @ normal - model.geom_rbound[geoms]
+        for row in np.argsort(bound):
+            if bound[row] / normal[2] >= least:
+                break
+            distance = mujoco.mj_geomDistance(model, data, plane, geoms[row], _FAR, None)
+            if distance < _FAR:
+                least = min(least, distance / normal[2])
+    return least
+
+
+def _may_touch(model: mujoco.MjModel) -> np.ndarray:
+    """Pairs of geoms ``[G, G]`` bool whose contacts are not filtered out by their bits."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        return np.zeros((model.ngeom, model.ngeom), dtype=bool)
+    touching = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
+    touching[model.pair_geom1, model.pair_geom2] = True
+    return touching | touching.T
+
+
+def _constraint_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Dense Jacobian ``[nefc, nv]`` of all constraints."""
+    if not mujoco.mj_isSparse(model):
+        return data.efc_J.reshape(data.nefc, model.nv)
+    dense = np.zeros((data.nefc, model.nv))
+    for row in range(data.nefc):
+        first, count = data.efc_J_rowadr[row], data.efc_J_rownnz[row]
+        dense[row, data.efc_J_colind[first : first + count]] = data.efc_J[first : first + count]
+    return dense
+
+
+def _ball(rng: np.random.Generator, n: int, limit: float | None) -> np.ndarray:
+    """Random orientations ``[n, 4]``: uniform, or of a uniform angle below the limit [rad]."""
+    if limit is None:
+        return _unit(rng.standard_normal((n, 4)))
+    axis, half = _unit(rng.standard_normal((n, 3))), 0.5 * rng.uniform(0.0, limit, (n, 1))
+    return np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
+
+
+def _rotation_between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Rotation vectors ``[n, 3]`` in the body's axes from an orientation ``[4]`` to others ``[n, 4]``."""
+    vectors = np.empty((len(there), 3))
+    for row, orientation in enumerate(there):
+        mujoco.mju_subQuat(vectors[row], orientation, here)
+    return vectors
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _geom(model: mujoco.MjModel, geom: int) -> str:
+    if geom < 0:
+        return "a flex"
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
+    body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom]))
+    return f"geom {name!r}" if name else f"a geom of body {body!r}"
