@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.contact_points import find_contact_points
-from torchrl_gn.scenes.invariance import find_yaw_frame, movable_components, translation_invariant
+from torchrl_gn.scenes.invariance import movable_components, translation_invariant
 from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph, UnsupportedSceneError
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import Topology, find_joint_anchors, offset, topology
+from torchrl_gn.scenes.yaw_frame import find_yaw_frame
 
 _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the state
     mujoco.mjtSensor.mjSENS_FRAMEPOS,
@@ -58,7 +59,7 @@ def build_scene(
         movable=movable,
         translation_invariant=invariant,
         joint_anchors=find_joint_anchors(model, data, graph),
-        yaw_frame=find_yaw_frame(model, data, graph, movable, invariant),
+        yaw_frame=find_yaw_frame(model, data, graph, movable),
         contact_points=find_contact_points(model, data, graph),
         action_low=model.actuator_ctrlrange[:, 0].copy(),
         action_high=model.actuator_ctrlrange[:, 1].copy(),
