@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, JointAxes, Predictor
+from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, JointAxes, Predictor, specialize
 from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.features.contacts import BoundContacts
+from torchrl_gn.dynamics.features.feature import StepInputs
 from torchrl_gn.dynamics.normalization import dynamic_graph
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
@@ -15,10 +17,10 @@ from .. import zoo
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", ["swimmer6", "cheetah", "falling"])
+@pytest.mark.parametrize("name", ["swimmer6", "cheetah", "falling", "crawler"])
 def test_predictions_do_not_depend_on_the_place(scenes, make_model, random_states, random_actions, name, dtype):
     """A thousand kilometres away, along axes without landmarks, the same change is predicted."""
-    scene = scenes[name]
+    scene = scenes.get(name) or zoo.load(name)
     bound = make_model(scene).to(dtype).bind(scene)
     state, action = random_states(scene, 10, seed=3), random_actions(scene, 10)
     delta = bound.delta(state, action)
@@ -93,6 +95,85 @@ def test_predictions_turn_with_the_scene(scenes, make_model, random_states, rand
     plain = make_model(scene, canonicalizer=Canonicalizer(yaw=False)).bind(scene)
     error = plain.delta(turned, action) - BODY_STATE.rotate_delta(plain.delta(state, action), turn)
     assert error.norm() > 1e-3 * delta.norm()
+
+
+@pytest.mark.parametrize("integrate", [True, False])
+def test_predictions_turn_with_free_roots(make_model, random_states, random_actions, integrate):
+    """Rotated and shifted, two free trees on the ground change in the same way, rotated, however they are tilted."""
+    scene = zoo.load("crawler")
+    bound = make_model(scene, integrate=integrate).double().bind(scene)
+    state, action = random_states(scene, 30, seed=3), random_actions(scene, 30)
+    delta = bound.delta(state, action)
+    for angle in (1e-8, 0.8, torch.pi, -2.0):
+        turn = quaternion.exp(angle * torch.eye(3, dtype=state.dtype)[2]).expand(30, 4)
+        turned = torch.cat((state[:, :1], BODY_STATE.rotate(state, turn)[:, 1:]), 1)
+        turned[:, 1:, :2] += torch.tensor([30.0, -50])
+        error = bound.delta(turned, action) - BODY_STATE.rotate_delta(delta, turn)
+        assert error.norm() < 1e-10 * delta.norm()
+    plain = make_model(scene, canonicalizer=Canonicalizer(yaw=False)).double().bind(scene)
+    error = plain.delta(turned, action) - BODY_STATE.rotate_delta(plain.delta(state, action), turn)
+    assert error.norm() > 1e-3 * delta.norm()
+
+
+def test_contacts_with_the_ground_do_not_show_the_yaw(make_model, random_states):
+    """Heights and approach speeds of contact points are those of the world, their velocities rotated."""
+    scene = zoo.load("crawler")
+    bound, plain = (make_model(scene, canonicalizer=Canonicalizer(yaw=yaw)).bind(scene) for yaw in (True, False))
+    state = random_states(scene, 10, seed=3)
+    canonical, world = (each.canonicalizer(state, each.scene_parameters) for each in (bound, plain))
+    controls = torch.zeros(10, scene.num_edges, 1, dtype=state.dtype)
+    seen, true = (
+        BoundContacts(scene)(StepInputs(each, controls, bound.scene_parameters)).unflatten(-1, (-1, 6))
+        for each in (canonical, world)
+    )
+    torch.testing.assert_close(seen[..., :3], true[..., :3])
+    back = canonical.rotation.matrix.mT[:, None, None]
+    torch.testing.assert_close(seen[..., 3:], (back @ true[..., 3:, None]).squeeze(-1))
+    assert true[..., 0].abs().max() > 0.1
+
+
+TILTS = (0.0, 1e-300, 1e-30, 1e-9, 1e-7, 1e-5, 1e-3)  # from upside down, radians
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("executor", ["eager", "native"])
+def test_upside_down_all_is_finite(make_model, random_states, random_actions, executor, dtype):
+    """The yaw jumps there: values and gradients stay finite, and other samples as they are."""
+    scene = zoo.load("crawler")
+    bound = make_model(scene).to(dtype).requires_grad_(False).bind(scene)
+    predictor = specialize(bound, executor=executor)
+    for across in ([1.0, 0, 0], [0, 1.0, 0], [0.6, 0.8, 0]):
+        state = random_states(scene, 2 * len(TILTS), seed=3)
+        rest = torch.as_tensor(scene.yaw_frame.rest)
+        over = torch.tensor([0.0, *across], dtype=torch.float64)
+        tilt = torch.tensor([[0.0, 0, 0, 1]], dtype=torch.float64) * torch.tensor(TILTS, dtype=torch.float64)[:, None]
+        state[: len(TILTS), scene.yaw_frame.node, 3:7] = quaternion.product(quaternion.normalize(over + tilt), rest)
+        state, action = state.to(dtype).requires_grad_(), random_actions(scene, len(state), 3).to(dtype)
+        states = predictor.rollout(state, action)[0]
+        gradient = torch.autograd.grad(states.square().sum(), state)[0]
+        assert states.isfinite().all() and gradient.isfinite().all()
+        assert gradient.abs().max() < 1e9
+        alone = state[len(TILTS) :].detach().requires_grad_()
+        others = predictor.rollout(alone, action[len(TILTS) :])[0]
+        torch.testing.assert_close(others, states[len(TILTS) :])
+        own = torch.autograd.grad(others.square().sum(), alone)[0]
+        assert (own - gradient[len(TILTS) :]).norm() < 1e-5 * own.norm()
+
+
+def test_the_yaw_of_a_free_root(make_model, random_states):
+    """It is 0 where the root tilts from rest about a horizontal axis, and adds up with rotations about the vertical."""
+    scene = zoo.load("crawler")
+    bound = make_model(scene).bind(scene)
+    rest = torch.as_tensor(scene.yaw_frame.rest)
+    generator = torch.Generator().manual_seed(0)
+    horizontal = torch.randn(20, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 1, 0])
+    angle = 3.1 * torch.rand(20, 1, generator=generator, dtype=torch.float64)
+    tilt = quaternion.exp(angle * horizontal / horizontal.norm(dim=-1, keepdim=True))
+    turn = quaternion.exp(torch.linspace(-3, 3, 20, dtype=torch.float64)[:, None] * torch.eye(3).double()[2])
+    state = random_states(scene, 20)
+    state[:, scene.yaw_frame.node, 3:7] = quaternion.product(turn, quaternion.product(tilt, rest))
+    found = bound.canonicalizer.yaw_rotation(state, bound.scene_parameters).quaternion
+    torch.testing.assert_close(found, turn)
 
 
 def test_where_the_world_can_be_touched_it_shows_the_heading(make_model, random_states):

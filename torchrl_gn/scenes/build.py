@@ -7,11 +7,12 @@ import numpy as np
 
 from torchrl_gn.scenes.contact_points import find_contact_points
 from torchrl_gn.scenes.control_bounds import ActionBounds, set_control_bounds
-from torchrl_gn.scenes.invariance import find_yaw_frame, movable_components, translation_invariant
+from torchrl_gn.scenes.invariance import movable_components, translation_invariant
 from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import EdgePair, Topology, find_joint_anchors, named, offset, topology
 from torchrl_gn.scenes.transmissions import find_transmissions
+from torchrl_gn.scenes.yaw_frame import find_yaw_frame
 
 _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the state
     mujoco.mjtSensor.mjSENS_FRAMEPOS,
@@ -70,7 +71,7 @@ def build_scene(
         movable=movable,
         translation_invariant=invariant,
         joint_anchors=find_joint_anchors(model, data, graph),
-        yaw_frame=find_yaw_frame(model, data, graph, movable, invariant),
+        yaw_frame=find_yaw_frame(model, data, graph, movable),
         contact_points=find_contact_points(model, data, graph),
         action_low=low,
         action_high=high,

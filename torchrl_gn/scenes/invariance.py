@@ -1,16 +1,15 @@
-"""Invariances: shifts and rotations of a scene that leave its dynamics unchanged, and what can move at all."""
+"""Translation invariance: shifts of a scene that leave its dynamics unchanged; and what can move at all."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.topology import Topology
 
-_TOLERANCE = 1e-9
-_Disable, _Trn = mujoco.mjtDisableBit, mujoco.mjtTrn
+TOLERANCE = 1e-9
+_Disable = mujoco.mjtDisableBit
+_Transmission = mujoco.mjtTrn
 
 
 def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> np.ndarray:
@@ -51,9 +50,9 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
         return None
     matrix = np.array([frame @ model.jnt_axis[joint] for joint in slides]).T  # [3, slides]
     amounts = np.linalg.lstsq(matrix, axis, rcond=None)[0]
-    if np.abs(matrix @ amounts - axis).max() > _TOLERANCE:
+    if np.abs(matrix @ amounts - axis).max() > TOLERANCE:
         return None
-    return [joint for joint, amount in zip(slides, amounts, strict=True) if abs(amount) > _TOLERANCE]
+    return [joint for joint, amount in zip(slides, amounts, strict=True) if abs(amount) > TOLERANCE]
 
 
 def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
@@ -84,13 +83,19 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
     return False
 
 
-def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray | None) -> bool:
+def actuators_of(model: mujoco.MjModel, *joints: int) -> np.ndarray:
+    """Actuators that drive one of the joints directly."""
+    direct = np.isin(model.actuator_trntype, (_Transmission.mjTRN_JOINT, _Transmission.mjTRN_JOINTINPARENT))
+    return np.flatnonzero(direct & np.isin(model.actuator_trnid[:, 0], joints))
+
+
+def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
     """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis``."""
     fixed = graph.node_of_body[model.geom_bodyid] == 0
     for other in np.flatnonzero(fixed):
         normal = data.geom_xmat[other].reshape(3, 3)[:, 2]
         plane = model.geom_type[other] == mujoco.mjtGeom.mjGEOM_PLANE
-        parallel = plane and axis is not None and abs(normal @ axis) < _TOLERANCE
+        parallel = plane and abs(normal @ axis) < TOLERANCE
         if not parallel and any(can_collide(model, int(other), int(moving)) for moving in np.flatnonzero(~fixed)):
             return True
     return False
@@ -109,7 +114,9 @@ def can_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
 
 
 def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -> bool:
-    """Whether an equality constraint, a tendon or a pair of sites acts on the world or on one of ``joints``."""
+    """Whether an equality constraint, tendon or actuator on sites acts on the world, or a first one on ``joints``."""
+    if any(_actuator_acts(model, graph, actuator) for actuator in range(len(model.actuator_trntype))):
+        return True
     constrained = not model.opt.disableflags & (_Disable.mjDSBL_EQUALITY | _Disable.mjDSBL_CONSTRAINT)
     if constrained and any(_equality_acts(model, graph, equality, joints) for equality in range(model.neq)):
         return True
@@ -124,15 +131,23 @@ def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -
                 return True
             case wrap.mjWRAP_SPHERE | wrap.mjWRAP_CYLINDER if fixed_geom[element]:
                 return True
-    between_sites = np.isin(model.actuator_trntype, [int(kind) for kind in (_Trn.mjTRN_SITE, _Trn.mjTRN_SLIDERCRANK)])
-    ends = model.actuator_trnid[between_sites]
-    return bool(fixed_site[ends[ends[:, 1] >= 0]].any())
+    return False
 
 
-def actuators_of(model: mujoco.MjModel, joint: int) -> np.ndarray:
-    """Ids of the actuators that act on a joint, other than through tendons."""
-    direct = np.isin(model.actuator_trntype, [int(kind) for kind in (_Trn.mjTRN_JOINT, _Trn.mjTRN_JOINTINPARENT)])
-    return np.flatnonzero(direct & (model.actuator_trnid[:, 0] == joint))
+def _actuator_acts(model: mujoco.MjModel, graph: Topology, actuator: int) -> bool:
+    """Whether an actuator other than of a joint or tendon depends on where the world is."""
+    ends = model.actuator_trnid[actuator]
+    match int(model.actuator_trntype[actuator]):
+        case _Transmission.mjTRN_JOINT | _Transmission.mjTRN_JOINTINPARENT | _Transmission.mjTRN_TENDON:
+            return False  # checked with the joint or tendon
+        case _Transmission.mjTRN_BODY:
+            return False  # acts along contact normals
+        case _Transmission.mjTRN_SITE if ends[1] < 0:
+            return False  # acts in the site's own frame
+        case _Transmission.mjTRN_SITE | _Transmission.mjTRN_SLIDERCRANK:
+            return bool((graph.node_of_body[model.site_bodyid[ends]] == 0).any())
+        case _:
+            return True
 
 
 def _equality_acts(model: mujoco.MjModel, graph: Topology, equality: int, joints: set[int]) -> bool:
@@ -145,73 +160,6 @@ def _equality_acts(model: mujoco.MjModel, graph: Topology, equality: int, joints
         bodies = [int(model.site_bodyid[end]) if sites else end for end in ends]
         return any(graph.node_of_body[body] == 0 for body in bodies)
     return kind != mujoco.mjtEq.mjEQ_TENDON  # a tendon's ends are checked with the tendon
-
-
-@dataclass(frozen=True, eq=False)
-class YawFrame:
-    """Yaw of a rotation-invariant scene: the rotation of its root about a world axis."""
-
-    exact: bool  # False if moving geoms can touch fixed ones, so that contacts depend on the yaw
-    node: int  # root node
-    axis: int  # 0, 1 or 2 for the world's x, y or z
-    pivot: np.ndarray  # [3] a point on the axis, metres; 0 if the scene is translation-invariant across it
-    rest: np.ndarray  # [4] the root's orientation at yaw 0
-
-
-def find_yaw_frame(
-    model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, movable: np.ndarray, translation_invariant: np.ndarray
-) -> YawFrame | None:
-    """Yaw frame of a scene, or None if its dynamics depend on the yaw other than by contacts.
-
-    The scene must be one tree whose root has slides, if any, then a hinge about a world axis. Gravity and wind must be
-    parallel to that axis. No limit, spring, tendon, equality constraint or position actuator may depend on the hinge,
-    and slides across the axis must be alike and without motors. ``data`` must be at its reference, kinematics done.
-    """
-    roots = np.flatnonzero(graph.parent == 0)
-    if len(roots) != 1 or model.nplugin or model.nflex:
-        return None
-    node = int(roots[0])
-    body = int(graph.body[node])
-    first = int(model.body_jntadr[body])
-    *slides, hinge = range(first, first + int(model.body_jntnum[body]))
-    kinds = [*[mujoco.mjtJoint.mjJNT_SLIDE] * len(slides), mujoco.mjtJoint.mjJNT_HINGE]
-    if model.jnt_type[[*slides, hinge]].tolist() != list(map(int, kinds)) or depends_on_position(model, hinge):
-        return None
-    rest = reference_rotation(model, body)
-    directions = np.abs(rest @ model.jnt_axis[hinge])
-    axis = int(directions.argmax())
-    if abs(directions[axis] - 1) > _TOLERANCE:
-        return None
-    across = [index for index in range(3) if index != axis]
-    flow = model.opt.wind if model.opt.density or model.opt.viscosity else np.zeros(3)
-    weight = np.zeros(3) if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY else model.opt.gravity
-    if np.abs(flow[across]).max() > _TOLERANCE or np.abs(weight[across]).max() > _TOLERANCE:
-        return None
-    lateral = [slide for slide in slides if abs((rest @ model.jnt_axis[slide])[axis]) < 1 - _TOLERANCE]
-    if lateral and not (_isotropic(model, lateral, rest, across) and translation_invariant[across].all()):
-        return None
-    if acts_on_position(model, graph, {hinge, *lateral}):
-        return None
-    vectors = movable.reshape(len(movable), 4, 3)
-    if not np.array_equal(vectors[..., across[0]], vectors[..., across[1]]):
-        return None
-    pivot = np.zeros(3) if lateral else data.xanchor[hinge].copy()
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, rest.ravel())
-    return YawFrame(not collides_with_world(model, data, graph, None), node, axis, pivot, quat)
-
-
-def _isotropic(model: mujoco.MjModel, slides: list[int], rest: np.ndarray, across: list[int]) -> bool:
-    """Whether slides span the plane across the axis orthogonally, with equal passive forces and no motors."""
-    directions = np.array([(rest @ model.jnt_axis[slide])[across] for slide in slides])
-    if directions.shape != (2, 2) or np.abs(directions @ directions.T - np.eye(2)).max() > _TOLERANCE:
-        return False
-    if any(len(actuators_of(model, slide)) for slide in slides):
-        return False
-    dofs = model.jnt_dofadr[slides]
-    names = ("dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss")
-    table = [getattr(model, name) for name in names if hasattr(model, name)]  # MuJoCo before 3.7 has no dampingpoly
-    return all(np.array_equal(values[dofs[0]], values[dofs[1]]) for values in table)
 
 
 def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray, *, samples: int = 8) -> np.ndarray:
@@ -237,5 +185,5 @@ def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndar
         for node, body_id in enumerate(body):
             mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], int(body_id))
             largest[node] = np.maximum(largest[node], np.abs(jacobian).max(axis=1, initial=0.0))
-    moves = largest > _TOLERANCE
+    moves = largest > TOLERANCE
     return np.concatenate([moves, moves], axis=1)

@@ -11,8 +11,8 @@ import numpy as np
 
 from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.fingerprint import physics
-from torchrl_gn.scenes.invariance import YawFrame
 from torchrl_gn.scenes.topology import EdgePair, JointAnchors, named
+from torchrl_gn.scenes.yaw_frame import YawFrame
 
 
 class SceneError(ValueError):

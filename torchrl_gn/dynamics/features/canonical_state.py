@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -16,6 +17,10 @@ from torchrl_gn.maths.state_layout import StateLayout
 if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+
+# Norm of the twist below which the yaw is 0: the cosine of half the tilt.
+_UPSIDE_DOWN = 1e-6
 
 
 class FrameRotation(NamedTuple):
@@ -35,7 +40,13 @@ class CanonicalState(NamedTuple):
 
 @dataclass(frozen=True)
 class Canonicalizer:
-    """Make predictions independent of where an invariant scene is and how it is rotated."""
+    """Make predictions independent of where an invariant scene is and how it is rotated.
+
+    The yaw of a root that can tilt is the twist of its orientation relative to rest about the yaw axis (swing-twist
+    decomposition). Every yaw of a body that rotates freely jumps somewhere: this one where the body is upside down,
+    farthest from rest; there, to 2e-6 rad, it is 0 and has no gradient, which elsewhere grows with the inverse of the
+    distance.
+    """
 
     # Along axes of translation invariance (paper, SM "System invariance": off when several systems train together).
     recenter: bool = True
@@ -55,7 +66,9 @@ class BoundCanonicalizer(Float64Buffers):
     def __init__(self, options: Canonicalizer, scene: Scene, layout: StateLayout) -> None:
         super().__init__()
         self.layout = layout
-        self.yaw_frame = scene.yaw_frame if options.yaw else None
+        self.yaw_frame = frame = scene.yaw_frame if options.yaw else None
+        movable = None if frame is None else scene.movable[frame.node, 3:6]
+        self.tilts = frame is not None and bool(np.delete(movable, frame.axis).any())
         predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
         invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
         self.recenters = bool(options.recenter and invariant.any() and predicted.any())
@@ -102,5 +115,10 @@ class BoundCanonicalizer(Float64Buffers):
         # The twist about the axis: of the swing-twist decomposition.
         kept = torch.zeros(4, dtype=state.dtype, device=state.device)
         kept[0] = kept[1 + self.yaw_frame.axis] = 1
-        twist = quaternion.normalize(relative * kept)
+        twist = relative * kept
+        if self.tilts:
+            upside_down = twist.square().sum(-1, keepdim=True) < _UPSIDE_DOWN**2
+            identity = torch.eye(4, dtype=state.dtype, device=state.device)[0]
+            twist = torch.where(upside_down, identity, twist)
+        twist = quaternion.normalize(twist)
         return FrameRotation(twist, quaternion.to_matrix(twist).unflatten(-1, (3, 3)))

@@ -1,0 +1,156 @@
+"""Yaw frame: the rotation of a scene about gravity on which its dynamics do not depend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.invariance import (
+    TOLERANCE,
+    acts_on_position,
+    actuators_of,
+    depends_on_position,
+    reference_rotation,
+)
+from torchrl_gn.scenes.topology import Topology
+
+_Disable = mujoco.mjtDisableBit
+_Transmission = mujoco.mjtTrn
+
+
+@dataclass(frozen=True, eq=False)
+class YawFrame:
+    """Yaw of a rotation-invariant scene: the rotation of one root about a world axis."""
+
+    exact: bool  # False if contacts depend on the yaw: the model then shows it to the network
+    node: int  # root node, the heaviest tree's
+    axis: int  # 0, 1 or 2 for the world's x, y or z
+    pivot: np.ndarray  # [3] a point on the axis, metres; 0 if every root can move across it
+    rest: np.ndarray  # [4] the root's orientation at yaw 0
+
+
+def find_yaw_frame(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, movable: np.ndarray) -> YawFrame | None:
+    """Yaw frame of a scene, or None if its dynamics depend on the yaw other than by contacts.
+
+    Every root must have a free joint, or slides, if any, then a ball or a hinge about the axis; roots that cannot move
+    across the axis must pivot on it. Gravity and wind must be parallel to it. No limit, spring, tendon, equality
+    constraint or position actuator may depend on those joints or on the world, and motion across the axis must be
+    alike in all directions and without motors. ``data`` must be at its reference, kinematics done.
+    """
+    if model.nplugin or model.nflex:
+        return None
+    frames = (_yaw_frame_about(model, data, graph, movable, axis) for axis in (2, 0, 1))
+    return next((frame for frame in frames if frame is not None), None)
+
+
+def _yaw_frame_about(
+    model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, movable: np.ndarray, axis: int
+) -> YawFrame | None:
+    across = [index for index in range(3) if index != axis]
+    flow = model.opt.wind if model.opt.density or model.opt.viscosity else np.zeros(3)
+    weight = np.zeros(3) if model.opt.disableflags & _Disable.mjDSBL_GRAVITY else model.opt.gravity
+    one, other = movable.reshape(len(movable), 4, 3)[..., across].T
+    if np.abs([flow[across], weight[across]]).max() > TOLERANCE or (one != other).any():
+        return None
+    roots, joints, pivots = np.flatnonzero(graph.parent == 0), set(), []
+    for body in graph.body[roots]:
+        found = _rotating_joints(model, int(body), axis)
+        if found is None or any(depends_on_position(model, joint) for joint in found[0]):
+            return None
+        joints |= found[0]
+        if not found[1]:
+            pivots.append(data.xanchor[int(model.body_jntadr[body] + model.body_jntnum[body] - 1)].copy())
+    pivot = pivots[0] if pivots else np.zeros(3)
+    if any(np.abs((each - pivot)[across]).max() > TOLERANCE for each in pivots):
+        return None
+    if acts_on_position(model, graph, joints):
+        return None
+    node = int(roots[model.body_subtreemass[graph.body[roots]].argmax()])
+    rest = np.empty(4)
+    mujoco.mju_mat2Quat(rest, reference_rotation(model, int(graph.body[node])).ravel())
+    return YawFrame(not contacts_depend_on_yaw(model, data, graph, axis), node, axis, pivot, rest)
+
+
+def _rotating_joints(model: mujoco.MjModel, body: int, axis: int) -> tuple[set[int], bool] | None:
+    """Joints that rotate a root about a world axis or move it across, and whether any does.
+
+    None if it cannot rotate so, or cannot move in all directions across alike.
+    """
+    kind, across = mujoco.mjtJoint, [index for index in range(3) if index != axis]
+    first = int(model.body_jntadr[body])
+    *slides, last = range(first, first + int(model.body_jntnum[body]))
+    rest, last_kind = reference_rotation(model, body), int(model.jnt_type[last])
+    if last_kind not in (kind.mjJNT_FREE, kind.mjJNT_BALL, kind.mjJNT_HINGE):
+        return None
+    if last_kind == kind.mjJNT_HINGE and abs(abs((rest @ model.jnt_axis[last])[axis]) - 1) > TOLERANCE:
+        return None
+    if (model.jnt_type[slides] != kind.mjJNT_SLIDE).any():
+        return None
+    lateral = [slide for slide in slides if abs((rest @ model.jnt_axis[slide])[axis]) < 1 - TOLERANCE]
+    directions = np.array([(rest @ model.jnt_axis[slide])[across] for slide in lateral])
+    dofs = model.jnt_dofadr[lateral]
+    if last_kind == kind.mjJNT_FREE:
+        directions, dofs = np.eye(2), model.jnt_dofadr[last] + np.array(across)
+    if len(dofs):
+        orthonormal = directions.shape == (2, 2) and np.abs(directions @ directions.T - np.eye(2)).max() <= TOLERANCE
+        if not orthonormal or not _isotropic(model, dofs) or len(actuators_of(model, *lateral)):
+            return None
+    if last_kind != kind.mjJNT_HINGE:
+        for actuator in actuators_of(model, last):
+            # Forces on a free joint act along the world's axes, torques about the body's own, or the parent's.
+            forces, torques = np.split(model.actuator_gear[actuator], [3 * (last_kind == kind.mjJNT_FREE)])
+            own = model.actuator_trntype[actuator] == _Transmission.mjTRN_JOINT
+            if any(part[across].any() for part in (forces, torques[: 0 if own else 3]) if len(part)):
+                return None
+    return {*lateral, last}, bool(len(dofs))
+
+
+def _isotropic(model: mujoco.MjModel, dofs: np.ndarray) -> bool:
+    """Whether passive forces on two orthogonal degrees of freedom are the same in all directions between them."""
+    linear = all(np.ptp(getattr(model, name)[dofs]) == 0 for name in ("dof_damping", "dof_armature"))
+    polynomial = getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1)))  # since MuJoCo 3.7
+    return bool(linear and not polynomial[dofs].any() and not model.dof_frictionloss[dofs].any())
+
+
+def contacts_depend_on_yaw(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: int) -> bool:
+    """Whether contact forces change, other than by rotation, when the scene rotates about a world axis.
+
+    They do if a moving geom can touch a fixed one other than a plane across the axis, or if a friction pyramid is in
+    between: its edges are along world axes, but for a capsule's on a plane, which are along the capsule.
+    """
+    pairs = _colliding_pairs(model, graph)
+    kind, plane = model.geom_type, int(mujoco.mjtGeom.mjGEOM_PLANE)
+    across = (kind == plane) & (np.abs(np.abs(data.geom_xmat[:, 2::3][:, axis]) - 1) < TOLERANCE)
+    fixed = graph.node_of_body[model.geom_bodyid] == 0
+    pyramids = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    for first, second, size, friction in pairs:
+        if any(fixed[each] and not across[each] for each in (first, second)):
+            return True
+        along_capsule = sorted((kind[first], kind[second])) == [plane, int(mujoco.mjtGeom.mjGEOM_CAPSULE)]
+        if size > 1 and not along_capsule and (pyramids or friction[0] != friction[1]):
+            return True
+    return False
+
+
+def _colliding_pairs(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, int, int, np.ndarray]]:
+    """Pairs of geoms that can collide, the dimension of their contact and two coefficients of sliding friction."""
+    if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
+        return
+    node = graph.node_of_body[model.geom_bodyid]
+    explicit = list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
+    for index, (first, second) in enumerate(explicit):
+        if node[first] or node[second]:
+            yield first, second, int(model.pair_dim[index]), model.pair_friction[index, :2]
+    filters = not model.opt.disableflags & _Disable.mjDSBL_FILTERPARENT
+    masks = model.geom_contype[:, None] & model.geom_conaffinity
+    for first, second in np.argwhere(np.triu(masks | masks.T, 1)).tolist():
+        one, other = int(node[first]), int(node[second])
+        related = filters and one and other and (graph.parent[one] == other or graph.parent[other] == one)
+        low, high = sorted(model.geom_bodyid[[first, second]].tolist())
+        excluded = (low << 16) + high in model.exclude_signature
+        if one != other and not related and not excluded and not {(first, second), (second, first)} & set(explicit):
+            size, priority = model.geom_condim[[first, second]], model.geom_priority[[first, second]]
+            yield first, second, int(size[priority == priority.max()].max()), np.zeros(2)
