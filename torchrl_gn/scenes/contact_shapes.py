@@ -37,7 +37,7 @@ class RoundedBox(NamedTuple):
         return np.array([corners[groups.ravel() == group].mean(0) for group in range(groups.max() + 1)])
 
     def distance(self, point: np.ndarray) -> float:
-        """Distance of a point ``[3]`` in the node's frame, metres; inside the box that of its surface, less rounding."""
+        """Distance of a point ``[3]`` in the node's frame, metres; from the box less rounding if inside."""
         outside = np.abs((point - self.center) @ self.rotation) - self.half
         return float(np.linalg.norm(np.maximum(outside, 0))) - self.radius
 

@@ -22,8 +22,12 @@ if TYPE_CHECKING:
 _NEAR = 0.02  # metres: up to this distance the fine features vary
 _FAR = 0.1  # metres: from this distance on all features are 0
 _SAME = 0.005  # metres: places nearer than this are one
+_TIE = 1e-5  # metres: of places that are so nearly as near the first is taken, so that rounding decides nothing
 _NOWHERE = 1e3  # metres: distance of a place that no candidate has
 _SIZE = 13
+_CANDIDATE = (
+    *("segment_node", "box_node", "start", "direction", "center", "rotation", "half_size", "radius", "has_ends"),
+)
 
 
 @dataclass(frozen=True)
@@ -77,27 +81,22 @@ class BoundPairContacts(Float64Buffers):
     radius: Tensor
     has_ends: Tensor
     sign: Tensor
-    order: Tensor
+    tie: Tensor
 
     def __init__(self, scene: Scene, places: int) -> None:
         super().__init__()
         pairs = _pairs(scene)
         self.timestep, self.places, self.joint_edges = float(scene.timestep), places, scene.num_edges
-        counts = np.bincount(pairs.pair, minlength=len(pairs.nodes)).tolist()
-        names = ("segment_node", "box_node", "start", "direction", "center", "rotation", "half_size", "radius", "has_ends")
-        # Candidates in rounds: one of each pair, those with the most candidates first.
-        starts = np.cumsum([0, *counts])
-        rounds = [[int(starts[pair]) + index for pair, count in enumerate(counts) if count > index]
-                  for index in range(max(counts, default=0))]
-        self.rounds = [len(each) for each in rounds]
-        order = np.array([index for each in rounds for index in each], dtype=np.int64)
-        self.constants({
-            **{name: torch.as_tensor(getattr(pairs, name)[order]) for name in names},
-            "first": torch.as_tensor(pairs.nodes[:, 0].copy()),
-            "second": torch.as_tensor(pairs.nodes[:, 1].copy()),
-            # Normals point from a pair's first node to its second.
-            "sign": torch.as_tensor(np.where(pairs.segment_node == pairs.nodes[pairs.pair, 1], 1.0, -1.0)[order]),
-        })
+        # Candidates in rounds: the first of each pair, then the second of those that have one, ...
+        number = np.arange(len(pairs.pair)) - np.searchsorted(pairs.pair, pairs.pair)
+        order, self.rounds = np.lexsort((pairs.pair, number)), np.bincount(number).tolist()
+        # Of a segment and its ends alike near, the ends.
+        tie = _TIE * (number + len(self.rounds) * pairs.has_ends)
+        # Normals point from a pair's first node to its second.
+        sign = np.where(pairs.segment_node == pairs.nodes[pairs.pair, 1], 1.0, -1.0)
+        values = {name: getattr(pairs, name) for name in _CANDIDATE} | {"tie": tie, "sign": sign}
+        first, second = pairs.nodes.T.copy()
+        self.constants({"first": first, "second": second, **{name: value[order] for name, value in values.items()}})
 
     def forward(self, inputs: StepInputs) -> Tensor:
         """Features ``[*B, E, 13 K]`` of all edges; 0 at joints, and at bodies more than 10 cm apart.
@@ -152,7 +151,7 @@ class BoundPairContacts(Float64Buffers):
         point = origin + near.fraction.unsqueeze(-1) * line - inwards.unsqueeze(-1) * normal
         # A segment whose end is nearest gives way to its other end, which may touch too: both are candidates.
         to_end = (0.5 - (near.fraction - 0.5).abs()) * torch.linalg.vector_norm(direction, dim=-1)
-        rank = distance + torch.where(self.has_ends, (_SAME - to_end).clamp(min=0), 0.0)
+        rank = distance + self.tie.to(dtype) + torch.where(self.has_ends, (_SAME - to_end).clamp(min=0), 0.0)
         each = torch.cat((rank.unsqueeze(-1), distance.unsqueeze(-1), sign.unsqueeze(-1) * normal, point), dim=-1)
         return self._first(each)[..., 1:]
 
