@@ -157,10 +157,10 @@ def _shown(scene: Scene, first: int, second: int) -> bool:
 
 def _planar_axes(scene: Scene, data: mujoco.MjData, *nodes: int) -> tuple[np.ndarray | None, np.ndarray | None]:
     """World axis about which both nodes turn, moving across it alone, in each node's frame; None if they are free."""
-    moves = scene.movable[list(nodes)].any(0)
+    moves = np.any(scene.movable[list(nodes)], axis=0)
     for axis in range(3):
         across = [index for index in range(3) if index != axis]
-        if not moves[axis] and not moves[3:6][across].any():
+        if not moves[axis] and not moves[[3 + index for index in across]].any():
             one, other = (data.xmat[scene.body[node]].reshape(3, 3)[axis].copy() for node in nodes)
             return one, other
     return None, None
