@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, ForwardModel, JointAxes
+from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, ForwardModel, JointAxes, PairContacts
 from torchrl_gn.scenes import KinematicTree, Scene
 from torchrl_gn.training import plain_config
 
@@ -23,8 +23,8 @@ def build_model(
     """
     given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
-    optional = {"joint_axes": JointAxes(), "contacts": Contacts()}
-    chosen = [feature for name, feature in optional.items() if shown.pop(name)]
+    optional = {"joint_axes": JointAxes(), "contacts": Contacts(), "contact_pairs": PairContacts()}
+    chosen = [feature for name, feature in optional.items() if shown.pop(name, False)]
     features = (BodyState(**shown), Controls(), *chosen)
     return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.dynamics.features.feature import graph_edges
 from torchrl_gn.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -38,13 +39,20 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
         )
 
 
-def check_scene(model: ForwardModel, scene: Scene) -> None:
-    """ValueError if the graph has another size than the core reads, or shows parameters hidden from the model."""
-    counts = model.core.counts
-    if counts is not None and counts != (scene.num_nodes, scene.num_edges):
+def check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
+    """ValueError if the graph has another size than the core reads, or shows parameters hidden from the model.
+
+    ``varies``: whether each sample may be another variant of the scene.
+    """
+    counts, size = model.core.counts, (scene.num_nodes, graph_edges(scene, model.features).shape[1])
+    if counts is not None and counts != size:
         raise ValueError(
             f"The model reads graphs of {counts[0]} nodes and {counts[1]} edges alone; scene {scene.name!r} has"
-            f" {scene.num_nodes} and {scene.num_edges}. Train another, or a graph network."
+            f" {size[0]} and {size[1]}. Train another, or a graph network."
+        )
+    if varies and model.marks_edges:
+        raise ValueError(
+            "PairContacts has the geoms of one scene, but each sample may be another variant: leave the feature out."
         )
     if model.parameter_source != "scene" and "parameters" in getattr(scene, "origin", ()):
         raise ValueError(

@@ -9,7 +9,16 @@ from typing import Any, Literal, cast, get_args
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_gn.dynamics.features import FEATURES, BodyState, Canonicalizer, Contacts, Controls, Feature, JointAxes
+from torchrl_gn.dynamics.features import (
+    FEATURES,
+    BodyState,
+    Canonicalizer,
+    Contacts,
+    Controls,
+    Feature,
+    JointAxes,
+    graph_edges,
+)
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
@@ -80,6 +89,8 @@ class ForwardModel(nn.Module):
         self.dynamic_size = GraphSize(count("nodes"), count("edges"), 0)
         self.inferred_size = GraphSize(*inferred)
         names = self.parameter_names
+        # One feature marks edges that no joint has.
+        self.marks_edges = any(feature.adds_edges for feature in self.features)
         static = GraphSize(len(names.nodes), len(names.edges), len(names.globals_))
         if parameters == "inferred":
             # The anchor offsets say how long bodies are.
@@ -88,6 +99,7 @@ class ForwardModel(nn.Module):
         self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=_DYNAMIC_FLOOR)
         self.parameter_node_normalizer = Normalizer(static.nodes, limit=_PARAMETER_LIMIT)
         self.parameter_edge_normalizer = Normalizer(static.edges, limit=_PARAMETER_LIMIT)
+        static += GraphSize(0, int(self.marks_edges), 0)
         self.parameter_global_normalizer = Normalizer(static.globals_, limit=_PARAMETER_LIMIT)
         # The network's output has the residual's scale; errors are weighted by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
@@ -112,7 +124,7 @@ class ForwardModel(nn.Module):
             spatial = "orientation" in layout.names
             features = (BodyState(), Controls(), *((JointAxes(), Contacts()) if spatial else ()))
         chosen = [feature.resolved(first) for feature in features]
-        counts = first.num_nodes, first.num_edges
+        counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)
 
     def _apply(self, fn, recurse: bool = True):

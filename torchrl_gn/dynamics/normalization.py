@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchrl_gn.dynamics.checks import check_shapes
 from torchrl_gn.dynamics.executors import eager
@@ -34,6 +35,10 @@ def static_graph(predictor: Predictor, parameters: PhysicalParameters, dtype: to
     else:
         normalizers = model.parameter_normalizers.items()
         nodes, edges, globals_ = (normalizer(getattr(parameters, part), dtype) for part, normalizer in normalizers)
+        if model.marks_edges:
+            edges = pad(edges, (0, 1, 0, predictor.incidence.num_edges - edges.shape[-2]))
+            added = torch.arange(edges.shape[-2], device=edges.device) >= predictor.scene.num_edges
+            edges = torch.cat((edges[..., :-1], added.to(dtype).unsqueeze(-1).expand_as(edges[..., -1:])), dim=-1)
     return Graph(nodes, edges, globals_, predictor.incidence.edge_index)
 
 

@@ -17,6 +17,7 @@ from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.eager import EagerExecutor
 from torchrl_gn.dynamics.executors.native import NativeDelta
 from torchrl_gn.dynamics.features.controls import ControlInputs
+from torchrl_gn.dynamics.features.feature import graph_edges
 from torchrl_gn.dynamics.normalization import in_range, scaled, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.program import Executor, StepProgram
@@ -70,15 +71,14 @@ class Predictor(TensorDictModuleBase):
         parameters_keys = [] if parameters_key is None else [parameters_key]
         self.in_keys: list[NestedKey] = [state_key, action_key, *parameters_keys, *hidden_keys]
         self.out_keys: list[NestedKey] = [unravel_key(("next", key)) for key in (state_key, *hidden_keys)]
-        check_scene(model, scene)
+        check_scene(model, scene, varies=parameters_key is not None)
         self.model, self.scene, self.layout = model, scene, model.layout
         self.strict, self.reference = strict, reference
         self._trainer: NativeDelta | None = None
 
-        ends = torch.as_tensor(scene.senders), torch.as_tensor(scene.receivers)
         self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
-        self.incidence = Incidence(torch.stack(ends).long(), scene.num_nodes, predicted)
+        self.incidence = Incidence(graph_edges(scene, model.features), scene.num_nodes, predicted)
         self.canonicalizer = model.canonicalizer.bind(scene, model.layout)
         self.controls = ControlInputs(scene)
         self.features = nn.ModuleDict({"nodes": nn.ModuleList(), "edges": nn.ModuleList()})

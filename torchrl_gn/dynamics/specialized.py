@@ -182,7 +182,7 @@ class SpecializedPredictor(Predictor):
     def skipped(self) -> dict[str, tuple[float, float]]:
         """What one prediction handles in the reference model, and here."""
         program, core, size = self.executor().program, self.model.core, self.model.dynamic_size
-        nodes, edges = self.scene.num_nodes, self.scene.num_edges
+        nodes, edges = self.scene.num_nodes, self.incidence.num_edges
         static = static_graph(self, self.scene_parameters, dtype_of(core))
         kept_nodes, kept_edges = _width(program.nodes, size.nodes), _width(program.edges, size.edges)
 

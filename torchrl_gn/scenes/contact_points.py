@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _GEOM = mujoco.mjtGeom
 
+SHAPES = tuple(map(int, (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX, _GEOM.mjGEOM_ELLIPSOID)))
+"""Geoms that have contact points."""
 SLOTS = 4
 """Contact points per node that models read: the ones farthest from the node's origin."""
 
@@ -31,6 +33,7 @@ class ContactPoints:
     radius: np.ndarray  # [C] metres; 0 for a corner
     normal: np.ndarray  # [3] normal of the plane, world frame
     origin: np.ndarray  # [3] a point on the plane, metres
+    plane: int  # geom
 
 
 def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> ContactPoints | None:
@@ -53,7 +56,7 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
         if spheres:
             nodes, offsets, radii = (np.array(column) for column in zip(*spheres, strict=True))
             normal, origin = data.geom_xmat[plane, 2::3].copy(), data.geom_xpos[plane].copy()
-            return ContactPoints(nodes, offsets, radii, normal, origin)
+            return ContactPoints(nodes, offsets, radii, normal, origin, int(plane))
     return None
 
 

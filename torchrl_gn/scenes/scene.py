@@ -9,6 +9,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.contact_pairs import ContactPairs, find_contact_pairs
 from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.fingerprint import physics
 from torchrl_gn.scenes.topology import EdgePair, JointAnchors, named
@@ -104,6 +105,11 @@ class Scene:
         """Length ``S`` of the full MuJoCo state (``mjSTATE_FULLPHYSICS``)."""
         return mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
+    @cached_property
+    def contact_pairs(self) -> ContactPairs:
+        """Nodes that can meet; the first call takes up to seconds."""
+        return find_contact_pairs(self)
+
     @property
     def state_size(self) -> int:
         return 13  # position 3, quaternion 4, linear velocity 3, angular velocity 3
@@ -173,7 +179,7 @@ class Scene:
             bounds = ", ".join(f"[{self.action_low[a]:.4g}, {self.action_high[a]:.4g}]" for a in actions)
             between = f"{self.node_names[pair.first]} - {self.node_names[pair.second]}"
             rows.append((pair.name, pair.kind, between, motors or "-", bounds or "-"))
-        return "\n".join([*lines, *_table(rows), *self._notes()])
+        return "\n".join([*lines, *_table(rows), *self._notes(), *self._contacts()])
 
     def _notes(self) -> list[str]:
         """What the edges do not show."""
@@ -192,6 +198,16 @@ class Scene:
             "mocap bodies, fixed at the pose of the model": mocap,
         }
         return [f"  {what}: {', '.join(names)}" for what, names in notes.items() if names]
+
+    def _contacts(self) -> list[str]:
+        """What can meet, for printing."""
+        pairs, names, lines = self.contact_pairs, self.node_names, []
+        if len(pairs.nodes):
+            more = f", and {pairs.left_out} less frequent pairs that are left out" * (pairs.left_out > 0)
+            lines.append(f"  can meet: {', '.join(f'{names[a]} - {names[b]}' for a, b in pairs.nodes)}{more}")
+        if pairs.ignored:
+            lines.append(f"  no contact features of {', '.join(pairs.ignored)}")
+        return lines
 
 
 def _axes(flags: np.ndarray, none: str = "-") -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchrl_gn.dynamics.features.canonical_state import CanonicalState
 from torchrl_gn.dynamics.features.feature import StepInputs
@@ -47,11 +48,16 @@ def rollout_by_steps(
 def features(program: StepProgram, canonical: CanonicalState, action: Tensor) -> tuple[Tensor, Tensor]:
     """Dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised."""
     inputs = StepInputs(canonical, program.controls(action), program.parameters)
-    nodes, edges = (
-        torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
-        for parts in ([feature(inputs) for feature in of] for of in (program.node_features, program.edge_features))
-    )
+    nodes = [feature(inputs) for feature in program.node_features]
+    edges = [_of_all_edges(feature(inputs), program.edge_index.shape[1]) for feature in program.edge_features]
+    nodes, edges = (torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0] for parts in (nodes, edges))
     return nodes, edges
+
+
+def _of_all_edges(features: Tensor, count: int) -> Tensor:
+    """Features ``[*B, count, F]``, 0 at edges that features add."""
+    missing = count - features.shape[-2]
+    return pad(features, (0, 0, 0, missing)) if missing else features
 
 
 def dynamic_graph(program: StepProgram, canonical: CanonicalState, action: Tensor) -> Graph:

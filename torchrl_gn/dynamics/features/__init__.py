@@ -11,10 +11,13 @@ from torchrl_gn.dynamics.features.contacts import Contacts as Contacts
 from torchrl_gn.dynamics.features.controls import Controls as Controls
 from torchrl_gn.dynamics.features.feature import Feature as Feature
 from torchrl_gn.dynamics.features.feature import StepInputs as StepInputs
+from torchrl_gn.dynamics.features.feature import graph_edges as graph_edges
 from torchrl_gn.dynamics.features.joint_axes import JointAxes as JointAxes
+from torchrl_gn.dynamics.features.pair_contacts import PairContacts as PairContacts
 
 FEATURES: dict[str, type[Feature]] = {
     "body_state": BodyState,
+    "contact_pairs": PairContacts,
     "contacts": Contacts,
     "controls": Controls,
     "joint_axes": JointAxes,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
+import numpy as np
+import torch
 from torch import Tensor, nn
 
 from torchrl_gn.maths.state_layout import StateLayout
@@ -28,6 +31,7 @@ class Feature:
     """Features of every node or edge (base class): options here, constants of a scene in what :meth:`bind` returns."""
 
     part: ClassVar[Literal["nodes", "edges"]]  # whether nodes or edges get the features
+    adds_edges: ClassVar[bool] = False  # whether it adds edges behind the scene's
 
     def resolved(self, scene: Scene) -> Feature:
         """The same feature with its open options read from a scene."""
@@ -37,10 +41,23 @@ class Feature:
         """Number of features of each node or edge."""
         raise NotImplementedError
 
+    def added_edges(self, scene: Scene) -> np.ndarray:
+        """Senders above receivers ``[2, X]`` of the edges that it adds."""
+        return np.empty((2, 0), dtype=np.int64)
+
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        """Module from :class:`StepInputs` to features ``[*B, N, size]`` or ``[*B, E, size]``, for one scene."""
+        """Module from :class:`StepInputs` to features ``[*B, N, size]`` or ``[*B, E, size]``, for one scene.
+
+        Edges behind the last that it gives features to have 0.
+        """
         raise NotImplementedError
 
     def options(self) -> dict:
         """Its options as plain values."""
         return asdict(self)
+
+
+def graph_edges(scene: Scene, features: Sequence[Feature]) -> Tensor:
+    """Senders above receivers ``[2, E]`` of the graph that the network sees: the scene's edges, then added ones."""
+    added = [feature.added_edges(scene) for feature in features]
+    return torch.as_tensor(np.concatenate((np.stack((scene.senders, scene.receivers)), *added), axis=1)).long()

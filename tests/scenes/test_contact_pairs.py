@@ -1,0 +1,103 @@
+"""Contact pairs: which nodes can meet, by MuJoCo's rules and at random configurations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes.contact_pairs import MOST_CANDIDATES, MOST_PAIRS
+
+from .. import zoo
+
+CHAIN = """<mujoco><option gravity="0 0 0"/><default><geom type="capsule" size="0.02" {geom}/></default><worldbody>
+<body name="a"><joint axis="0 1 0"/><geom name="a" fromto="0 0 0 0.2 0 0"/>
+<body name="b" pos="0.2 0 0"><joint axis="0 1 0" {joint}/><geom name="b" fromto="0 0 0 0.2 0 0"/>
+<body name="c" pos="0.2 0 0"><joint axis="0 1 0"/><geom name="c" fromto="0 0 0 0.1 0 0"/></body></body></body>
+</worldbody>{more}</mujoco>"""
+
+
+def chain(geom="", joint="", more=""):
+    return load_scene(CHAIN.format(geom=geom, joint=joint, more=more))
+
+
+def names(scene) -> set[str]:
+    return {" - ".join(scene.node_names[node] for node in nodes) for nodes in scene.contact_pairs.nodes}
+
+
+def test_a_finger_meets_box_and_table():
+    scene = zoo.load("pusher")
+    assert names(scene) == {"world - mount", "world - link", "world - box", "mount - box", "link - box"}
+    pairs = scene.contact_pairs
+    counts = np.bincount(pairs.pair)
+    assert counts.max() <= MOST_CANDIDATES and (np.diff(counts) <= 0).all()
+    assert "can meet: world - box, " in str(scene)
+    assert scene.contact_pairs is pairs
+    again = zoo.load("pusher").contact_pairs
+    for field in ("nodes", "pair", "start", "direction", "center", "half_size", "radius"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(pairs, field))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, {"a - c"}),  # neighbours never collide in MuJoCo
+        ({"more": '<option><flag filterparent="disable"/></option>'}, {"a - b", "b - c", "a - c"}),
+        ({"more": '<contact><exclude body1="c" body2="a"/></contact>'}, set()),
+        ({"more": '<contact><pair geom1="a" geom2="b"/></contact>'}, {"a - b", "a - c"}),
+        ({"geom": 'contype="1" conaffinity="2"'}, set()),
+        (
+            {"geom": 'contype="1" conaffinity="2"', "more": '<contact><pair geom1="a" geom2="c"/></contact>'},
+            {"a - c"},
+        ),
+        ({"more": '<option><flag contact="disable"/></option>'}, set()),
+    ],
+)
+def test_only_those_that_may_collide(changes, expected):
+    assert names(chain(**changes)) == expected
+
+
+def test_only_those_that_come_near():
+    assert names(chain(joint='limited="true" range="-170 170"')) == {"a - c"}
+    assert names(chain(joint='limited="true" range="-10 10"')) == set()
+
+
+def test_planar_boxes_have_one_candidate_for_two_corners_behind_each_other():
+    text = """<mujoco><worldbody><body><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+    <joint axis="0 1 0"/><geom type="box" size="0.1 0.2 0.05" pos="0.1 0 0.3" euler="0 20 0"/></body>
+    <geom type="box" size="5 1 0.1"/></worldbody></mujoco>"""
+    pairs = load_scene(text).contact_pairs
+    assert len(pairs.pair) == 4
+    np.testing.assert_allclose(pairs.start[:, 1], 0, atol=1e-12)
+
+
+def test_a_plane_beside_that_of_the_contact_points_and_what_these_lack():
+    text = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 1"><freejoint/>{}</body>
+    {}</worldbody></mujoco>"""
+    ball, drum = '<geom size="0.1"/>', '<geom type="cylinder" size="0.1 0.2"/>'
+    wall = '<geom type="plane" size="1 1 1" pos="2 0 0" zaxis="-1 0 0"/>'
+    assert len(load_scene(text.format(ball, "")).contact_pairs.nodes) == 0
+    assert len(load_scene(text.format(drum, "")).contact_pairs.pair) == 1 + 2  # a segment and its ends
+    pairs = load_scene(text.format(ball, wall)).contact_pairs
+    assert len(pairs.pair) == 1
+    surface = pairs.center[0] + pairs.rotation[0, :, 2] * pairs.half_size[0, 2]
+    np.testing.assert_allclose(surface, [2, 0, 0], atol=1e-9)
+
+
+def test_height_fields_are_named():
+    scene = zoo.load("everything")
+    assert scene.contact_pairs.ignored == ("ground",)
+    assert str(scene).endswith("no contact features of ground")
+
+
+def test_the_most_frequent_pairs_are_kept():
+    balls = "".join(f'<body pos="0 0 {i}"><freejoint/><geom size="0.1"/></body>' for i in range(9))
+    scene = load_scene(f"<mujoco><worldbody>{balls}</worldbody></mujoco>")
+    assert len(scene.contact_pairs.nodes) == MOST_PAIRS and scene.contact_pairs.left_out == 36 - MOST_PAIRS
+    assert "12 less frequent pairs that are left out" in str(scene)
+
+
+def test_the_paper_s_systems():
+    found = {name: names(load_scene(name)) for name in ("pendulum", "cartpole", "acrobot", "swimmer6", "walker2d")}
+    assert not any(found.values())  # their geoms' masks let them touch the floor alone, if anything
+    assert names(load_scene("cheetah")) == {"torso - bfoot", "bthigh - bfoot", "torso - ffoot"}

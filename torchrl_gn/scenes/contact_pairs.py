@@ -1,0 +1,264 @@
+"""Contact pairs: nodes whose geoms can meet, found at random configurations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.contact_points import SHAPES
+from torchrl_gn.scenes.contact_shapes import Candidate, RoundedBox, candidates, rounded_box
+from torchrl_gn.scenes.invariance import can_collide
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.scene import Scene
+
+MOST_PAIRS = 24
+MOST_CANDIDATES = 16  # of each pair
+_MARGIN = 0.05  # metres: geoms that come so near can meet
+_CONFIGURATIONS = 400
+_ENOUGH = 20  # configurations in which geoms are near are counted up to this
+_GEOM, _JOINT, _DISABLE = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtDisableBit
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPairs:
+    """Pairs of nodes that can meet, and segments on one node near boxes on the other, one of which is the nearest.
+
+    Pairs have their most frequent first, pairs with the most candidates before others.
+    """
+
+    nodes: np.ndarray  # [P, 2] nodes of each pair
+    pair: np.ndarray  # [C] pair of each candidate
+    segment_node: np.ndarray  # [C] node that the segment is on
+    box_node: np.ndarray  # [C] node that the box is on
+    start: np.ndarray  # [C, 3] one end of the segment in its node's frame, metres
+    direction: np.ndarray  # [C, 3] from there to the other end; 0: a point
+    center: np.ndarray  # [C, 3] centre of the box in its node's frame, metres
+    rotation: np.ndarray  # [C, 3, 3] from the box's frame to its node's
+    half_size: np.ndarray  # [C, 3] half sizes of the box, metres
+    radius: np.ndarray  # [C, 2] rounding of segment and box, metres
+    has_ends: np.ndarray  # [C] bool, whether the segment's ends are candidates too
+    left_out: int = 0  # pairs beyond the MOST_PAIRS most frequent
+    ignored: tuple[str, ...] = ()  # names of geoms that can be touched but have no distance, such as height fields
+
+    def __str__(self) -> str:
+        return f"{len(self.nodes)} contact pairs, {len(self.pair)} candidates"
+
+
+def find_contact_pairs(scene: Scene) -> ContactPairs:
+    """Find the nodes that can meet.
+
+    Takes geoms that MuJoCo lets collide and that come within 5 cm of each other in one of 400 random configurations
+    within the joints' limits; bodies that move freely are put near other geoms in most of these. Leaves out what
+    :class:`~torchrl_gn.scenes.contact_points.ContactPoints` has. The same scene always gives the same pairs.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    node_of_geom = np.searchsorted(scene.body, model.body_weldid)[model.geom_bodyid]
+    mujoco.mj_kinematics(model, data)
+    boxes = [rounded_box(model, data, geom, int(scene.body[node])) for geom, node in enumerate(node_of_geom)]
+    possible = _colliding(scene, node_of_geom)
+    ignored = {geom for pair in possible for geom in pair if boxes[geom] is None}
+    pairs = np.array([pair for pair in possible if not ignored & set(pair)], dtype=np.int64).reshape(-1, 2)
+    axes = {}
+    found: dict[tuple[int, int], list[Candidate]] = {}
+    for first, second in pairs.tolist():
+        nodes = int(node_of_geom[first]), int(node_of_geom[second])
+        axes[first, second] = _planar_axes(scene, data, *nodes)
+        found[first, second] = candidates(_known(boxes[first]), _known(boxes[second]), axes[first, second])
+    seen = _count_near(scene, pairs, found)
+    of_nodes: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
+    often: dict[tuple[int, int], int] = {}
+    for geoms, (near, counts) in seen.items():
+        a, b = (int(node_of_geom[geom]) for geom in geoms)
+        kept = [(int(count), each) for count, each in zip(counts, found[geoms], strict=True) if count]
+        if a > b:  # the lower node first
+            a, b, kept = b, a, [(count, each._replace(on_second=not each.on_second)) for count, each in kept]
+        if kept:
+            of_nodes.setdefault((a, b), []).extend(kept)
+            often[a, b] = often.get((a, b), 0) + near
+    chosen = sorted(sorted(of_nodes), key=lambda nodes: -often[nodes])[:MOST_PAIRS]
+    lists = {nodes: sorted(of_nodes[nodes], key=lambda each: -each[0])[:MOST_CANDIDATES] for nodes in chosen}
+    chosen.sort(key=lambda nodes: -len(lists[nodes]))
+    names = tuple(_name(model, geom) for geom in sorted(ignored))
+    return _arrays(chosen, [[each for _, each in lists[nodes]] for nodes in chosen], len(of_nodes) - len(chosen), names)
+
+
+def _arrays(
+    nodes: list[tuple[int, int]], lists: list[list[Candidate]], left_out: int, ignored: tuple[str, ...]
+) -> ContactPairs:
+    rows = [(pair, each) for pair, of_pair in enumerate(lists) for each in of_pair]
+    pair = np.array([pair for pair, _ in rows], dtype=np.int64)
+    ends = np.array(nodes, dtype=np.int64).reshape(-1, 2)
+    second = np.array([each.on_second for _, each in rows], dtype=np.int64)
+
+    def column(values: list, *shape: int) -> np.ndarray:
+        return np.array(values, dtype=np.float64).reshape(len(rows), *shape)
+
+    return ContactPairs(
+        nodes=ends,
+        pair=pair,
+        segment_node=ends[pair, second],
+        box_node=ends[pair, 1 - second],
+        start=column([each.start for _, each in rows], 3),
+        direction=column([each.direction for _, each in rows], 3),
+        center=column([each.box.center for _, each in rows], 3),
+        rotation=column([each.box.rotation for _, each in rows], 3, 3),
+        half_size=column([each.box.half for _, each in rows], 3),
+        radius=column([(each.radius, each.box.radius) for _, each in rows], 2),
+        has_ends=np.array([each.has_ends for _, each in rows], dtype=bool),
+        left_out=left_out,
+        ignored=ignored,
+    )
+
+
+def _known(box: RoundedBox | None) -> RoundedBox:
+    assert box is not None
+    return box
+
+
+def _name(model: mujoco.MjModel, geom: int) -> str:
+    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"geom{geom}"
+
+
+def _colliding(scene: Scene, node_of_geom: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of geoms on different nodes that MuJoCo lets collide, without those that contact points show."""
+    model, weld = scene.model, scene.model.body_weldid[scene.model.geom_bodyid]
+    above = np.where(weld > 0, model.body_weldid[model.body_parentid[weld]], -1)  # the welded body that it hangs on
+    explicit = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+    excluded = set(model.exclude_signature.tolist())
+    family = not model.opt.disableflags & _DISABLE.mjDSBL_FILTERPARENT
+    found = []
+    for second in range(model.ngeom):
+        for first in range(second):
+            bodies = sorted((int(model.geom_bodyid[first]), int(model.geom_bodyid[second])))
+            if node_of_geom[first] == node_of_geom[second] or _shown(scene, first, second):
+                continue
+            if not can_collide(model, first, second):
+                continue
+            if frozenset((first, second)) not in explicit:
+                related = above[first] == weld[second] > 0 or above[second] == weld[first] > 0
+                if (family and related) or (bodies[0] << 16) + bodies[1] in excluded:
+                    continue
+            found.append((first, second))
+    return found
+
+
+def _shown(scene: Scene, first: int, second: int) -> bool:
+    """Whether one geom is the plane of the contact points and the other has such points."""
+    points, kind = scene.contact_points, scene.model.geom_type
+    return points is not None and any(
+        plane == points.plane and int(kind[other]) in SHAPES for plane, other in ((first, second), (second, first))
+    )
+
+
+def _planar_axes(scene: Scene, data: mujoco.MjData, *nodes: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """World axis about which both nodes turn, moving across it alone, in each node's frame; None if they are free."""
+    moves = np.any(scene.movable[list(nodes)], axis=0)
+    for axis in range(3):
+        across = [index for index in range(3) if index != axis]
+        if not moves[axis] and not moves[[3 + index for index in across]].any():
+            one, other = (data.xmat[scene.body[node]].reshape(3, 3)[axis].copy() for node in nodes)
+            return one, other
+    return None, None
+
+
+def _count_near(
+    scene: Scene, pairs: np.ndarray, found: dict[tuple[int, int], list[Candidate]]
+) -> dict[tuple[int, int], tuple[int, np.ndarray]]:
+    """How often two geoms, and each of their candidates, are near, of those that ever are."""
+    model, data = scene.model, mujoco.MjData(scene.model)
+    seen: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
+    reach = np.where(model.geom_type == _GEOM.mjGEOM_PLANE, np.inf, model.geom_rbound)
+    nodes = np.searchsorted(scene.body, model.body_weldid)[model.geom_bodyid]
+    counts = np.zeros(len(pairs), dtype=np.int64)
+    for _ in _configurations(model, data) if len(pairs) else ():
+        away = np.linalg.norm(data.geom_xpos[pairs[:, 0]] - data.geom_xpos[pairs[:, 1]], axis=1)
+        close = (away - reach[pairs].sum(1) < _MARGIN) & (counts < _ENOUGH)
+        for index in np.flatnonzero(close):
+            first, second = pairs[index].tolist()
+            if mujoco.mj_geomDistance(model, data, first, second, _MARGIN, None) >= _MARGIN:
+                continue
+            counts[index] += 1
+            bodies = [int(scene.body[nodes[geom]]) for geom in (first, second)]
+            near = np.array([_is_near(data, each, *bodies) for each in found[first, second]])
+            _, before = seen.get((first, second), (0, 0))
+            seen[first, second] = int(counts[index]), before + near.astype(np.int64)
+    return seen
+
+
+def _is_near(data: mujoco.MjData, candidate: Candidate, first: int, second: int) -> bool:
+    """Whether a point is near the box; a segment always counts as near."""
+    if candidate.direction.any():
+        return True
+    body, other = (second, first) if candidate.on_second else (first, second)
+    world = data.xpos[body] + data.xmat[body].reshape(3, 3) @ candidate.start
+    local = data.xmat[other].reshape(3, 3).T @ (world - data.xpos[other])
+    return bool(candidate.box.distance(local) - candidate.radius < _MARGIN)
+
+
+def _configurations(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
+    """Random configurations within the joints' limits, kinematics done."""
+    rng = np.random.default_rng(0)
+    floating = _floating(model)
+    for _ in range(_CONFIGURATIONS):
+        _random_joints(model, data, rng)
+        mujoco.mj_kinematics(model, data)
+        for body in rng.permutation(np.array(list(floating), dtype=np.int64)).tolist():
+            if rng.random() < 0.8:
+                _move_near(model, data, rng, body, floating[body])
+                mujoco.mj_kinematics(model, data)
+        yield
+
+
+def _random_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
+    extent = float(model.stat.extent)
+    for joint in range(model.njnt):
+        kind, start = _JOINT(model.jnt_type[joint]), int(model.jnt_qposadr[joint])
+        if kind in (_JOINT.mjJNT_FREE, _JOINT.mjJNT_BALL):
+            if kind == _JOINT.mjJNT_FREE:
+                data.qpos[start : start + 3] = model.stat.center + rng.uniform(-extent, extent, 3)
+                start += 3
+            quat = rng.normal(size=4)
+            data.qpos[start : start + 4] = quat / np.linalg.norm(quat)
+            continue
+        widest = np.pi if kind == _JOINT.mjJNT_HINGE else extent
+        low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-widest, widest)
+        data.qpos[start] = rng.uniform(low, high) + (0 if model.jnt_limited[joint] else model.qpos0[start])
+
+
+def _floating(model: mujoco.MjModel) -> dict[int, list[int]]:
+    """Bodies below the world's with a free joint or slides without limits, and these joints."""
+    found: dict[int, list[int]] = {}
+    for joint in range(model.njnt):
+        body, kind = int(model.jnt_bodyid[joint]), model.jnt_type[joint]
+        free = kind == _JOINT.mjJNT_FREE or (kind == _JOINT.mjJNT_SLIDE and not model.jnt_limited[joint])
+        if free and model.body_weldid[model.body_parentid[body]] == 0:
+            found.setdefault(body, []).append(joint)
+    return found
+
+
+def _move_near(
+    model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator, body: int, joints: list[int]
+) -> None:
+    """Move a floating body so that a random geom of its tree is near a random other one."""
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+    if own.all() or not own.any():
+        return
+    geom, other = int(rng.choice(np.flatnonzero(own))), int(rng.choice(np.flatnonzero(~own)))
+    plane = model.geom_type[other] == _GEOM.mjGEOM_PLANE
+    away = rng.normal(size=3)
+    away *= rng.uniform(0.3, 1) * (model.geom_rbound[[geom, other]].sum() + _MARGIN) / np.linalg.norm(away)
+    shift = data.geom_xpos[other] + away - data.geom_xpos[geom]
+    if plane:
+        normal = data.geom_xmat[other, 2::3]
+        shift = (shift @ normal) * normal
+    for joint in joints:
+        start = int(model.jnt_qposadr[joint])
+        if model.jnt_type[joint] == _JOINT.mjJNT_FREE:
+            data.qpos[start : start + 3] += shift
+        else:
+            data.qpos[start] += data.xaxis[joint] @ shift
