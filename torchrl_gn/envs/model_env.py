@@ -72,6 +72,9 @@ class ModelEnv(ModelBasedEnvBase):
             raise TypeError(f"the model must read 'state' and 'action' and write ('next', 'state'); {keys}")
         if not hasattr(model, "scene"):
             raise TypeError(f"the model has no attribute 'scene'; bind {type(model).__name__} to a scene first")
+        if history := getattr(model.scene, "history", 0):
+            free = "a plan would choose them anew at every step"
+            raise ValueError(f"actions hold the commands of {history} past steps, and {free}; train with history=0")
         if device is None:
             weight = next(itertools.chain(model.parameters(), model.buffers()), None)
             device = torch.device("cpu") if weight is None else weight.device

@@ -34,6 +34,7 @@ class KinematicTree:
     action_low: np.ndarray = field(default_factory=lambda: np.empty(0))  # [A]; default: unbounded
     action_high: np.ndarray = field(default_factory=lambda: np.empty(0))
     joint_parents: tuple[int, ...] = ()  # parent of each joint, -1 for the base; default: the joint before it
+    history: int = 0  # past steps whose commands are among a joint's, which a plan cannot choose freely
 
     yaw_frame = None
     contact_points = None
@@ -172,7 +173,8 @@ class KinematicTree:
         """Hash of all arguments."""
         text = (self.name, *self.joint_names, f"{self.timestep:.6g}", str(self.commands), str(self.joint_parents))
         bounds = (f"{value:.6g}" for value in (*self.action_low, *self.action_high))
-        return hashlib.sha256("\n".join((*text, *self.extras, *bounds)).encode()).hexdigest()[:16]
+        past = (f"history {self.history}",) * (self.history > 0)
+        return hashlib.sha256("\n".join((*text, *self.extras, *bounds, *past)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
         joints, commands, step = self.num_joints, self.num_actions, 1e3 * self.timestep
