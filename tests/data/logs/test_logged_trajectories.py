@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from torchrl_gn.data import RobotLog, load_robot_log, log_trajectories, log_tree, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.envs import ModelEnv
 from torchrl_gn.scenes import scene_from_description
 
 STEP = 0.01
@@ -199,10 +199,9 @@ def test_a_graph_has_the_past_commands_at_their_joints():
     assert tree.action_low.tolist() == 3 * log.command_bounds()[0].tolist()
     again = scene_from_description(tree.description())
     assert again.history == 2 and again.fingerprint() == tree.fingerprint() != log_tree(log, "arm").fingerprint()
-    model = ForwardModel.for_scene(tree, hidden=[8])
-    start = torch.zeros(1, 3, 4)
-    with pytest.raises(ValueError, match="commands of 2 past steps.*history=0"):
-        ModelEnv(model.bind(tree), start_states=start)
+    assert tree.present.commands == ((1,), (0,)) and tree.present.action_high.tolist() == tree.action_high[:2].tolist()
+    with pytest.raises(ValueError, match="must be as many for each of 2 past steps"):
+        dataclasses.replace(tree, commands=((1, 3), (0, 2, 4)))
 
 
 def test_targets_are_smoothed_and_states_are_not():
