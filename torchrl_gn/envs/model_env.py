@@ -94,7 +94,7 @@ class ModelEnv(ModelBasedEnvBase):
                 spec["hidden_state"] = spec_of(cast(Any, model).initial_hidden_state(), self.device)
         if self.history:
             for spec in (self.observation_spec, self.state_spec):
-                spec["past_actions"] = Unbounded((self.history, self.scene.num_actions), device=self.device)
+                spec["past_actions"] = Unbounded(torch.Size((self.history, self.scene.num_actions)), device=self.device)
 
     @property
     def predictor(self) -> Predictor | ModulePredictor:

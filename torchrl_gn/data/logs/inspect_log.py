@@ -11,8 +11,9 @@ from torchrl_gn.data.logs.robot_log import RobotLog, short_way, unbroken
 
 _PAST = 4  # rows before a command from which it is predicted, to find what is new in it
 _ROWS = 50_000  # commands from which delays are estimated
-_SIGNIFICANT = 5.0  # standard deviations of a correlation by chance
-_ONSET = 0.25  # of the largest correlation: where a command begins to act
+_SIGNIFICANT = 4.0  # standard deviations by chance that a command's largest correlation must exceed
+_CHANCE = 3.0  # and its first one
+_ONSET = 0.1  # of the largest correlation: where a command begins to act
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class LogInspection:
     timestep: float  # seconds between rows
     jitter: float | None  # standard deviation of the time between rows, of the timestep; None without time stamps
     missing: int | None  # rows in the gaps of the time stamps
+    lag: int  # rows until the first command acts, seen over all joints together: ``lag`` of log_trajectories
     delays: tuple[JointDelay | None, ...]  # of each joint; None: no command moves it measurably
     noise: dict[str, np.ndarray]  # standard deviation by channel: angle (rad), velocity (rad/s), extras
     quantum: dict[str, np.ndarray]  # quantisation step by channel, 0 where none is found
@@ -39,11 +41,6 @@ class LogInspection:
     velocity_gain: np.ndarray  # slope of logged velocities over differentiated angles; 1 if units fit
     velocity_error: np.ndarray  # rad/s, standard deviation of their difference
     velocity_kind: str  # the difference of angles they match best: backward, central or forward
-
-    @property
-    def lag(self) -> int:
-        """Rows until the first command acts: ``lag`` of :func:`log_trajectories`."""
-        return min((delay.onset for delay in self.delays if delay), default=0)
 
     def __str__(self) -> str:
         rate = f"{1 / self.timestep:.4g} Hz, a row every {1e3 * self.timestep:.4g} ms"
@@ -81,12 +78,14 @@ def inspect_log(log: RobotLog, *, jump: float = 50.0) -> LogInspection:
     steps, missing = log.steps[good], log.steps[log.gaps]
     noise = channel_noise(log, pieces)
     gain, error, kind = _velocities(log, pieces)
+    lag, delays = _delays(log, pieces)
     channels = {"angle": log.angle, "velocity": log.velocity, **log.extra}
     return LogInspection(
         timestep=log.timestep,
         jitter=None if log.time is None else float(steps.std() / log.timestep),
         missing=None if log.time is None else int(np.maximum(np.round(missing / log.timestep) - 1, 0).sum()),
-        delays=_delays(log, pieces),
+        lag=lag,
+        delays=delays,
         noise=noise,
         quantum={name: np.array([_quantum(column) for column in values.T]) for name, values in channels.items()},
         half_widths=half_widths(log, pieces, noise),
@@ -96,17 +95,17 @@ def inspect_log(log: RobotLog, *, jump: float = 50.0) -> LogInspection:
     )
 
 
-def _delays(log: RobotLog, pieces: list[slice]) -> tuple[JointDelay | None, ...]:
+def _delays(log: RobotLog, pieces: list[slice]) -> tuple[int, tuple[JointDelay | None, ...]]:
     """Correlate what is new in each command with the accelerations of the rows behind it.
 
     A command that a controller computes from states correlates with accelerations before it acts. What past states and
     commands do not predict of it does not.
     """
-    farthest = int(np.clip(0.25 / log.timestep, 5, 50))
+    farthest = int(np.clip(0.25 / log.timestep, 10, 50))
     begin = np.concatenate([np.arange(piece.start, piece.stop - _PAST - farthest - 2) for piece in pieces] or [[]])
     rows = begin[:: 1 + len(begin) // _ROWS].astype(int) + _PAST  # of commands
     if not log.command.shape[1] or len(rows) < 50:
-        return (None,) * log.num_joints
+        return 0, (None,) * log.num_joints
     state = np.hstack((np.cos(log.angle), np.sin(log.angle), log.velocity))
     past = [state[rows - shift] for shift in range(_PAST)] + [log.command[rows - shift] for shift in range(1, _PAST)]
     predictors = np.hstack((np.ones((len(rows), 1)), *past))
@@ -118,18 +117,25 @@ def _delays(log: RobotLog, pieces: list[slice]) -> tuple[JointDelay | None, ...]
         change = log.velocity[rows + shift + 1] - log.velocity[rows + shift]
         correlation[shift] = new.T @ (change - change.mean(0)) / (len(rows) * np.maximum(change.std(0), 1e-30))
     found: list[JointDelay | None] = []
+    responses = []  # [shifts], in standard deviations by chance, positive at the peak
     for joint in range(log.num_joints):
-        strength = np.abs(correlation[..., joint])
-        peak, command = np.unravel_index(strength.argmax(), strength.shape)
-        most, chance = strength[peak, command], _SIGNIFICANT / np.sqrt(len(rows))
-        onset = np.flatnonzero(strength[:, command] >= max(_ONSET * most, chance))
-        delay = (
-            JointDelay(int(command), int(onset[0]), int(peak), float(correlation[peak, command, joint]))
-            if len(onset)
-            else None
-        )
-        found.append(delay)
-    return tuple(found)
+        own = correlation[..., joint]
+        peak, command = (int(index) for index in np.unravel_index(np.abs(own).argmax(), own.shape))
+        responses.append(own[:, command] * np.sign(own[peak, command]) * np.sqrt(len(rows)))
+        onset = _onset(np.abs(responses[-1]))
+        most = float(own[peak, command])
+        found.append(None if onset is None else JointDelay(command, onset, peak, most))
+    # Joints that react alike add up to what is seen in none of them: weigh each by its largest response.
+    weight = np.max(responses, 1)
+    together = np.abs(weight @ np.array(responses)) / max(np.linalg.norm(weight), 1e-30)
+    return (_onset(together) or 0) if any(found) else 0, tuple(found)
+
+
+def _onset(response: np.ndarray) -> int | None:
+    """First shift with a response, in standard deviations by chance ``[shifts]``; None if there is none."""
+    if response.max() < _SIGNIFICANT:
+        return None
+    return int(np.flatnonzero(response >= max(_ONSET * response.max(), _CHANCE))[0])
 
 
 def _velocities(log: RobotLog, pieces: list[slice]) -> tuple[np.ndarray, np.ndarray, str]:
