@@ -189,9 +189,10 @@ class KinematicTree:
         return hashlib.sha256("\n".join((*text, *self.extras, *bounds, *past)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
-        joints, commands, step = self.num_joints, self.num_actions, 1e3 * self.timestep
-        lines = [f"Robot {self.name}: {joints} joints, {commands} commands, step {step:g} ms"]
-        for name, indices, before in zip(self.joint_names, self.commands, self.joint_parents, strict=True):
+        now, step = self.present, 1e3 * self.timestep
+        past = f" and those of {self.history} past steps" if self.history else ""
+        lines = [f"Robot {self.name}: {self.num_joints} joints, {now.num_actions} commands{past}, step {step:g} ms"]
+        for name, indices, before in zip(self.joint_names, now.commands, self.joint_parents, strict=True):
             acting = ", ".join(map(str, indices)) or "none"
             lines.append(f"  {name}, parent {self.node_names[before + 1]}: commands {acting}")
         return "\n".join(lines)

@@ -200,6 +200,7 @@ def test_a_graph_has_the_past_commands_at_their_joints():
     again = scene_from_description(tree.description())
     assert again.history == 2 and again.fingerprint() == tree.fingerprint() != log_tree(log, "arm").fingerprint()
     assert tree.present.commands == ((1,), (0,)) and tree.present.action_high.tolist() == tree.action_high[:2].tolist()
+    assert "2 commands and those of 2 past steps" in str(tree) and "parent base: commands 1\n" in str(tree)
     with pytest.raises(ValueError, match="must be as many for each of 2 past steps"):
         dataclasses.replace(tree, commands=((1, 3), (0, 2, 4)))
 

@@ -71,7 +71,10 @@ def test_a_lerobot_folder(version, stamped, chosen, arrays, tmp_path):
     angle, velocity = (f"observation.state{which}" for which in chosen.split())
     log = load_robot_log(tmp_path / "set", names={"angle": angle, "velocity": velocity})
     assert_same(log, arrays)
-    assert not log.extra and log.unread == {"observation.image": "neither numbers nor text, nor lists of them"}
+    assert not log.extra and log.unread == {
+        "observation.image": "neither numbers nor text, nor lists of them",
+        "frame_index": "no name is given to it",
+    }
     assert (log.time is not None) is stamped
     with pytest.raises(DatasetError, match=r"no 'observation.state.\*torque'.*has columns \['joint0.pos'"):
         load_robot_log(tmp_path / "set", names={"angle": "observation.state.*torque"})
@@ -124,6 +127,7 @@ def test_robomimic_demonstrations(arrays, tmp_path):
         for demo, begin in ((10, LENGTH[0]), (2, 0)):  # by number: 2 comes first
             rows = slice(begin, begin + LENGTH[demo == 10])
             group = data.create_group(f"demo_{demo}")
+            group["states"] = np.zeros((LENGTH[demo == 10], 11))
             group["actions"] = arrays["command"][rows]
             group["obs/robot0_joint_pos"], group["obs/robot0_joint_vel"] = (
                 arrays["angle"][rows],
@@ -133,9 +137,9 @@ def test_robomimic_demonstrations(arrays, tmp_path):
             group["obs/image"] = np.zeros((LENGTH[demo == 10], 2, 2, 3), np.uint8)
     log = load_robot_log(tmp_path / "demo.hdf5")
     assert_same(log, arrays)
-    assert list(log.extra) == ["obs/robot0_joint_torque"] and "obs/image" in log.unread
-    without = load_robot_log(tmp_path / "demo.hdf5", names={"torque": "obs/robot0_joint_torque"})
-    assert list(without.extra) == ["torque"]
+    assert not log.extra and {"obs/image", "obs/robot0_joint_torque", "states"} == log.unread.keys()
+    named = load_robot_log(tmp_path / "demo.hdf5", names={"torque": "obs/robot0_joint_torque"})
+    assert list(named.extra) == ["torque"]
 
 
 def test_a_flat_hdf5_file(arrays, tmp_path):

@@ -34,7 +34,8 @@ def load_robot_log(
 
     LeRobot dataset folders (version 2 or 3) need ``names`` only where ``observation.state`` is more than angles: an
     array's columns are ``"observation.state[:7]"``, or by their names in ``info.json`` ``"observation.state.*pos"``. In
-    robomimic's ``.hdf5`` arrays are called as within an episode, ``"obs/robot0_joint_pos"`` (the default).
+    robomimic's ``.hdf5`` arrays are called as within an episode, ``"obs/robot0_joint_pos"`` (the default). Of both only
+    what is named is read.
 
     Args:
         timestep: time between rows, seconds, if the file does not have it.
@@ -95,6 +96,9 @@ def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dic
             used.add(used_name)
     rest = {name: values for name, values in arrays.items() if name not in used and name not in names.values()}
     unread = {name: f"{names[name]!r} was named for it" for name in rest if names.get(name)}
+    if found.only_named:
+        unread |= {name: "no name is given to it" for name in rest if name not in ("length", "timestep", *names)}
+        rest = {name: values for name, values in rest.items() if name not in unread}
     return {name: values for name, values in rest.items() if name not in names} | picked, unread
 
 

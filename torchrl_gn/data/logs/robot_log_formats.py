@@ -24,6 +24,7 @@ class LogArrays:
     columns: dict[str, list[str]] = field(default_factory=dict)
     names: Names = field(default_factory=dict)  # default of ``names=`` of :func:`load_robot_log`
     unread: dict[str, str] = field(default_factory=dict)
+    only_named: bool = False  # what has no name is no channel of the joints
 
 
 def read_log_arrays(path: Path) -> LogArrays:
@@ -69,8 +70,7 @@ def _read_lerobot(path: Path) -> LogArrays:
             columns[name] = [str(label) for label in labels]
     names = {"angle": "observation.state", "velocity": "", "command": "action", "episode": "episode_index"}
     names |= {"time": "timestamp"} if "timestamp" in arrays else {}
-    names |= {name: "" for name in ("frame_index", "index", "task_index") if name in arrays}
-    return LogArrays(arrays, columns, names, unread)
+    return LogArrays(arrays, columns, names, unread, only_named=True)
 
 
 def _read_hdf5(path: Path) -> LogArrays:
@@ -96,7 +96,7 @@ def _read_hdf5(path: Path) -> LogArrays:
         step = json.loads(data.attrs.get("env_args", "{}")).get("env_kwargs", {}).get("control_freq")
         if step:
             arrays["timestep"] = np.array(1 / step)
-        return LogArrays(arrays, names=names, unread=unread)
+        return LogArrays(arrays, names=names, unread=unread, only_named=True)
 
 
 READERS: dict[str, Callable[[Path], LogArrays]] = {
