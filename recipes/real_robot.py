@@ -2,15 +2,14 @@
 
     python recipes/real_robot.py [log=arm.npz] [timestep=0.01] ["names={angle: q, velocity: dq, command: u}"]
 
-Follows the paper's "Real robot data" and SM "Recurrent one-step predictions". Reads angles, velocities and commands of
-the joints (docs/data.md has the format), cuts them where they break, prints what was dropped, and trains a feed-forward
-and a recurrent graph network for equal time. Compares both on episodes never trained on (of a log with few episodes: on
-its last part), after `burn_in` true steps. Without a log it simulates one: the JACO arm, with lagging motors, play, and
-noisy, coarse encoders. Ctrl-C saves everything; the same `run_dir` goes on.
+Follows the paper's "Real robot data" and SM "Recurrent one-step predictions". Reads a log (docs/data.md),
+measures its rate, delays and noise, cuts it where it breaks, and trains a feed-forward and a recurrent
+graph network for equal time. Compares both on episodes never trained on (of few episodes: on the last part), after
+`burn_in` true steps. Without a log it simulates one: the JACO arm, with lagging motors, play, and noisy, coarse
+encoders. Ctrl-C saves everything; the same `run_dir` goes on.
 
-Writes config.yaml, metrics.json, a checkpoint of each model, and figures of measured and predicted joint angles
-(joints.png) and of the errors (errors.png) to its run folder. All options: recipes/config/real_robot.yaml. Results:
-docs/results.md.
+Writes config.yaml, metrics.json, a checkpoint of each model, and figures of joint angles (joints.png) and errors
+(errors.png) to its run folder. All options: recipes/config/real_robot.yaml. Results: docs/results.md.
 """
 
 from __future__ import annotations
@@ -27,7 +26,15 @@ from tensordict import TensorDictBase
 from _common import clean_exit, finish_run, open_log, with_help
 from _common.models import build_model
 from _common.progress import train_with_progress
-from torchrl_gn.data import RobotLog, load_robot_log, log_trajectories, log_tree, simulate_log, trajectory_buffer
+from torchrl_gn.data import (
+    RobotLog,
+    inspect_log,
+    load_robot_log,
+    log_trajectories,
+    log_tree,
+    simulate_log,
+    trajectory_buffer,
+)
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_joints, summary
 from torchrl_gn.objectives import ForwardModelLoss
@@ -50,22 +57,27 @@ MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "chec
 
 def read(cfg: DictConfig) -> tuple[RobotLog, KinematicTree]:
     """The log, or a simulated one, and the robot as a graph."""
-    commands = None if cfg.commands is None else [list(indices) for indices in cfg.commands]
+    options = plain_config(cfg)
     if cfg.log is not None:
-        log = load_robot_log(cfg.log, timestep=cfg.timestep, names=plain_config(cfg)["names"])
+        log = load_robot_log(cfg.log, **{key: options[key] for key in ("timestep", "names", "degrees")})
         name, joint_parents = Path(cfg.log).stem, cfg.joint_parents or ()
     else:
         own = cfg.simulated
         scene = load_scene("jaco", timestep=own.timestep)
         log = simulate_log(scene, own.episodes, own.steps, cfg.seed, **plain_config(own.faults))
         name, joint_parents = "simulated jaco", [-1, 0, 1, 2, 3, 4, 5, 5, 5]
-    return log, log_tree(log, name, resample=cfg.resample, commands=commands, joint_parents=joint_parents)
+    options = {key: options[key] for key in ("resample", "commands", "history")}
+    return log, log_tree(log, name, joint_parents=joint_parents, **options)
 
 
 def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
     """Trajectories to train, validate and test with: of whole episodes, or where these are few in blocks of time."""
-    data, report = log_trajectories(log, cfg.length, resample=cfg.resample, lag=cfg.lag, jump=cfg.jump)
-    print(report)
+    measured = inspect_log(log, jump=cfg.jump)
+    lag = measured.lag if cfg.lag == "auto" else cfg.lag
+    smooth = measured.half_widths if cfg.filter == "auto" else cfg.filter
+    options = {"resample": cfg.resample, "lag": lag, "jump": cfg.jump, "history": cfg.history, "smooth": smooth}
+    data, report = log_trajectories(log, cfg.length, **options)
+    print(measured, report, sep="\n")
     shares, which = (cfg.share.validation, cfg.share.test), data["episode"]
     order = torch.from_numpy(np.random.default_rng(cfg.data_seed).permutation(len(log.length)))
     counts = [int(share * len(order)) for share in shares]

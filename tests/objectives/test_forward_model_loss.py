@@ -398,3 +398,20 @@ def test_leaving_out_what_never_varies_changes_neither_loss_nor_gradient(make_lo
         monkeypatch.setattr(type(loss.model), "program", lambda self, parameters, reduced: whole(self, parameters))
     for reduced, full in zip(*results, strict=True):
         torch.testing.assert_close(reduced, full, rtol=1e-9, atol=1e-12)
+
+
+def test_channels_weigh_as_told(make_loss, windows):
+    plain = make_loss("falling")
+    weights = 0.1 + torch.rand(plain.model.movable.shape, generator=torch.Generator().manual_seed(0))
+    weighted = make_loss("falling", channel_weights=weights)
+    batch = windows["falling"].reshape(-1)
+    delta = plain.model.delta(batch["state"], batch["action"])
+    target = BODY_STATE.delta(batch["state"], batch["next", "state"])
+    # Perfect but for one channel: its weight is the ratio.
+    for channel in (0, 2, 7, 11):
+        off = torch.where(torch.arange(12) == channel, delta, target)
+        ratio = weighted.component_errors(off, target).sum() / plain.component_errors(off, target).sum()
+        assert ratio.item() == pytest.approx(weights[1, channel].item(), rel=1e-5)
+    assert weighted.state_dict().keys() == plain.state_dict().keys()
+    with pytest.raises(ValueError, match="channel_weights must be above 0"):
+        make_loss("falling", channel_weights=0 * weights)

@@ -70,13 +70,34 @@ def test_a_robot_without_motors_at_other_steps(pendulum, call, tmp_path):
     assert "0 commands, step 15 ms" in output and "interpolated between rows, at steps of 15 ms" in output
 
 
+@pytest.mark.slow
+def test_delay_and_filter_follow_the_measurements(pendulum, call, tmp_path):
+    """And past commands are seen by the models."""
+    options = (f"log={pendulum}", "names={angle: q, velocity: dq, command: u}", "commands=[[0], []]")
+    run, more = tmp_path / "run", ("lag=auto", "filter=auto", "history=2")
+    code, output, errors = call(*options, *more, f"run_dir={run}", *SMALL, recipe="real_robot")
+    assert code == 0, errors
+    assert "Hz, a row every" in output and "delay (rows)" in output
+    tree = load_pretrained(run / "feed-forward").scene()
+    assert tree.commands == ((0, 1, 2), ()) and tree.history == 2
+
+
 @pytest.mark.parametrize(
     ("share", "episodes"), [("{validation: 0.4, test: 0.4}", 5), ("{validation: 0.2, test: 0.2}", 4)]
 )
 def test_episodes_stay_whole_where_there_are_enough(share, episodes, recipe):
     log = simulate_log(load_scene("acrobot"), episodes, 62, 0)
     cfg = OmegaConf.create(
-        {"length": 10, "resample": None, "lag": 0, "jump": 50.0, "data_seed": 0, "share": OmegaConf.create(share)}
+        {
+            "length": 10,
+            "resample": None,
+            "lag": 0,
+            "jump": 50.0,
+            "history": 0,
+            "filter": 0,
+            "data_seed": 0,
+            "share": OmegaConf.create(share),
+        }
     )
     parts = recipe.split(cfg, log)
     which = {part: set(data["episode"].tolist()) for part, data in parts.items()}
@@ -90,6 +111,17 @@ def test_episodes_stay_whole_where_there_are_enough(share, episodes, recipe):
 def test_shares_that_leave_nothing_are_refused(recipe):
     log = simulate_log(load_scene("acrobot"), 1, 62, 0)
     for share in ({"validation": 0.6, "test": 0.6}, {"validation": 0.0, "test": 0.5}):
-        cfg = OmegaConf.create({"length": 10, "resample": None, "lag": 0, "jump": 50.0, "data_seed": 0, "share": share})
+        cfg = OmegaConf.create(
+            {
+                "length": 10,
+                "resample": None,
+                "lag": 0,
+                "jump": 50.0,
+                "history": 0,
+                "filter": 0,
+                "data_seed": 0,
+                "share": share,
+            }
+        )
         with pytest.raises(ValueError, match="1 episodes cannot be split by share="):
             recipe.split(cfg, log)

@@ -6,8 +6,12 @@ from torchrl_gn.data.dataset import TrajectoryDataset as TrajectoryDataset
 from torchrl_gn.data.dataset import create_dataset as create_dataset
 from torchrl_gn.data.dataset import load_dataset as load_dataset
 from torchrl_gn.data.dataset_files import DatasetError as DatasetError
+from torchrl_gn.data.logs import JointDelay as JointDelay
+from torchrl_gn.data.logs import LogInspection as LogInspection
 from torchrl_gn.data.logs import LogReport as LogReport
 from torchrl_gn.data.logs import RobotLog as RobotLog
+from torchrl_gn.data.logs import channel_weights as channel_weights
+from torchrl_gn.data.logs import inspect_log as inspect_log
 from torchrl_gn.data.logs import load_robot_log as load_robot_log
 from torchrl_gn.data.logs import log_trajectories as log_trajectories
 from torchrl_gn.data.logs import log_tree as log_tree

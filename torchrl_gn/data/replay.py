@@ -12,7 +12,7 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictRoundRobinWriter
 
-_KEYS = ("state", "action", "parameters")
+_KEYS = ("state", "action", "parameters", "smoothed")
 
 
 def trajectory_buffer(
@@ -33,7 +33,8 @@ def trajectory_buffer(
 
     Args:
         trajectories: ``[M]`` of ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and optionally ``parameters`` (a
-            tensor ``[M, ...]`` or a TensorDict ``[M]``); other entries are ignored.
+            tensor ``[M, ...]`` or a TensorDict ``[M]``) and ``smoothed`` like ``state``, in place of which next states
+            are read from it (:func:`log_trajectories`); other entries are ignored.
         window: consecutive transitions in a draw.
         seed: default: drawn from torch's global generator.
         capacity: trajectories to allocate, for ``extend`` to add more and replace the oldest; default: read-only.
@@ -90,10 +91,11 @@ class TrajectoryStorage(TensorStorage):
         trajectory, time = index
         stored = self.trajectories
         here = trajectory * (self.steps + 1) + time
+        next_state = "smoothed" if "smoothed" in stored else "state"
         entries = {
             "state": _rows(stored.get("state"), here),
             "action": _rows(stored.get("action"), trajectory * self.steps + time),
-            "next": TensorDict({"state": _rows(stored.get("state"), here + 1)}, batch_size=here.shape),
+            "next": TensorDict({"state": _rows(stored.get(next_state), here + 1)}, batch_size=here.shape),
         }
         if (parameters := stored.get("parameters", None)) is not None:
             own = parameters[trajectory if trajectory.ndim == 1 else trajectory[:, :1]]
@@ -188,6 +190,8 @@ def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:
         raise ValueError(f"trajectories must be [M] of state [M, T+1, ...] and action [M, T, A], {shapes}")
     if state.shape[1] != action.shape[1] + 1:
         raise ValueError(f"a trajectory has one state more than actions, {shapes}")
+    if (smoothed := trajectories.get("smoothed", None)) is not None and smoothed.shape != state.shape:
+        raise ValueError(f"smoothed states must be {list(state.shape)} as the states, got {list(smoothed.shape)}")
     if not len(trajectories):
         raise ValueError("there is no trajectory to sample from")
     if action.shape[1] < window:

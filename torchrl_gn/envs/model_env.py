@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
@@ -39,7 +40,8 @@ class ModelEnv(ModelBasedEnvBase):
 
     ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state``, ``reset()`` from drawn ones. Physical
     parameters come from the TensorDict, else from the scene (zeros if inferred); TorchRL does not carry them across
-    auto-resets.
+    auto-resets. A model that reads past commands (:attr:`KinematicTree.history`) has the further entry
+    ``past_actions`` ``[*B, history, A]``; the action is that of the present.
 
     Args:
         model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
@@ -76,7 +78,9 @@ class ModelEnv(ModelBasedEnvBase):
             weight = next(itertools.chain(model.parameters(), model.buffers()), None)
             device = torch.device("cpu") if weight is None else weight.device
         super().__init__(cast(TensorDictModule, model), device=device, allow_done_after_reset=True)
-        self.scene = cast(Scene, model.scene)
+        self.scene, self.history = cast(Scene, model.scene), getattr(model.scene, "history", 0)
+        if self.history:
+            self.scene = cast(Any, model.scene).present
         self.reward = reward_of(reward, self, self.scene)
         self.unstable_reward = finite_reward(unstable_reward)
         self.starts = StartSampler(self.scene, start_states, seed)
@@ -88,6 +92,9 @@ class ModelEnv(ModelBasedEnvBase):
         if "hidden_state" in inputs:
             for spec in (self.observation_spec, self.state_spec):
                 spec["hidden_state"] = spec_of(cast(Any, model).initial_hidden_state(), self.device)
+        if self.history:
+            for spec in (self.observation_spec, self.state_spec):
+                spec["past_actions"] = Unbounded(torch.Size((self.history, self.scene.num_actions)), device=self.device)
 
     @property
     def predictor(self) -> Predictor | ModulePredictor:
@@ -120,18 +127,56 @@ class ModelEnv(ModelBasedEnvBase):
             if (hidden_state := tensordict.get("hidden_state", None)) is None:
                 hidden_state = cast(Any, self.world_model).initial_hidden_state().expand(shape).clone()
             reset.set("hidden_state", hidden_state)
+        if self.history:
+            reset.set("past_actions", self._past_actions(tensordict).clone())
         return reset.to(self.device)
+
+    def _past_actions(self, tensordict: TensorDictBase) -> Tensor:
+        """Actions of the steps before ``[*B, history, A]``, the latest first; zeros (within bounds) by default."""
+        if "past_actions" in tensordict.keys():
+            return read(tensordict, "past_actions", (self.history, self.scene.num_actions), self)
+        low, high = (torch.as_tensor(bound).float() for bound in (self.scene.action_low, self.scene.action_high))
+        return torch.zeros(*tensordict.shape, self.history, len(low)).clamp(low, high).to(self.device)
+
+    def _with_past(self, tensordict: TensorDictBase, actions: Tensor) -> Tensor:
+        """What the model reads ``[*B, H, (history + 1) A]`` at each of the actions ``[*B, H, A]``."""
+        if not self.history:
+            return actions
+        past = self._past_actions(tensordict).to(actions.dtype)
+        windows = torch.cat((past.flip(-2), actions), -2).unfold(-2, self.history + 1, 1)  # [*B, H, A, history + 1]
+        return windows.flip(-1).transpose(-1, -2).flatten(-2)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
-        # The model writes into its input: give it a shallow copy, with all entries, some of which it may refuse.
-        predicted = self.world_model(tensordict.exclude("next"))["next"]
+        predicted = self.world_model(self._inputs(tensordict))["next"]
         stable = predicted["state"].isfinite().flatten(-2).all(-1, keepdim=True)
         entries: dict[str, Any] = outcome(self, tensordict, state, action, predicted["state"], stable)
-        if "hidden_state" in predicted.keys():
-            entries["hidden_state"] = predicted["hidden_state"]
+        entries |= self.carried(tensordict, predicted)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
+
+    @property
+    def carried_keys(self) -> list[str]:
+        """Entries besides the state that a step reads and writes."""
+        return [key for key in ("hidden_state", "past_actions") if key in self.observation_spec.keys()]
+
+    def carried(self, tensordict: TensorDictBase, predicted: TensorDictBase | None = None) -> dict[str, Any]:
+        """The next step's :attr:`carried_keys`; ``predicted`` is the model's output, if known."""
+        entries: dict[str, Any] = {}
+        if "hidden_state" in self.carried_keys:
+            predicted = self.world_model(self._inputs(tensordict))["next"] if predicted is None else predicted
+            entries["hidden_state"] = cast(TensorDictBase, predicted)["hidden_state"]
+        if self.history:
+            action = tensordict["action"].unsqueeze(-2)
+            entries["past_actions"] = torch.cat((action, self._past_actions(tensordict)[..., :-1, :]), -2)
+        return entries
+
+    def _inputs(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The model's input, a shallow copy as it writes into it, with all entries, some of which it may refuse."""
+        inputs = tensordict.exclude("next")
+        if self.history:
+            inputs.set("action", self._with_past(tensordict, tensordict["action"].unsqueeze(-2)).squeeze(-2))
+        return inputs
 
     def imagine(self, tensordict: TensorDictBase, actions: Tensor) -> tuple[Tensor, Tensor]:
         """States ``[*B, H + 1, N, 13]`` and rewards ``[*B, H, 1]`` of action sequences ``[*B, H, A]``; differentiable.
@@ -147,7 +192,7 @@ class ModelEnv(ModelBasedEnvBase):
         state = read(tensordict, "state", self._state_shape, self)
         model = self.predictor
         inputs = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
-        states, _ = model.rollout(state, actions, *inputs)  # pyright: ignore[reportArgumentType]
+        states, _ = model.rollout(state, self._with_past(tensordict, actions), *inputs)  # pyright: ignore[reportArgumentType]
         if (task := cast("Tensor | None", tensordict.get("task", None))) is not None:
             batch = tensordict.ndim
             task = task.unsqueeze(batch).expand(*task.shape[:batch], shape[-2], *task.shape[batch:])

@@ -39,6 +39,8 @@ class ForwardModelLoss(LossModule):
             orientations).
         generator: source of the noise. Default: torch's global generator, with which a run cannot resume bit for bit.
         teacher_forced_steps: steps at the start of a window that are fed the true state, with noise.
+        channel_weights: ``[N, 12]`` (or broadcast) factors of each channel's squared error, for example of less than 1
+            where measurement noise makes up most of a step's change. Default: all 1.
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` consecutive steps, ``action`` ``[B, (H,) A]``,
     ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if it reads them.
@@ -61,6 +63,7 @@ class ForwardModelLoss(LossModule):
     model: Predictor
     noise_scale: Tensor
     error_weight: Tensor
+    channel_scale: Tensor | None
 
     def __init__(
         self,
@@ -69,6 +72,7 @@ class ForwardModelLoss(LossModule):
         noise: float = 0.0,
         generator: torch.Generator | None = None,
         teacher_forced_steps: int = 1,
+        channel_weights: Tensor | None = None,
     ) -> None:
         super().__init__()
         if not 0 <= noise < math.inf:
@@ -83,6 +87,11 @@ class ForwardModelLoss(LossModule):
         self.teacher_forced_steps = teacher_forced_steps
         scale = torch.zeros(model.layout.delta_size, dtype=torch.float64, device=model.movable.device)
         self.register_buffer("noise_scale", scale)
+        if channel_weights is not None:
+            if not bool((channel_weights > 0).all()):
+                raise ValueError("channel_weights must be above 0.")
+            channel_weights = channel_weights.to(scale).sqrt().expand(model.movable.shape).clone()
+        self.register_buffer("channel_scale", channel_weights, persistent=False)
         self.register_buffer("error_weight", scale - 1)  # negative: not fitted; None would be lost in a state_dict
 
     @property
@@ -212,8 +221,9 @@ class ForwardModelLoss(LossModule):
         return self.model.layout.apply(state, noise * scale)
 
     def _scale(self, like: Tensor) -> Tensor:
-        """Weights ``[N, 12]``: inverse standard deviations of movable channels, 0 for fixed ones."""
+        """Weights ``[N, 12]``: inverse standard deviations of movable channels by their weights, 0 for fixed ones."""
         weight = torch.where(self.error_weight < 0, self.trained.delta_normalizer.inverse_std, self.error_weight)
+        weight = weight if self.channel_scale is None else weight * self.channel_scale
         return (weight * self.model.movable).to(like.dtype)
 
     def component_errors(self, delta: Tensor, target: Tensor) -> Tensor:

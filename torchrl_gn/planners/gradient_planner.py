@@ -107,10 +107,9 @@ class GradientPlanner(RecedingHorizonPlanner):
         return self.candidates, self.horizon, self.imagined.scene.num_actions
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Transform for the real environment that resets the plan, and a recurrent model's hidden state."""
-        model = self.imagined.world_model
-        hidden_state = cast(TensorDictBase, model.initial_hidden_state()) if self._recurrent else None
-        return plan_primer(self.plan_shape, torch.float32, self.imagined.device, hidden_state, step_size=(1,))
+        """Transform for the real environment that resets the plan, a model's hidden state, and its past actions."""
+        carried = {key: self.imagined.observation_spec[key].clone() for key in self.imagined.carried_keys}
+        return plan_primer(self.plan_shape, torch.float32, self.imagined.device, carried, step_size=(1,))
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
         if torch.is_inference_mode_enabled():
@@ -123,10 +122,11 @@ class GradientPlanner(RecedingHorizonPlanner):
         states_at = cast(Tensor, tensordict.get("state", plan)).device
         plan, planned = self._scaled(plan.to(device)), planned.flatten().to(device)
         entries = self._entries(flat)
-        if self._recurrent and "hidden_state" not in entries.keys() and bool(planned.any()):
+        lost = [key for key in self.imagined.carried_keys if key not in entries.keys()]
+        if lost and bool(planned.any()):
             raise KeyError(
-                "The model is recurrent, and the environment drops its entry 'hidden_state' between steps: append the"
-                " planner's make_tensordict_primer() to the real environment."
+                f"The model carries {lost[0]!r} from step to step, and the environment drops it: append the planner's"
+                " make_tensordict_primer() to the real environment."
             )
         size = cast(Tensor, flat.get((KEY, "step_size"), torch.ones(len(flat), 1)))
         step_size = size.where(size > 0, 1.0).to(device)  # a primer writes 0
@@ -145,11 +145,13 @@ class GradientPlanner(RecedingHorizonPlanner):
         plan, step_size = actions.reshape(*batch, *self.plan_shape), step_size.reshape(*batch, 1)
         written: dict[NestedKey, TensorDictBase]
         written = {KEY: shift_plan(batch, plan.to(states_at), step_size=step_size.to(states_at))}
-        if self._recurrent:
+        if self.imagined.carried_keys:
+            executed = entries.copy().set("action", self.env.action_spec.project(actions[:, 0, 0]))
             with torch.no_grad():
-                executed = entries.copy().set("action", self.env.action_spec.project(actions[:, 0, 0]))
-                hidden_state = self.imagined.world_model(executed)["next", "hidden_state"]
-            written["next", "hidden_state"] = hidden_state.reshape(batch).to(states_at)
+                after = self.imagined.carried(executed)
+            written |= {
+                ("next", key): value.reshape(*batch, *value.shape[1:]).to(states_at) for key, value in after.items()
+            }
         return actions[:, 0, 0].reshape(*batch, -1).to(states_at), written
 
     def _scaled(self, actions: Tensor) -> Tensor:
@@ -160,14 +162,10 @@ class GradientPlanner(RecedingHorizonPlanner):
         """Actions ``[*B, A]`` in the actuators' units."""
         return torch.addcmul(self.middle, scaled, self.half_range)
 
-    @property
-    def _recurrent(self) -> bool:
-        return "hidden_state" in self.imagined.world_model.in_keys
-
     def _entries(self, flat: TensorDictBase) -> TensorDictBase:
         """Entries that a rollout reads, detached."""
         self.imagined.predictor.parameters_in(flat)  # refuses other variants, which the entries below no longer show
-        keys = [key for key in (*self.imagined.world_model.in_keys, "task") if key != "action"]
+        keys = [key for key in (*self.imagined.world_model.in_keys, "past_actions", "task") if key != "action"]
         read = flat.select(*keys, strict=False).detach()
         # Autograd refuses tensors made in inference mode: clone them.
         usable = read.apply(lambda entry: entry.clone() if entry.is_inference() else entry)

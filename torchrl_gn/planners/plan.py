@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from numbers import Integral
 from typing import Any, cast
 
@@ -11,13 +12,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
-from torchrl_gn.envs.specs import spec_of
 
 # Environments carry entries unknown to them from step to step; a primer also resets its own when an episode begins.
 KEY = "plan"
@@ -102,18 +102,16 @@ def plan_primer(
     shape: tuple[int, ...],
     dtype: torch.dtype,
     device: torch.device | None,
-    hidden_state: TensorDictBase | None = None,
+    carried: Mapping[str, TensorSpec] | None = None,
     **more: tuple[int, ...],
 ) -> TensorDictPrimer:
     """Transform that resets the plan when an episode begins; append it to the real environment.
 
     ``shape`` is that of a sample's sequences, ``(..., H, A)``; ``more`` has the shapes of other entries of the plan.
-    A recurrent model's initial ``hidden_state``, zeros, is reset too.
+    Entries that the model carries from step to step, ``carried``, are reset to zeros too.
     """
     shapes = {**more, "actions": shape}
     entries = {key: Unbounded(shape=torch.Size(of), dtype=dtype, device=device) for key, of in shapes.items()}
     entries["planned"] = Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=device)
-    specs = {KEY: Composite(entries)}
-    if hidden_state is not None:
-        specs["hidden_state"] = spec_of(hidden_state, device)
+    specs = {KEY: Composite(entries), **(carried or {})}
     return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)

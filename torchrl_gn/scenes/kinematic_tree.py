@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -34,6 +34,7 @@ class KinematicTree:
     action_low: np.ndarray = field(default_factory=lambda: np.empty(0))  # [A]; default: unbounded
     action_high: np.ndarray = field(default_factory=lambda: np.empty(0))
     joint_parents: tuple[int, ...] = ()  # parent of each joint, -1 for the base; default: the joint before it
+    history: int = 0  # past steps whose commands follow those of the present, for each joint and in the action
 
     yaw_frame = None
     contact_points = None
@@ -59,6 +60,10 @@ class KinematicTree:
             raise ValueError(
                 f"joint_parents={self.joint_parents} of {self.name!r} must be an earlier joint, or -1, for each joint."
             )
+        if self.history < 0 or any(len(own) % (self.history + 1) for own in (*self.commands, range(self.num_actions))):
+            raise ValueError(
+                f"commands={self.commands} of {self.name!r} must be as many for each of {self.history} past steps."
+            )
         for which, infinite in _BOUNDS:
             count = len(getattr(self, which))
             if count not in (0, self.num_actions):
@@ -83,6 +88,14 @@ class KinematicTree:
     @property
     def num_actions(self) -> int:
         return 1 + max((index for indices in self.commands for index in indices), default=-1)
+
+    @property
+    def present(self) -> KinematicTree:
+        """The same robot with the commands of the present step alone."""
+        steps = self.history + 1
+        commands = tuple(own[: len(own) // steps] for own in self.commands)
+        low, high = (bound[: self.num_actions // steps] for bound in (self.action_low, self.action_high))
+        return replace(self, commands=commands, action_low=low, action_high=high, history=0)
 
     @property
     def state_size(self) -> int:
@@ -172,12 +185,14 @@ class KinematicTree:
         """Hash of all arguments."""
         text = (self.name, *self.joint_names, f"{self.timestep:.6g}", str(self.commands), str(self.joint_parents))
         bounds = (f"{value:.6g}" for value in (*self.action_low, *self.action_high))
-        return hashlib.sha256("\n".join((*text, *self.extras, *bounds)).encode()).hexdigest()[:16]
+        past = (f"history {self.history}",) * (self.history > 0)
+        return hashlib.sha256("\n".join((*text, *self.extras, *bounds, *past)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
-        joints, commands, step = self.num_joints, self.num_actions, 1e3 * self.timestep
-        lines = [f"Robot {self.name}: {joints} joints, {commands} commands, step {step:g} ms"]
-        for name, indices, before in zip(self.joint_names, self.commands, self.joint_parents, strict=True):
+        now, step = self.present, 1e3 * self.timestep
+        past = f" and those of {self.history} past steps" if self.history else ""
+        lines = [f"Robot {self.name}: {self.num_joints} joints, {now.num_actions} commands{past}, step {step:g} ms"]
+        for name, indices, before in zip(self.joint_names, now.commands, self.joint_parents, strict=True):
             acting = ", ".join(map(str, indices)) or "none"
             lines.append(f"  {name}, parent {self.node_names[before + 1]}: commands {acting}")
         return "\n".join(lines)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.data import RobotLog, load_robot_log, log_trajectories, log_tree
+from torchrl_gn.data import RobotLog, load_robot_log, log_trajectories, log_tree, trajectory_buffer
+from torchrl_gn.scenes import scene_from_description
 
 STEP = 0.01
 
@@ -170,3 +173,58 @@ def test_a_command_that_never_varies_is_named():
     assert report.constant == (1,) and "commands that never vary: 1;" in str(report)
     tree = log_tree(log, "arm")
     assert tree.action_low[1] == tree.action_high[1] == 3 and tree.action_low[0] < tree.action_high[0]
+
+
+@pytest.mark.parametrize("resample", [None, 2 * STEP, 1.5 * STEP])
+@pytest.mark.parametrize("lag", [0, 2])
+def test_past_commands_are_those_of_the_steps_before(resample, lag):
+    log = turning_log(np.arange(100) * STEP, length=[60, 40])
+    plain, _ = log_trajectories(log, 12, resample=resample, lag=lag, overlap=True)
+    past, report = log_trajectories(log, 12, resample=resample, lag=lag, overlap=True, history=3)
+    assert past["action"].shape[-1] == 8 and len(past) == len(plain) - 2 * 3  # of each episode the first steps
+    later = torch.cat([plain[plain["episode"] == episode][3:] for episode in (0, 1)])
+    assert torch.equal(past["state"], later["state"]) and torch.equal(past["action"][..., :2], later["action"])
+    for step in (1, 2, 3):
+        for episode in (0, 1):
+            before = plain[plain["episode"] == episode]["action"][3 - step : -step]
+            own = past[past["episode"] == episode]["action"]
+            assert torch.equal(own[..., 2 * step : 2 * step + 2], before)
+    assert report.short == log_trajectories(log, 15, resample=resample, lag=lag, overlap=True)[1].short
+
+
+def test_a_graph_has_the_past_commands_at_their_joints():
+    log = turning_log(np.arange(100) * STEP)
+    tree = log_tree(log, "arm", commands=[[1], [0]], history=2)
+    assert tree.commands == ((1, 3, 5), (0, 2, 4)) and tree.num_actions == 6
+    assert tree.action_low.tolist() == 3 * log.command_bounds()[0].tolist()
+    again = scene_from_description(tree.description())
+    assert again.history == 2 and again.fingerprint() == tree.fingerprint() != log_tree(log, "arm").fingerprint()
+    assert tree.present.commands == ((1,), (0,)) and tree.present.action_high.tolist() == tree.action_high[:2].tolist()
+    assert "2 commands and those of 2 past steps" in str(tree) and "parent base: commands 1\n" in str(tree)
+    with pytest.raises(ValueError, match="must be as many for each of 2 past steps"):
+        dataclasses.replace(tree, commands=((1, 3), (0, 2, 4)))
+
+
+def test_targets_are_smoothed_and_states_are_not():
+    log = turning_log(np.arange(300) * STEP)
+    rng, clean = np.random.default_rng(0), log_trajectories(log, 20)[0]
+    noisy = RobotLog(
+        (log.angle + 0.01 * rng.normal(size=log.angle.shape) + np.pi) % (2 * np.pi) - np.pi,
+        log.velocity + 0.1 * rng.normal(size=log.velocity.shape),
+        *(log.command, log.length, STEP, log.extra),
+    )
+    raw, (data, _) = log_trajectories(noisy, 20)[0], log_trajectories(noisy, 20, smooth={"angle": 4})
+    assert torch.equal(data["state"], raw["state"]) and "smoothed" not in raw
+    errors = {key: (data[key] - clean["state"])[..., 1:, :].square().mean((0, 1, 2)) for key in ("state", "smoothed")}
+    assert (errors["smoothed"][:2] < 0.4 * errors["state"][:2]).all()
+    assert torch.equal(data["smoothed"][..., 2:], data["state"][..., 2:])  # channels that were not named
+    assert not torch.equal(log_trajectories(noisy, 20, smooth=4)[0]["smoothed"][..., 2:], data["state"][..., 2:])
+    batch = trajectory_buffer(data, batch_size=8, window=5, seed=0).sample()
+    trajectory, time = batch["index"].unbind(-1)
+    assert torch.equal(batch["state"], data["state"][trajectory, time])
+    assert torch.equal(batch["next", "state"], data["smoothed"][trajectory, time + 1])
+    with pytest.raises(ValueError, match="smooth=.* must be rows of at least 0, by channel"):
+        log_trajectories(noisy, 20, smooth={"torque": 4})
+    data["smoothed"] = data["smoothed"][:, 1:]
+    with pytest.raises(ValueError, match="smoothed states must be"):
+        trajectory_buffer(data, batch_size=8)

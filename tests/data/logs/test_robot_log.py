@@ -220,7 +220,7 @@ def test_other_bad_input_is_named(tmp_path):
     with pytest.raises(DatasetError, match="No robot log at"):
         load_robot_log(tmp_path / "none.npz")
     (tmp_path / "log.txt").write_text("x")
-    with pytest.raises(DatasetError, match=r"is a \.npz or \.csv"):
+    with pytest.raises(DatasetError, match=r"is a \.npz, \.csv, \.parquet, "):
         load_robot_log(tmp_path / "log.txt")
     (tmp_path / "log.npz").write_text("no zip")
     with pytest.raises(DatasetError, match="cannot be read as a robot log"):

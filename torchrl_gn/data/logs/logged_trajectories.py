@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.data.logs.robot_log import RobotLog, short_way
+from torchrl_gn.data.logs.log_noise import smoothed
+from torchrl_gn.data.logs.robot_log import RobotLog, pieces, short_way
 from torchrl_gn.scenes.kinematic_tree import tree_states
 
 
@@ -60,6 +61,8 @@ def log_trajectories(
     jump: float = 50.0,
     overlap: bool = False,
     episodes: Sequence[int] | np.ndarray | None = None,
+    history: int = 0,
+    smooth: int | Mapping[str, int] = 0,
 ) -> tuple[TensorDict, LogReport]:
     """Cut a log into trajectories of equal length, none across a gap, a jump, an episode or a row that is not finite.
 
@@ -72,29 +75,42 @@ def log_trajectories(
             quantile, and the change at the largest logged velocity.
         overlap: start trajectories at every step.
         episodes: indices of the episodes to use; default: all.
+        history: past steps whose commands an action holds too, ``A = (history + 1) * commands``, the latest first; for
+            feed-forward models of motors that lag. :func:`log_tree` needs the same.
+        smooth: rows to each side over which training targets are smoothed (zero-phase, local parabolas), by channel
+            (:attr:`LogInspection.half_widths`) or for all. ``state`` stays as logged; :func:`trajectory_buffer` reads
+            next states from the further entry ``smoothed``.
 
     Returns:
-        TensorDict ``[M]``, float64, of ``state`` ``[M, steps + 1, J + 1, 3 + extras]``, ``action`` ``[M, steps, A]``
-        and integer ``episode`` ``[M]``, and the report.
+        TensorDict ``[M]``, float64, of ``state`` ``[M, steps + 1, J + 1, 3 + extras]``, ``action`` ``[M, steps, A]``,
+        integer ``episode`` ``[M]`` and, if asked for, ``smoothed`` like ``state``; and the report.
     """
-    if steps < 1 or lag < 0 or not jump > 0:
-        raise ValueError(f"steps={steps} must be at least 1, lag={lag} at least 0, jump={jump} above 0.")
+    if steps < 1 or min(lag, history) < 0 or not jump > 0:
+        given = f"steps={steps} must be at least 1, lag={lag} and history={history} at least 0, jump={jump} above 0."
+        raise ValueError(given)
     chosen = list(range(len(log.length))) if episodes is None else [int(episode) for episode in episodes]
     stride, at, finite, gaps, jumps = _stride(log, resample), log.at, log.finite, log.gaps, log.jumps(jump)
-    channels = np.stack((log.angle, log.velocity, *log.extra.values()), 1)
-    states, actions, which, used = [], [], [], 0
-    for episode, start, stop in _pieces(log, chosen, gaps | jumps, finite):
+    names, channels = ("angle", "velocity", *log.extra), np.stack((log.angle, log.velocity, *log.extra.values()), 1)
+    half = dict.fromkeys(names, smooth) if isinstance(smooth, int) else dict(smooth)
+    if half.keys() - set(names) or min(half.values(), default=0) < 0:
+        raise ValueError(f"smooth={smooth} must be rows of at least 0, by channel of {names} or for all.")
+    states, actions, targets, which, used = [], [], [], [], 0
+    for episode, start, stop in pieces(log, chosen, gaps | jumps, finite):
         rows = slice(start + lag, stop)
         count = int((at[stop - 1] - at[start + lag]) / stride + 1e-9) if start + lag < stop else 0  # against rounding
-        if count < steps:
+        if count < steps + history:
             continue
         here, grid = at[rows] - at[start + lag], stride * np.arange(count + 1)
-        (angle, velocity, *extras), needed = _interpolated(here, channels[rows], grid)
-        state, command = tree_states(angle, velocity, extras), _held(here, log.command[start : stop - lag], grid)
-        begin = np.arange(0, count - steps + 1, 1 if overlap else steps)
+        state, needed = _states(here, channels[rows], grid)
+        command = _held(here, log.command[start : stop - lag], grid)
+        command = np.hstack([command[history - past : count - past] for past in range(history + 1)])
+        begin = np.arange(history, count - steps + 1, 1 if overlap else steps)
         window = begin[:, None] + np.arange(steps + 1)
         states.append(state[window])
-        actions.append(command[window[:, :-1]])
+        actions.append(command[window[:, :-1] - history])
+        if any(half.values()):
+            calm = _smoothed(here, channels[rows], [half.get(name, 0) for name in names])
+            targets.append(_states(here, calm, grid)[0][window])
         which.append(np.full(len(begin), episode))
         used += lag + int(needed[window[-1, -1]])
     low, high = log.command_bounds()
@@ -117,7 +133,7 @@ def log_trajectories(
     if not num_trajectories:
         step = f"{1e3 * report.timestep:g} ms"
         raise ValueError(f"No piece of the log has {steps} transitions of {step}; take fewer.\n{report}")
-    parts = {"state": states, "action": actions, "episode": which}
+    parts = {"state": states, "action": actions, "episode": which} | ({"smoothed": targets} if targets else {})
     entries = {key: torch.from_numpy(np.concatenate(part)) for key, part in parts.items()}
     return TensorDict(entries, batch_size=[num_trajectories]), report
 
@@ -132,24 +148,22 @@ def _stride(log: RobotLog, resample: float | None) -> float:
     return float(round(stride)) if np.isclose(stride, max(1, round(stride)), rtol=1e-6) else stride
 
 
-def _pieces(
-    log: RobotLog, episodes: Sequence[int], breaks: np.ndarray, finite: np.ndarray
-) -> Iterator[tuple[int, int, int]]:
-    """Yield unbroken pieces as episode, first row, and last row + 1."""
-    begins = log.begins
-    for episode in episodes:
-        start, last = int(begins[episode]), int(begins[episode + 1])
-        # A piece ends at a row after which the log breaks, and at rows that are not finite.
-        stops = start + np.r_[np.flatnonzero(breaks[start : last - 1]) + 1, np.flatnonzero(~finite[start:last])]
-        for stop in [*np.unique(stops).tolist(), last]:
-            yield episode, start, stop
-            start = stop + (stop < last and not finite[stop])
-
-
 def _places(found: np.ndarray, log: RobotLog, episodes: Sequence[int]) -> tuple[tuple[int, int], ...]:
     begins = log.begins
     each = ((episode, np.flatnonzero(found[begins[episode] : begins[episode + 1] - 1])) for episode in episodes)
     return tuple((episode, int(row)) for episode, rows in each for row in rows)
+
+
+def _states(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    (angle, velocity, *extras), needed = _interpolated(at, channels, grid)
+    return tree_states(angle, velocity, extras), needed
+
+
+def _smoothed(at: np.ndarray, channels: np.ndarray, half: Sequence[int]) -> np.ndarray:
+    """Channels ``[n, C, J]``, the first an angle, each smoothed over its rows to each side."""
+    angle = np.unwrap(channels[:, :1], axis=0)
+    calm = np.concatenate((angle, channels[:, 1:]), 1)
+    return np.stack([smoothed(at, calm[:, index], rows)[0] for index, rows in enumerate(half)], 1)
 
 
 def _interpolated(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -96,6 +96,26 @@ def short_way(change: np.ndarray) -> np.ndarray:
     return (change + np.pi) % (2 * np.pi) - np.pi
 
 
+def pieces(
+    log: RobotLog, episodes: Sequence[int], breaks: np.ndarray, finite: np.ndarray
+) -> Iterator[tuple[int, int, int]]:
+    """Yield unbroken pieces as episode, first row, and last row + 1."""
+    begins = log.begins
+    for episode in episodes:
+        start, last = int(begins[episode]), int(begins[episode + 1])
+        # A piece ends at a row after which the log breaks, and at rows that are not finite.
+        stops = start + np.r_[np.flatnonzero(breaks[start : last - 1]) + 1, np.flatnonzero(~finite[start:last])]
+        for stop in [*np.unique(stops).tolist(), last]:
+            yield episode, start, stop
+            start = stop + (stop < last and not finite[stop])
+
+
+def unbroken(log: RobotLog, jump: float) -> list[slice]:
+    """Rows of all pieces without gap, jump, or row that is not finite."""
+    breaks = log.gaps | log.jumps(jump)
+    return [slice(start, stop) for _, start, stop in pieces(log, range(len(log.length)), breaks, log.finite)]
+
+
 def log_tree(
     log: RobotLog,
     name: str,
@@ -103,6 +123,7 @@ def log_tree(
     resample: float | None = None,
     commands: Sequence[Sequence[int]] | None = None,
     joint_parents: Sequence[int] = (),
+    history: int = 0,
 ) -> KinematicTree:
     """Kinematic tree of a log's robot.
 
@@ -110,6 +131,7 @@ def log_tree(
         resample: time step, seconds; default: the log's.
         commands: indices of the commands of each joint, none without motor; default: as many for each joint, in order.
         joint_parents: parent of each joint, -1 for the base; default: the joint before it.
+        history: as of :func:`log_trajectories`; the past commands of a joint act on it too.
     """
     joints, count = log.num_joints, log.command.shape[1]
     if commands is None:
@@ -118,7 +140,8 @@ def log_tree(
             raise ValueError(f"{wrong}; give those of each, such as commands=[[0], []] if only the first has a motor.")
         each = count // joints
         commands = [range(joint * each, (joint + 1) * each) for joint in range(joints)]
-    low, high = log.command_bounds()
+    low, high = (np.tile(bound, history + 1) for bound in log.command_bounds())
+    commands = [[past * count + index for past in range(history + 1) for index in own] for own in commands]
     return KinematicTree(
         name,
         tuple(f"joint{joint}" for joint in range(joints)),
@@ -128,4 +151,5 @@ def log_tree(
         action_low=low,
         action_high=high,
         joint_parents=tuple(joint_parents),
+        history=history,
     )

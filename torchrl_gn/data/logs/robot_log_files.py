@@ -1,98 +1,128 @@
-"""Read robot logs from .npz and .csv files."""
+"""Read robot logs from files and dataset folders."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 
 from torchrl_gn.data.dataset_files import DatasetError
-from torchrl_gn.data.logs.robot_log import RobotLog
-
-_Arrays = dict[str, np.ndarray]
+from torchrl_gn.data.logs.robot_log import RobotLog, short_way
+from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, read_log_arrays
 
 
 def load_robot_log(
-    path: str | os.PathLike, *, timestep: float | None = None, names: Mapping[str, str] | None = None
+    path: str | os.PathLike,
+    *,
+    timestep: float | None = None,
+    names: Mapping[str, str] | None = None,
+    degrees: bool = False,
 ) -> RobotLog:
     """Read a log of joint angles, velocities and commands.
 
     ``.npz`` with arrays ``angle`` ``[R, J]``, ``velocity`` ``[R, J]``, ``command`` ``[R, A]``; optionally ``length``
     ``[episodes]`` (rows of each) or ``episode`` ``[R]`` (a new one starts where it changes), ``time`` ``[R]`` (seconds)
     or ``timestep``, and extra channels of any other name ``[R, J]``, or ``[R, k J]`` with the ``k`` numbers of a joint
-    side by side, which become ``name0``, ``name1``, ... ``.csv`` has a header and columns ``angle0``, ``angle1``, ...
+    side by side, which become ``name0``, ``name1``, ... ``.csv`` has a header and columns ``angle0``, ``angle1``, ...,
+    ``.parquet`` such columns or lists, ``.hdf5`` (``.h5``) datasets of these names.
+
+    LeRobot dataset folders (version 2 or 3) need ``names`` only where ``observation.state`` is more than angles: an
+    array's columns are ``"observation.state[:7]"``, or by their names in ``info.json`` ``"observation.state.*pos"``. In
+    robomimic's ``.hdf5`` arrays are called as within an episode, ``"obs/robot0_joint_pos"`` (the default). Of both only
+    what is named is read.
 
     Args:
         timestep: time between rows, seconds, if the file does not have it.
-        names: name in the file of each array, as ``{"angle": "q", "velocity": "dq"}``; ``""`` leaves an array out, and
-            ``{"command": ""}`` means a robot without motors.
+        names: name in the file of each array, as ``{"angle": "q", "velocity": "dq"}``; ``""`` leaves an array out.
+            ``{"command": ""}`` means a robot without motors; ``{"velocity": ""}`` takes backward differences of the
+            angles, which lose the first row of each episode and hide jumps.
+        degrees: the file has degrees and degrees/s.
 
     Raises:
         DatasetError: if the file is missing, incomplete, or contradicts itself or ``timestep``.
+        ImportError: if the format needs a package that is not installed.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise DatasetError(f"No robot log at {path}.")
-    if path.suffix not in (".npz", ".csv"):
-        raise DatasetError(f"{path}: a robot log is a .npz or .csv file.")
+    if path.suffix not in READERS and not path.is_dir():
+        raise DatasetError(f"{path}: a robot log is a {', '.join(READERS)} file, or a LeRobot dataset folder.")
     try:
-        arrays = dict(np.load(path, allow_pickle=False)) if path.suffix == ".npz" else _read_csv(path)
-        return _log(arrays, dict(names or {}), timestep)
+        found = read_log_arrays(path)
+        log = _log(found, {**found.names, **(names or {})}, timestep)
     except (ValueError, OSError, KeyError, EOFError, BadZipFile) as error:
         raise DatasetError(f"{path} cannot be read as a robot log: {error}") from error
+    if degrees:
+        return replace(log, angle=np.deg2rad(log.angle), velocity=np.deg2rad(log.velocity))
+    return log
 
 
-def _read_csv(path: Path) -> _Arrays:
-    with path.open() as file:
-        header = [name.strip() for name in file.readline().split(",")]
-    table = np.atleast_2d(np.loadtxt(path, delimiter=",", skiprows=1, dtype=np.float64))
-    if table.shape[1] != len(header):
-        raise ValueError(f"{len(header)} names for {table.shape[1]} columns")
-    columns: dict[str, list[tuple[int, int]]] = {}
-    for index, name in enumerate(header):
-        base, number = re.fullmatch(r"(.*?)(\d*)", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
-        columns.setdefault(base, []).append((int(number or 0), index))
-    return {base: table[:, [index for _, index in sorted(entries)]] for base, entries in columns.items()}
-
-
-def _log(arrays: _Arrays, names: dict[str, str], timestep: float | None) -> RobotLog:
-    arrays, unread = _renamed(arrays, names)
-    if "command" in names and not names["command"] and "angle" in arrays:
+def _log(found: LogArrays, names: Names, timestep: float | None) -> RobotLog:
+    arrays, unread = _renamed(found, names)
+    if names.get("command") == "" and "angle" in arrays:
         arrays["command"] = np.zeros((len(arrays["angle"]), 0))
-    if missing := [name for name in ("angle", "velocity", "command") if name not in arrays]:
+    missing = {"angle", "velocity", "command"} - arrays.keys() - {name for name in names if not names[name]}
+    if missing or "angle" not in arrays:
         raise ValueError(
-            f"it lacks {missing}; it has {sorted(arrays)}. Give their names in the file with names={{...}}; for a robot"
-            ' without motors, names={command: ""}.'
+            f"it lacks {sorted(missing)}; it has {sorted(found.arrays)}. Give their names in the file with"
+            ' names={...}; for a robot without motors, names={command: ""}; without velocities, names={velocity: ""}.'
         )
-    angle, velocity, command = (_columns(arrays.pop(name)) for name in ("angle", "velocity", "command"))
+    angle, command = _columns(arrays.pop("angle")), _columns(arrays.pop("command"))
+    velocity = _columns(arrays.pop("velocity")) if "velocity" in arrays else np.full(angle.shape, np.nan)
     if angle.ndim != 2 or velocity.shape != angle.shape or command.ndim != 2 or len(command) != len(angle):
         raise ValueError(f"angle {angle.shape}, velocity {velocity.shape} and command {command.shape} do not fit.")
     length, time = _length(arrays, len(angle)), _of_every_row(arrays, "time", len(angle), number=True)
     timestep = _timestep(arrays.pop("timestep", None), time, length, timestep)
     extra, more = _extras(arrays, angle.shape)
-    return RobotLog(angle, velocity, command, length, timestep, extra, time, unread | more)
+    log = RobotLog(angle, velocity, command, length, timestep, extra, time, found.unread | unread | more)
+    if names.get("velocity") == "":
+        change = short_way(np.diff(angle, axis=0)) / np.where(log.steps > 0, log.steps, np.nan)[:, None]
+        velocity[1:] = np.where(log.inside[:, None], change, np.nan)
+    return log
 
 
-def _renamed(arrays: _Arrays, names: dict[str, str]) -> tuple[_Arrays, dict[str, str]]:
+def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Apply ``names``, and return why arrays that lost their name are not read."""
+    arrays, picked, used = found.arrays, {}, set()
     for name, source in names.items():
-        if source and source not in arrays:
-            raise ValueError(f"it has no {source!r} (for {name!r}), only {sorted(arrays)}.")
-    renamed = {name: arrays[source] for name, source in names.items() if source}
-    rest = {name: values for name, values in arrays.items() if name not in names.values()}
+        if source:
+            used_name, picked[name] = _picked(found, name, source)
+            used.add(used_name)
+    rest = {name: values for name, values in arrays.items() if name not in used and name not in names.values()}
     unread = {name: f"{names[name]!r} was named for it" for name in rest if names.get(name)}
-    return {name: values for name, values in rest.items() if name not in names} | renamed, unread
+    if found.only_named:
+        unread |= {name: "no name is given to it" for name in rest if name not in ("length", "timestep", *names)}
+        rest = {name: values for name, values in rest.items() if name not in unread}
+    return {name: values for name, values in rest.items() if name not in names} | picked, unread
+
+
+def _picked(found: LogArrays, name: str, source: str) -> tuple[str, np.ndarray]:
+    """The name of an array and its values, or those of its columns that ``source`` chooses."""
+    arrays = found.arrays
+    if source in arrays:
+        return source, arrays[source]
+    if (chosen := re.fullmatch(r"(.+)\[(-?\d*):(-?\d*)\]", source)) and chosen[1] in arrays:
+        where = slice(*(int(bound) if bound else None for bound in chosen.groups()[1:]))
+        return chosen[1], np.atleast_2d(arrays[chosen[1]].T).T[:, where]
+    for array, labels in found.columns.items():
+        columns = [index for index, label in enumerate(labels) if fnmatchcase(f"{array}.{label}", source)]
+        if columns:
+            return array, arrays[array][:, columns]
+    labelled = "".join(f"; {array!r} has columns {labels}" for array, labels in found.columns.items())
+    raise ValueError(f"it has no {source!r} (for {name!r}), only {sorted(arrays)}{labelled}.")
 
 
 def _columns(values: np.ndarray) -> np.ndarray:
     return (values[:, None] if values.ndim == 1 else values).astype(np.float64)
 
 
-def _of_every_row(arrays: _Arrays, name: str, rows: int, *, number: bool) -> np.ndarray | None:
+def _of_every_row(arrays: dict[str, np.ndarray], name: str, rows: int, *, number: bool) -> np.ndarray | None:
     """Remove and return an array ``[R]``; leave anything else, to be listed as not read."""
     values = arrays.get(name, np.zeros(0))
     if values.shape not in ((rows,), (rows, 1)) or (number and not np.issubdtype(values.dtype, np.number)):
@@ -101,7 +131,7 @@ def _of_every_row(arrays: _Arrays, name: str, rows: int, *, number: bool) -> np.
     return values.astype(np.float64) if number else values
 
 
-def _length(arrays: _Arrays, rows: int) -> np.ndarray:
+def _length(arrays: dict[str, np.ndarray], rows: int) -> np.ndarray:
     episode = _of_every_row(arrays, "episode", rows, number=False)
     begins = [0] if episode is None else np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
     length = np.atleast_1d(arrays.pop("length", np.diff(np.r_[begins, rows]))).astype(np.int64)
@@ -132,7 +162,7 @@ def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarra
     return next(iter(said.values()))
 
 
-def _extras(arrays: _Arrays, shape: tuple[int, int]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def _extras(arrays: dict[str, np.ndarray], shape: tuple[int, int]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return further channels of every joint, and why other arrays are not read."""
     extra, unread, (rows, joints) = {}, {}, shape
     for name, values in arrays.items():

@@ -1,0 +1,191 @@
+"""Arrays of robot logs in .npz, .csv, .parquet and .hdf5 files, and in LeRobot dataset folders."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Names = dict[str, str]
+_DEMO = re.compile(r"demo_?(\d+)")
+
+
+@dataclass
+class LogArrays:
+    """Arrays of a file, the names of their columns, and where they go by default."""
+
+    arrays: dict[str, np.ndarray]
+    columns: dict[str, list[str]] = field(default_factory=dict)
+    names: Names = field(default_factory=dict)  # default of ``names=`` of :func:`load_robot_log`
+    unread: dict[str, str] = field(default_factory=dict)
+    only_named: bool = False  # what has no name is no channel of the joints
+
+
+def read_log_arrays(path: Path) -> LogArrays:
+    """Read all arrays of a file or a LeRobot folder; ImportError if the format needs a package that is missing."""
+    if path.is_dir():
+        return _read_lerobot(path)
+    return READERS[path.suffix](path)
+
+
+def _read_npz(path: Path) -> LogArrays:
+    return LogArrays(dict(np.load(path, allow_pickle=False)))
+
+
+def _read_csv(path: Path) -> LogArrays:
+    with path.open() as file:
+        header = [name.strip() for name in file.readline().split(",")]
+    table = np.atleast_2d(np.loadtxt(path, delimiter=",", skiprows=1, dtype=np.float64))
+    if table.shape[1] != len(header):
+        raise ValueError(f"{len(header)} names for {table.shape[1]} columns")
+    return LogArrays(_grouped(dict(zip(header, table.T, strict=True))))
+
+
+def _read_parquet(path: Path) -> LogArrays:
+    arrays, unread = _parquet_columns([path])
+    return LogArrays(_grouped(arrays), unread=unread)
+
+
+def _read_lerobot(path: Path) -> LogArrays:
+    """A LeRobot dataset: of version 2 with a file an episode, of version 3 with several in a file."""
+    info_file, files = path / "meta" / "info.json", sorted((path / "data").glob("**/*.parquet"))
+    if not info_file.is_file() or not files:
+        raise ValueError("a folder is read if it is a LeRobot dataset, with meta/info.json and data/**/*.parquet")
+    info = json.loads(info_file.read_text())
+    arrays, unread = _parquet_columns(files)
+    if "timestamp" not in arrays and info.get("fps"):
+        arrays["timestep"] = np.array(1 / info["fps"])
+    features, columns = info.get("features", {}), {}
+    for name, values in arrays.items():
+        labels = features.get(name, {}).get("names")
+        if isinstance(labels, dict):  # {"motors": [...]}
+            labels = next(iter(labels.values()), None)
+        if isinstance(labels, list) and values.ndim == 2 and len(labels) == values.shape[1]:
+            columns[name] = [str(label) for label in labels]
+    names = {"angle": "observation.state", "velocity": "", "command": "action", "episode": "episode_index"}
+    names |= {"time": "timestamp"} if "timestamp" in arrays else {}
+    return LogArrays(arrays, columns, names, unread, only_named=True)
+
+
+def _read_hdf5(path: Path) -> LogArrays:
+    """Robomimic's layout, a group ``data/demo_<k>`` an episode, or datasets of all rows of any name."""
+    h5py = _optional("h5py", path)
+    with h5py.File(path, "r") as file:
+        data = file.get("data")
+        demos = sorted(filter(_DEMO.fullmatch, data), key=_demo_number) if isinstance(data, h5py.Group) else []
+        if not demos:
+            arrays, unread = _hdf5_arrays(file, h5py)
+            arrays |= {name: np.asarray(value) for name, value in file.attrs.items() if np.isreal(value).all()}
+            return LogArrays(arrays, unread=unread)
+        found = [_hdf5_arrays(data[demo], h5py) for demo in demos]
+        unread = found[0][1]
+        parts = [{name: values for name, values in arrays.items() if values.ndim} for arrays, _ in found]
+        shared = [name for name in parts[0] if all(name in part for part in parts)]
+        unread |= {name: "not in every episode" for part in parts for name in part if name not in shared}
+        arrays = {name: np.concatenate([part[name] for part in parts]) for name in shared}
+        names = {"angle": "obs/robot0_joint_pos", "velocity": "obs/robot0_joint_vel", "command": "actions"}
+        names = {name: source for name, source in names.items() if source in arrays}
+        if "actions" in arrays:
+            arrays["length"] = np.array([len(part["actions"]) for part in parts])
+        step = json.loads(data.attrs.get("env_args", "{}")).get("env_kwargs", {}).get("control_freq")
+        if step:
+            arrays["timestep"] = np.array(1 / step)
+        return LogArrays(arrays, names=names, unread=unread, only_named=True)
+
+
+READERS: dict[str, Callable[[Path], LogArrays]] = {
+    ".npz": _read_npz,
+    ".csv": _read_csv,
+    ".parquet": _read_parquet,
+    ".hdf5": _read_hdf5,
+    ".h5": _read_hdf5,
+}
+
+
+def _optional(package: str, path: Path) -> Any:
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise ImportError(
+            f"{path} needs {package}: pip install 'torchrl_gn[logs]' (or {package.split('.')[0]})."
+        ) from error
+
+
+def _grouped(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Join columns ``name0``, ``name1``, ... ``[R]`` to arrays ``name`` ``[R, columns]``; others stay as they are."""
+    groups: dict[str, list[tuple[int, np.ndarray]]] = {}
+    for name, values in columns.items():
+        base, number = re.fullmatch(r"(.*?)(\d*)", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        single = values.ndim == 1 and np.issubdtype(values.dtype, np.number)
+        groups.setdefault(base if single else name, []).append((int(number or 0) if single else 0, values))
+    ordered = {
+        base: [values for _, values in sorted(group, key=lambda entry: entry[0])] for base, group in groups.items()
+    }
+    return {
+        base: group[0] if group[0].ndim > 1 or not np.issubdtype(group[0].dtype, np.number) else np.stack(group, 1)
+        for base, group in ordered.items()
+    }
+
+
+def _parquet_columns(files: Sequence[Path]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Columns ``[R]``, or ``[R, k]`` of lists of equal length, and why others are not read."""
+    pq = _optional("pyarrow.parquet", files[0])
+    schema = pq.read_schema(files[0])
+    flat = {entry.name for entry in schema if not _nested(entry.type)}
+    unread = {name: "neither numbers nor text, nor lists of them" for name in schema.names if name not in flat}
+    wanted = [name for name in schema.names if name in flat]
+    tables = [pq.read_table(file, columns=wanted) for file in files]
+    arrays = {}
+    for name in wanted:
+        try:
+            arrays[name] = np.concatenate([_column(table.column(name).combine_chunks()) for table in tables])
+        except ValueError as error:
+            unread[name] = str(error)
+    return arrays, unread
+
+
+def _nested(kind: Any) -> bool:
+    inner = kind.value_type if hasattr(kind, "value_type") else kind
+    return inner.num_fields > 0 or str(inner) in ("binary", "large_binary")
+
+
+def _column(values: Any) -> np.ndarray:
+    kind = str(values.type)
+    if "list" in kind:
+        lengths = set(values.value_lengths().to_pylist()) if "fixed" not in kind else {values.type.list_size}
+        if len(lengths) != 1 or None in lengths:
+            raise ValueError("of lists of several lengths")
+        return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
+    if kind.startswith(("timestamp", "duration")):
+        per_second = {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[values.type.unit]
+        return values.cast("int64").to_numpy(zero_copy_only=False) / per_second
+    return values.to_numpy(zero_copy_only=False)
+
+
+def _hdf5_arrays(group: Any, h5py: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Numeric datasets of up to two dimensions below a group, by path, and why others are not read."""
+    arrays, unread = {}, {}
+    for name, values in _datasets(group, h5py):
+        if values.ndim > 2:
+            unread[name] = f"of shape {list(values.shape)}"
+        else:
+            arrays[name] = values.asstr()[()] if h5py.check_string_dtype(values.dtype) else np.asarray(values[()])
+    return arrays, unread
+
+
+def _datasets(group: Any, h5py: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, entry in group.items():
+        if isinstance(entry, h5py.Group):
+            yield from _datasets(entry, h5py, f"{prefix}{name}/")
+        elif isinstance(entry, h5py.Dataset):
+            yield f"{prefix}{name}", entry
+
+
+def _demo_number(name: str) -> int:
+    return int(_DEMO.fullmatch(name)[1])  # pyright: ignore[reportOptionalSubscript]
