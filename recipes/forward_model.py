@@ -94,7 +94,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
     return Trainer(
         losses[0] if len(losses) == 1 else SeveralScenesLoss(losses),
         make_buffer(tasks, cfg.batch_size, 1, cfg.seed, workers),
-        make_optimizer(model.core, cfg.optimizer, lr=cfg.lr),
+        make_optimizer(model, cfg.optimizer, lr=cfg.lr),
         Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
         unroll_fraction=cfg.unroll_fraction,

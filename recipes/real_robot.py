@@ -111,7 +111,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
     return Trainer(
         loss,
         trajectory_buffer(data["train"], batch_size=size, window=window, seed=cfg.seed),
-        make_optimizer(model.core, cfg.optimizer, lr=cfg.lr),
+        make_optimizer(model, cfg.optimizer, lr=cfg.lr),
         Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
         unroll_fraction=cfg.unroll_fraction if unroll is not None else 0.0,
