@@ -8,7 +8,6 @@ relative to the first link; viscous and Coulomb friction, geared motors with rot
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import torch

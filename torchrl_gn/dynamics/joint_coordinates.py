@@ -21,7 +21,7 @@ class JointCoordinates(Float64Buffers):
     """MuJoCo's ``qpos`` and ``qvel`` of body states, differentiable.
 
     For bodies with a free joint, or with slides and then at most one hinge; a hinge's angle is the one nearest to the
-    middle of its range. States that the joints do not allow give the nearest slides, and the hinge's part of a rotation.
+    middle of its range. Of states that the joints do not allow, it takes the nearest.
 
     Raises:
         UnsupportedSceneError: names the joint whose coordinate does not follow.

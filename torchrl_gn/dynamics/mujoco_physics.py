@@ -203,5 +203,7 @@ def _matched(scene: Scene, tree: KinematicTree, joints: Sequence[str] | None) ->
             " give joints=, the scene's joint for each of the robot's."
         )
     if wrong := [name for name in joints if kinds[name] != mujoco.mjtJoint.mjJNT_HINGE]:
-        raise UnsupportedSceneError(f"Joints {wrong} of scene {scene.name!r} are no hinges, whose angles encoders show.")
+        raise UnsupportedSceneError(
+            f"Joints {wrong} of scene {scene.name!r} are no hinges, whose angles encoders show."
+        )
     return tuple(joints)
