@@ -15,7 +15,7 @@ from torchrl_gn.scenes import KinematicTree, Scene
 from torchrl_gn.training import plain_config
 
 
-def load_physics(source: str | None, options: Mapping[str, Any], robot: Scene | KinematicTree) -> Physics | None:
+def load_physics(source: str | None, options: Mapping[str, Any] | None, robot: Scene | KinematicTree) -> Physics | None:
     """Physics for a robot's residual model; None without.
 
     Args:
@@ -26,7 +26,7 @@ def load_physics(source: str | None, options: Mapping[str, Any], robot: Scene | 
     Raises:
         ValueError: if the source names nothing, or a function is given options.
     """
-    options = plain_config(options)
+    options = plain_config(options or {})
     if source is None:
         return None
     tree = robot if isinstance(robot, KinematicTree) else None
