@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -11,11 +12,12 @@ from typing import cast
 import mujoco
 import numpy as np
 import torch
+from mujoco.rollout import Rollout
 from torch import Tensor
 
-from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.physics import Physics
+from torchrl_gn.processor import usable_cores
 from torchrl_gn.scenes import KinematicTree, Scene, UnsupportedSceneError, load_scene, scene_from_description
 
 _GROUPS = {
@@ -23,6 +25,7 @@ _GROUPS = {
     "friction": ("dof_damping", "dof_frictionloss", "geom_friction"),
 }
 _DIFFERENCE = 1e-6  # of the coordinates, for central differences
+_MEMORY = 2**23  # numbers of MuJoCo's output held at a time
 
 
 class MujocoPhysics(Physics):
@@ -62,7 +65,8 @@ class MujocoPhysics(Physics):
             scene = load_scene(scene, timestep=None if tree is None else tree.timestep)
         self.scene, self.tree, self.scale, self.num_threads = scene, tree, dict(scale or {}), num_threads
         self.simulated = _scaled(scene, self.scale)
-        self._simulator: Simulator | None = None
+        self._pool: Rollout | None = None
+        self._data: list[mujoco.MjData] = []
         model = scene.model
         if model.nv != scene.physics_size - 1 - model.nq:
             raise UnsupportedSceneError(f"Scene {scene.name!r} has a state beside positions and velocities.")
@@ -113,18 +117,32 @@ class MujocoPhysics(Physics):
 
     def advance(self, position: np.ndarray, velocity: np.ndarray, action: np.ndarray) -> np.ndarray:
         """Coordinates and rates ``[n, nq + nv]``, or body states ``[n, N * 13]``, a control step later."""
-        self._simulator = self._simulator or Simulator(self.simulated, self.num_threads)
-        physics = np.concatenate((np.ones((len(position), 1)), position, velocity), axis=1)
-        finite = np.isfinite(physics).all(1) & np.isfinite(action).all(1)
-        rest = np.concatenate((np.ones(1), self.scene.model.qpos0, np.zeros(self.scene.model.nv)))
-        physics, action = np.where(finite[:, None], physics, rest), np.where(finite[:, None], action, 0.0)
-        if self.tree is not None:
-            after = self._simulator.step(physics, action)[0][:, 1:]
-        else:
-            rollout = self._simulator.rollout(physics, action[:, None])
-            after = cast(Tensor, rollout["state"]).numpy()[:, 1].reshape(len(physics), -1)
-            finite &= rollout["stable"].numpy()
+        model, timestep = self.simulated.model, self.simulated.model.opt.timestep
+        # Sensors show the state before a physics step: one more step shows the last.
+        steps = self.scene.substeps + (self.tree is None)
+        start = np.concatenate((np.ones((len(position), 1)), position, velocity), axis=1)
+        finite = np.isfinite(start).all(1) & np.isfinite(action).all(1)
+        rest = np.concatenate((np.ones(1), model.qpos0, np.zeros(model.nv)))
+        start, action = np.where(finite[:, None], start, rest), np.where(finite[:, None], action, 0.0)
+        rows, parts = max(1, _MEMORY // (steps * (model.nsensordata + start.shape[1] + model.nu))), []
+        for first in range(0, len(start), rows):
+            part = slice(first, first + rows)
+            held = np.repeat(action[part, None], steps, axis=1) if model.nu else None
+            pool = self._simulation()
+            with _quiet():
+                after, sensors = pool.rollout(model, self._data, start[part], held, nstep=steps)
+            # MuJoCo resets an unstable simulation, and its time.
+            finite[part] &= after[:, -1, 0] > 1 + (steps - 0.5) * timestep
+            parts.append(sensors[:, -1, self.scene.sensor_slice] if self.tree is None else after[:, -1, 1:])
+        after = np.concatenate(parts) if parts else np.empty((0, 13 * self.scene.num_nodes))
         return np.where(finite[:, None], after, np.nan)
+
+    def _simulation(self) -> Rollout:
+        if self._pool is None:
+            threads = self.num_threads or usable_cores()
+            self._pool = Rollout(nthread=threads if threads > 1 else 0)
+            self._data = [mujoco.MjData(self.simulated.model) for _ in range(threads)]
+        return self._pool
 
     def description(self) -> dict:
         tree = None if self.tree is None else self.tree.description()
@@ -143,7 +161,7 @@ class MujocoPhysics(Physics):
         )
 
     def __getstate__(self) -> dict:
-        return {**super().__getstate__(), "_simulator": None}  # copies start their own threads
+        return {**super().__getstate__(), "_pool": None, "_data": []}  # copies start their own threads
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}, scale={self.scale}"
@@ -174,6 +192,19 @@ class _Advance(torch.autograd.Function):
         found = np.einsum("knm,nm->nk", ahead - behind, gradient.reshape(len(flat), -1).cpu().numpy())
         parts = torch.from_numpy(found / (2 * _DIFFERENCE)).to(gradient.device).split(sizes, dim=-1)
         return None, *(part.view_as(each) for part, each in zip(parts, inputs, strict=True))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep MuJoCo from printing warnings of unstable simulations, unless the user has a handler."""
+    own = mujoco.get_mju_user_warning() is None
+    if own:
+        mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        if own:
+            mujoco.set_mju_user_warning(None)
 
 
 def _scaled(scene: Scene, scale: Mapping[str, float]) -> Scene:

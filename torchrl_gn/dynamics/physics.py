@@ -90,7 +90,6 @@ def physics_from_description(
 
     ValueError if a function is not given, or another than the one described.
     """
-    # It imports data, which most models do without.
     from torchrl_gn.dynamics.mujoco_physics import MujocoPhysics
 
     if description is None:
