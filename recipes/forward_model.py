@@ -11,6 +11,8 @@ trajectories never trained on. Ctrl-C saves everything; the same `run_dir` goes 
 - `zero_shot` systems are only evaluated (paper: Figure "Zero-shot dynamics prediction").
 - `parametrized=true` trains on random variants of the systems, each sequence of its own (paper: SM "Datasets"), and
   evaluates on new variants and on the standard systems. Of several systems, those without variants stay as they are.
+- `physics=scene "physics_options={scale: {mass: 1.2, friction: 0.8}}"` trains on top of MuJoCo's prediction with wrong
+  parameters, which it corrects; `physics=robot.xml` and `physics=robot.py:function` on top of others. One system.
 - `start_from=cheetah data.extra=runs/mpc/<time>/gn.safetensors` goes on from a model of the package; half of its data
   are the episodes that recipes/mpc.py saved.
 
@@ -29,13 +31,22 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, resumed_checkpoint, with_help
+from _common.known_physics import load_physics
 from _common.models import build_model
 from _common.progress import cut_short_note, train_with_progress
 from _common.training_data import Task, make_buffer, make_tasks
 from torchrl_gn import load_pretrained
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_training_curve, report, summary
+from torchrl_gn.dynamics import ForwardModel, Physics
+from torchrl_gn.evaluation import (
+    ErrorTable,
+    baseline_errors,
+    evaluate_errors,
+    plot_errors,
+    plot_training_curve,
+    report,
+    summary,
+)
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import Budget, RunFolder, Tracker, Trainer, Workers, join_workers, make_optimizer, plain_config
@@ -61,13 +72,13 @@ def load_scenes(names: str | ListConfig, timestep: float | None) -> list[Scene]:
     return [load_scene(name, timestep=timestep) for name in as_list(names)]
 
 
-def make_model(cfg: DictConfig, scenes: list[Scene]) -> ForwardModel:
+def make_model(cfg: DictConfig, scenes: list[Scene], physics: Physics | None) -> ForwardModel:
     """A model with fresh weights, or the one to start from."""
     if cfg.start_from is not None:
-        return load_pretrained(cfg.start_from).model
+        return load_pretrained(cfg.start_from, physics=physics).model
     if cfg.model.core == "mlp" and len(scenes) > 1:
         raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
-    return build_model(scenes, cfg.model)
+    return build_model(scenes, cfg.model, physics=physics)
 
 
 def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], workers: Workers) -> Trainer:
@@ -94,7 +105,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
     return Trainer(
         losses[0] if len(losses) == 1 else SeveralScenesLoss(losses),
         make_buffer(tasks, cfg.batch_size, 1, cfg.seed, workers),
-        make_optimizer(model.core, cfg.optimizer, lr=cfg.lr),
+        make_optimizer(model, cfg.optimizer, lr=cfg.lr),
         Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
         unroll_fraction=cfg.unroll_fraction,
@@ -122,13 +133,15 @@ def evaluate(
         name, test = task.scene.name, task.dataset.test
         place = folder if len(tasks) == 1 else folder / name
         scene = task.dataset.scene_of("test", 0)
-        tables[name], written = report(task.bind(model), test, place, scene=scene)
+        tables[name], written = report(task.bind(model), test, place, scene=scene, horizons=tuple(cfg.horizons))
         files += written
+        if model.physics is not None:
+            tables |= baseline_errors(task.scene, test, model.physics, horizons=tuple(cfg.horizons))
     others = {f"standard {task.scene.name}": task.scene for task in tasks if task.parametrized}
     others |= {f"{scene.name} (zero-shot)": scene for scene in unseen}
     for name, scene in tqdm(others.items(), desc="evaluating", disable=not others, leave=False):
         sequences = collect_trajectories(scene, cfg.data.test, cfg.data.length, cfg.data.seed, split=3)
-        tables[name] = evaluate_errors(model.bind(scene), sequences)
+        tables[name] = evaluate_errors(model.bind(scene), sequences, horizons=tuple(cfg.horizons))
     if len(tables) > 1:
         files.append(plot_errors(tables, folder / "errors.png"))
     return tables, list(dict.fromkeys(files))
@@ -140,9 +153,12 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     torch.set_num_threads(cfg.threads)
     scenes, unseen = load_scenes(cfg.system, cfg.timestep), load_scenes(cfg.zero_shot, cfg.timestep)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)  # refuse a bad budget before anything is written
+    if cfg.physics is not None and len(scenes) > 1:
+        raise ValueError("physics= are of one system; name one.")
+    physics = load_physics(cfg.physics, cfg.physics_options, scenes[0])
     run = workers.agree(lambda: RunFolder(cfg.run_dir, "forward_model"))
-    resumed = resumed_checkpoint(cfg, run, MAY_CHANGE)
-    model = (resumed.model if resumed else make_model(cfg, scenes)).to(workers.device(cfg.device))
+    resumed = resumed_checkpoint(cfg, run, MAY_CHANGE, physics=physics)
+    model = (resumed.model if resumed else make_model(cfg, scenes, physics)).to(workers.device(cfg.device))
     if workers.first:
         run.write_config(OmegaConf.to_yaml(cfg))
     names = "-".join(scene.name for scene in scenes)

@@ -1,12 +1,14 @@
-"""Train forward models on the logs of a robot's joints, with and without recurrence.
+"""Train forward models on the logs of a robot's joints: with and without recurrence, and on top of known physics.
 
     python recipes/real_robot.py [log=arm.npz] [timestep=0.01] ["names={angle: q, velocity: dq, command: u}"]
 
-Follows the paper's "Real robot data" and SM "Recurrent one-step predictions". Reads a log (docs/data.md),
-measures its rate, delays and noise, cuts it where it breaks, and trains a feed-forward and a recurrent
-graph network for equal time. Compares both on episodes never trained on (of few episodes: on the last part), after
-`burn_in` true steps. Without a log it simulates one: the JACO arm, with lagging motors, play, and noisy, coarse
-encoders. Ctrl-C saves everything; the same `run_dir` goes on.
+Follows the paper's "Real robot data" and SM "Recurrent one-step predictions". Reads a log (docs/data.md), measures its
+rate, delays and noise, cuts it where it breaks, and trains a feed-forward and a recurrent graph network for equal time.
+Compares both on episodes never trained on (of few episodes: on the last part), after `burn_in` true steps, and with
+baselines. `physics=robot.xml`, or `physics=robot.py:function` of state and action, adds those physics and a residual
+model, which corrects them; parameters of the function that require gradients are fitted to the log first. Without a log
+it simulates one: the JACO arm, with lagging motors, play, and noisy, coarse encoders. Ctrl-C saves everything; the same
+`run_dir` goes on.
 
 Writes config.yaml, metrics.json, a checkpoint of each model, and figures of joint angles (joints.png) and errors
 (errors.png) to its run folder. All options: recipes/config/real_robot.yaml. Results: docs/results.md.
@@ -24,6 +26,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
 from _common import clean_exit, finish_run, open_log, with_help
+from _common.known_physics import load_physics
 from _common.models import build_model
 from _common.progress import train_with_progress
 from torchrl_gn.data import (
@@ -35,8 +38,8 @@ from torchrl_gn.data import (
     simulate_log,
     trajectory_buffer,
 )
-from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.evaluation import ErrorTable, evaluate_errors, plot_errors, plot_joints, summary
+from torchrl_gn.dynamics import ForwardModel, Physics
+from torchrl_gn.evaluation import baseline_errors, evaluate_errors, plot_errors, plot_joints, summary
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import KinematicTree, load_scene
 from torchrl_gn.training import (
@@ -45,6 +48,7 @@ from torchrl_gn.training import (
     RunFolder,
     Tracker,
     Trainer,
+    fit_physics,
     load_pretrained,
     make_optimizer,
     plain_config,
@@ -123,7 +127,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
     return Trainer(
         loss,
         trajectory_buffer(data["train"], batch_size=size, window=window, seed=cfg.seed),
-        make_optimizer(model.core, cfg.optimizer, lr=cfg.lr),
+        make_optimizer(model, cfg.optimizer, lr=cfg.lr),
         Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
         unroll_fraction=cfg.unroll_fraction if unroll is not None else 0.0,
@@ -139,13 +143,16 @@ def train(
     tree: KinematicTree,
     data: dict,
     tracker: Tracker,
+    physics: Physics | None,
 ):
     """Train one of the models, or go on with it; the model and its trainer."""
     if resumed:
         model = resumed.model
     else:
         torch.manual_seed(cfg.seed)
-        model = build_model(tree, cfg.model, **plain_config(cfg.models[name]))
+        options = plain_config(cfg.models[name])
+        known = physics if options.pop("physics", False) else None
+        model = build_model(tree, cfg.model, physics=known, **options)
     trainer = make_trainer(cfg, model, tree, data)
     if not resumed:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
@@ -169,25 +176,35 @@ def main(cfg: DictConfig) -> None:
     print(tree)
     data = split(cfg, log)
     run = RunFolder(cfg.run_dir, "real_robot")
-    paths = {name: run.path / name / CHECKPOINT_FILE for name in cfg.models}
-    resumed = {name: load_pretrained(path) for name, path in paths.items() if path.exists()}
+    physics = load_physics(cfg.physics, cfg.physics_options, tree)
+    measured: dict[str, Any] = {
+        "burn_in": cfg.burn_in,
+        "horizons": {h for h in cfg.horizons if h <= horizon} | {horizon},
+    }
+    tables = baseline_errors(tree, data["test"], physics, **measured)
+    residual = {name for name, options in cfg.models.items() if options.get("physics", False)}
+    names = [name for name in cfg.models if physics is not None or name not in residual]
+    paths = {name: run.path / name / CHECKPOINT_FILE for name in names}
+    resumed = {
+        name: load_pretrained(path, physics=physics if name in residual else None)
+        for name, path in paths.items()
+        if path.exists()
+    }
     for checkpoint in resumed.values():
         run.refuse_changes(checkpoint.config, cfg, free=MAY_CHANGE)
     tracker = open_log(cfg, run, label=f"real_robot-{tree.name}")
-    tables: dict[str, ErrorTable] = {}
+    if physics is not None and physics.trained and cfg.physics_fit:
+        if not residual & resumed.keys():
+            fit_physics(physics, tree, data["train"], steps=cfg.physics_fit, seed=cfg.seed)
+        physics.requires_grad_(False)
+        tables["fitted physics"] = baseline_errors(tree, data["test"], physics, **measured)["physics"]
     metrics: dict[str, float] = {}
     for name, path in paths.items():
-        model, trainer = train(cfg, name, path, resumed.get(name), tree, data, tracker)
-        tables[name] = evaluate_errors(
-            model.bind(cast(Any, tree)),
-            data["test"],
-            horizons=(min(20, horizon), horizon),
-            burn_in=cfg.burn_in,
-            keep=1,
-        )
-        metrics |= {f"{name}/{key}": value for key, value in tables[name].to_metrics().items()}
+        model, trainer = train(cfg, name, path, resumed.get(name), tree, data, tracker, physics)
+        tables[name] = evaluate_errors(model.bind(cast(Any, tree)), data["test"], keep=1, **measured)
         metrics |= {f"{name}/steps": trainer.step, f"{name}/training_seconds": trainer.seconds}
-    predictions = {name: table.rollouts[0] for name, table in tables.items()}
+    metrics |= {f"{name}/{key}": value for name, table in tables.items() for key, value in table.to_metrics().items()}
+    predictions = {name: tables[name].rollouts[0] for name in names}
     pictures = [
         plot_joints(cast(Any, data["test"]["state"])[0], predictions, tree, run.path / "joints.png"),
         plot_errors(tables, run.path / "errors.png"),

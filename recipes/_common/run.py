@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_gn.dynamics import Physics
 from torchrl_gn.training import Checkpoint, RunFolder, Tracker, load_pretrained
 from torchrl_gn.training.run_folder import CONFIG_FILE, METRICS_FILE
 
@@ -24,15 +25,17 @@ def open_log(cfg: DictConfig, run: RunFolder, *, label: str | None = None) -> Tr
     return Tracker(cfg.logger, run.path / "log", name=label or run.name, config=cfg)
 
 
-def resumed_checkpoint(cfg: DictConfig, run: RunFolder, may_change: Collection[str]) -> Checkpoint | None:
-    """Load the checkpoint to go on from; None if the run is new.
+def resumed_checkpoint(
+    cfg: DictConfig, run: RunFolder, may_change: Collection[str], *, physics: Physics | None = None
+) -> Checkpoint | None:
+    """Load the checkpoint to go on from, of a model that corrects ``physics``; None if the run is new.
 
     Raises:
         ValueError: if an option outside of ``may_change`` differs from the checkpoint's.
     """
     if not run.checkpoint.exists():
         return None
-    checkpoint = load_pretrained(run.checkpoint)
+    checkpoint = load_pretrained(run.checkpoint, physics=physics)
     run.refuse_changes(checkpoint.config, cfg, free=may_change)
     return checkpoint
 

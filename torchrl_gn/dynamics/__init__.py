@@ -11,7 +11,11 @@ from torchrl_gn.dynamics.features import Controls as Controls
 from torchrl_gn.dynamics.features import Feature as Feature
 from torchrl_gn.dynamics.features import JointAxes as JointAxes
 from torchrl_gn.dynamics.features import PairContacts as PairContacts
+from torchrl_gn.dynamics.features import PhysicsChange as PhysicsChange
 from torchrl_gn.dynamics.model import ForwardModel as ForwardModel
+from torchrl_gn.dynamics.mujoco_physics import MujocoPhysics as MujocoPhysics
+from torchrl_gn.dynamics.physics import ConstantVelocity as ConstantVelocity
+from torchrl_gn.dynamics.physics import Physics as Physics
 from torchrl_gn.dynamics.predictor import Predictor as Predictor
 from torchrl_gn.dynamics.specialized import SpecializedPredictor as SpecializedPredictor
 from torchrl_gn.dynamics.specialized import specialize as specialize

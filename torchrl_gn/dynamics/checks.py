@@ -74,7 +74,7 @@ def warn_of_unseen(predictor: Predictor, values: PhysicalParameters, name: str, 
         for index in (normalizer.constant & differs).nonzero().flatten().tolist():
             unseen.append(getattr(model.parameter_names, part)[index])
     residual = model.residual_normalizer
-    if bool((residual.count > 0).any()):
+    if model.physics is None and bool((residual.count > 0).any()):
         fixed = (predictor.movable & residual.constant).any(0).nonzero().flatten().tolist()
         unseen += [f"state change {index}" for index in fixed]
     if not unseen:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, Literal, cast, get_args
 
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_gn.dynamics.features import (
     FEATURES,
@@ -17,8 +17,11 @@ from torchrl_gn.dynamics.features import (
     Controls,
     Feature,
     JointAxes,
+    PhysicsChange,
     graph_edges,
 )
+from torchrl_gn.dynamics.normalization import DYNAMIC_FLOOR
+from torchrl_gn.dynamics.physics import as_physics, physics_from_description
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
@@ -29,8 +32,6 @@ from torchrl_gn.scenes import KinematicTree, ParameterNames, PhysicalParameters,
 
 ParameterSource = Literal["none", "scene", "inferred"]
 
-# Standard deviations below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
-_DYNAMIC_FLOOR = 1e-9
 # Physical parameters further than this from training's, in standard deviations, are clipped to it.
 _PARAMETER_LIMIT = 20.0
 
@@ -49,8 +50,10 @@ class ForwardModel(nn.Module):
             the estimated anchor offsets less the scene's.
         canonicalizer: which invariances are built in.
         integrate: predict of position and orientation only what their rates do not explain (trapezoidal rule); the
-            paper predicts the whole change.
+            paper predicts the whole change. Physics take its place.
         project: project predictions onto the joint constraints. Paper: bodies drift apart.
+        physics: known physics of one robot, which the network corrects, see
+            :class:`~torchrl_gn.dynamics.physics.Physics`; a function or module of state and action.
         core: name of the network, one of :data:`~torchrl_gn.networks.CORES`.
         counts: numbers of nodes and edges, for a core that reads graphs of one size.
         **core_options: of the core's class, for example ``hidden=64``.
@@ -70,6 +73,7 @@ class ForwardModel(nn.Module):
         canonicalizer: Canonicalizer | None = None,
         integrate: bool = True,
         project: bool = True,
+        physics: Callable[[Tensor, Tensor], Tensor] | None = None,
         core: str = "gn",
         counts: Sequence[int] | None = None,
         **core_options,
@@ -78,6 +82,9 @@ class ForwardModel(nn.Module):
         if parameters not in (choices := list(get_args(ParameterSource))):
             raise ValueError(f"parameters={parameters!r} is not known; use one of {choices}.")
         self.parameter_source, self.layout, self.features = parameters, layout, tuple(features)
+        self.physics = None if physics is None else as_physics(physics)
+        if physics is not None and PhysicsChange() not in self.features:
+            self.features += (PhysicsChange(),)
         self.parameter_names = parameter_names if parameters == "scene" else ParameterNames()
         self.canonicalizer = Canonicalizer() if canonicalizer is None else canonicalizer
         self.integrate, self.project = integrate, project
@@ -95,15 +102,15 @@ class ForwardModel(nn.Module):
         if parameters == "inferred":
             # The anchor offsets say how long bodies are.
             static = self.inferred_size + GraphSize(6 if project else 0, 0, 0)
-        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=_DYNAMIC_FLOOR)
-        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=_DYNAMIC_FLOOR)
+        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=DYNAMIC_FLOOR)
+        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=DYNAMIC_FLOOR)
         self.parameter_node_normalizer = Normalizer(static.nodes, limit=_PARAMETER_LIMIT)
         self.parameter_edge_normalizer = Normalizer(static.edges, limit=_PARAMETER_LIMIT)
         static += GraphSize(0, int(self.marks_edges), 0)
         self.parameter_global_normalizer = Normalizer(static.globals_, limit=_PARAMETER_LIMIT)
         # The network's output has the residual's scale; errors are weighted by the whole change's.
-        self.residual_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
-        self.delta_normalizer = Normalizer(layout.delta_size, floor=_DYNAMIC_FLOOR)
+        self.residual_normalizer = Normalizer(layout.delta_size, floor=DYNAMIC_FLOOR)
+        self.delta_normalizer = Normalizer(layout.delta_size, floor=DYNAMIC_FLOOR)
         kind = cast(Any, core_class(core))
         fixed = {"counts": counts} if kind.fixed_size else {}
         self.casts = 0  # of the weights, which PyTorch counts as no change of them
@@ -208,6 +215,7 @@ class ForwardModel(nn.Module):
             "canonicalizer": asdict(self.canonicalizer),
             "integrate": self.integrate,
             "project": self.project,
+            "physics": None if self.physics is None else self.physics.description(),
             "core": self.core_name,
             "counts": None if self.core.counts is None else list(self.core.counts),
             "core_options": {
@@ -216,9 +224,15 @@ class ForwardModel(nn.Module):
         }
 
     @classmethod
-    def from_description(cls, description: dict) -> ForwardModel:
-        """Build the model of a :meth:`description`, with fresh weights; ValueError if it has unknown names."""
+    def from_description(
+        cls, description: dict, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
+    ) -> ForwardModel:
+        """Build the model of a :meth:`description`, with fresh weights.
+
+        ValueError if it has unknown names, or needs physics that are not given: those of MJCF rebuild themselves.
+        """
         rest = dict(description)
+        known = physics_from_description(rest.pop("physics", None), physics)
         features = []
         for each in rest.pop("features"):
             options = dict(each)
@@ -234,6 +248,7 @@ class ForwardModel(nn.Module):
             layout=layout,
             features=features,
             canonicalizer=Canonicalizer(**rest.pop("canonicalizer")),
+            physics=known,
             **rest.pop("core_options"),
             **rest,
         )

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import hardshrink, pad
 
 from torchrl_gn.dynamics.checks import check_shapes
 from torchrl_gn.dynamics.executors import eager
-from torchrl_gn.dynamics.program import InputScaling, OutputScaling
+from torchrl_gn.dynamics.program import InputScaling, OutputScaling, StepProgram
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.networks.core import FoldedCore, ReducibleCore
@@ -20,6 +20,9 @@ from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.predictor import Predictor
+
+# Standard deviations below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
+DYNAMIC_FLOOR = 1e-9
 
 
 def static_graph(predictor: Predictor, parameters: PhysicalParameters, dtype: torch.dtype | None = None) -> Graph:
@@ -46,21 +49,22 @@ def dynamic_graph(predictor: Predictor, state: Tensor, action: Tensor) -> Graph:
     """Normalised dynamic graph ``[*B, ...]`` of states and actions, in the network's dtype."""
     check_shapes(predictor.scene, state, action)
     program = predictor.program(reference=True)
-    return eager.dynamic_graph(program, program.canonicalizer(state, program.parameters), action)
+    return eager.dynamic_graph(program, eager.canonical_state(program, state, action), action)
 
 
-def residual(
-    predictor: Predictor, state: Tensor, next_state: Tensor, parameters: PhysicalParameters | None = None
-) -> Tensor:
-    """Target of the network for transitions: change ``[*B, N, 12]`` in the yaw frame, less what the rates explain."""
-    layout, frame = predictor.layout, predictor.canonicalizer
+def residual(program: StepProgram, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    """Target of the network for transitions: change ``[*B, N, 12]`` in the yaw frame, less what is known of it.
+
+    That is what the rates explain, or what physics predict.
+    """
+    layout, canonical = program.layout, eager.canonical_state(program, state, action)
     change = layout.delta(state, next_state)
-    if predictor.model.integrate:
-        change = layout.residual(state, change, float(predictor.scene.timestep))
-    rotation = frame.yaw_rotation(state, parameters or predictor.scene_parameters)
-    if rotation is None:
-        return change
-    return layout.rotate_delta(change, quaternion.conjugate(rotation.quaternion), rotation.matrix.mT)
+    if program.timestep is not None:
+        change = layout.residual(state, change, program.timestep)
+    if (rotation := canonical.rotation) is not None:
+        change = layout.rotate_delta(change, quaternion.conjugate(rotation.quaternion), rotation.matrix.mT)
+    # What differs by rounding alone is to be corrected by exactly nothing.
+    return change if canonical.change is None else hardshrink(change - canonical.change, DYNAMIC_FLOOR)
 
 
 def in_range(predictor: Predictor, states: Tensor, limit: float) -> Tensor:
@@ -111,11 +115,11 @@ def update_dynamic_normalizers(
         if value is not None:
             require_finite(value, what)
     model, movable, program = predictor.model, predictor.movable, predictor.program(parameters, reference=True)
-    nodes, edges = eager.features(program, program.canonicalizer(state, program.parameters), action)
+    nodes, edges = eager.features(program, eager.canonical_state(program, state, action), action)
     model.node_normalizer.update(nodes)
     model.edge_normalizer.update(edges)
     model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)
-    model.residual_normalizer.update(residual(predictor, state, next_state, program.parameters), movable)
+    model.residual_normalizer.update(residual(program, state, action, next_state), movable)
 
 
 def scaled(

@@ -192,13 +192,15 @@ class Predictor(TensorDictModuleBase):
             output=output,
             change_std=model.delta_normalizer.std,
             dtype=self.dtype,
+            physics=model.physics,
         )
 
     def constants(self) -> dict:
         """Those parts of a program that follow from the scene alone."""
         return {
             "layout": self.layout,
-            "timestep": float(self.scene.timestep) if self.model.integrate else None,
+            # Physics know how rates integrate.
+            "timestep": float(self.scene.timestep) if self.model.integrate and self.model.physics is None else None,
             "movable": self.movable,
             "edge_index": self.incidence.edge_index,
             "canonicalizer": self.canonicalizer,
@@ -214,7 +216,8 @@ class Predictor(TensorDictModuleBase):
 
     def training_executor(self, parameters: TensorDictBase | None = None) -> EagerExecutor | NativeDelta:
         """What predicts changes by its ``delta``, differentiable in states, actions and weights."""
-        if torch.compiler.is_compiling():  # which cannot ask which features vary
+        # A compiler cannot ask which features vary; C++ has no gradient in parameters of physics.
+        if torch.compiler.is_compiling() or (self.model.physics is not None and self.model.physics.trained):
             return EagerExecutor(self.program(parameters))
         program = self.program(parameters, reduced=True)
         if self._trainer is None:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics.constraints import MaximalProjection
 from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 from torchrl_gn.dynamics.features.controls import ControlInputs
+from torchrl_gn.dynamics.physics import Physics
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.networks.core import Core, FoldedCore
@@ -82,7 +83,7 @@ class StepProgram:
     """
 
     layout: StateLayout  # channels of the state
-    timestep: float | None  # control step, seconds; None: the whole change is predicted
+    timestep: float | None  # control step, seconds, to integrate the rates; None: they are not
     movable: Tensor  # [N, 12] movable-component mask
     edge_index: Tensor  # [2, E]
     parameters: PhysicalParameters  # physical parameters of the scene, or of each sample
@@ -99,6 +100,7 @@ class StepProgram:
     projection: MaximalProjection | None  # onto the joint constraints; None without
     change_std: Tensor  # [12] standard deviations of a change, weights of the projection
     dtype: torch.dtype  # of the network
+    physics: Physics | None = None  # whose prediction the network corrects; None without
 
 
 class Executor(Protocol):

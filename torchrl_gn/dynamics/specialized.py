@@ -17,6 +17,7 @@ from torchrl_gn.dynamics.checks import UnseenParameterWarning
 from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor
 from torchrl_gn.dynamics.executors.native.binding import load_binding, make_plan
 from torchrl_gn.dynamics.normalization import scaled, static_graph
+from torchrl_gn.dynamics.physics import Physics
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
 from torchrl_gn.dynamics.watched import Watched, is_same, version_of
@@ -177,6 +178,7 @@ class SpecializedPredictor(Predictor):
             output=_copied(output),
             change_std=self.model.delta_normalizer.std.clone(),
             dtype=self.dtype,
+            physics=_frozen(self.model.physics),
         )
 
     def skipped(self) -> dict[str, tuple[float, float]]:
@@ -261,6 +263,12 @@ def specialize(
 
 def _width(inputs: InputScaling, full: int) -> int:
     return full if inputs.columns is None else len(inputs.columns)
+
+
+def _frozen(physics: Physics | None) -> Physics | None:
+    """The physics, or a copy of those that are trained."""
+    trained = physics is not None and physics.trained
+    return copy.deepcopy(physics).requires_grad_(False) if trained else physics
 
 
 def _copied(scaling: Any) -> Any:

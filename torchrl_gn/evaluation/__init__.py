@@ -1,5 +1,6 @@
 """Errors as the paper defines them, rollouts, figures and videos."""
 
+from torchrl_gn.evaluation.baselines import baseline_errors as baseline_errors
 from torchrl_gn.evaluation.error_table import ErrorTable as ErrorTable
 from torchrl_gn.evaluation.error_table import PredictionError as PredictionError
 from torchrl_gn.evaluation.error_table import summary as summary

@@ -160,7 +160,9 @@ class BoundInferenceModel(TensorDictModuleBase):
         # Features of all steps at once: only the graph network is recurrent.
         predictor = self.predictor
         dynamic = dynamic_graph(predictor, state, action)
-        change = predictor.model.residual_normalizer(residual(predictor, state, next_state), predictor.dtype)
+        change = predictor.model.residual_normalizer(
+            residual(predictor.program(), state, action, next_state), predictor.dtype
+        )
         nodes = torch.cat((dynamic.nodes, change * predictor.movable), dim=-1)
         anchors = self._anchor_sums(state, next_state, context)
         for step in range(state.shape[-3]):

@@ -8,7 +8,7 @@ import importlib.metadata
 import json
 import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -132,10 +132,17 @@ def save_checkpoint(
         save_file(tensors, temporary, metadata={"format": str(FORMAT), "description": text, "sha256": digest})
 
 
-def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
+def read_checkpoint(
+    path: str | os.PathLike, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
+) -> Checkpoint:
     """Read a checkpoint file, or that of a run folder. Weights in half precision compute in single precision.
 
-    CheckpointError if the file is missing, damaged, of another format or no checkpoint, or holds NaN or Inf.
+    Args:
+        physics: the function that a forward model corrects, which no checkpoint holds.
+
+    Raises:
+        CheckpointError: if the file is missing, damaged, of another format or no checkpoint, or holds NaN or Inf.
+        ValueError: if it needs physics that are not given, or was trained with others.
     """
     path = Path(path)
     if path.is_dir():
@@ -165,7 +172,8 @@ def read_checkpoint(path: str | os.PathLike) -> Checkpoint:
     weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
     stored = next(value.dtype for name, value in weights.items() if name.endswith(".weight"))
     try:
-        model = KINDS[description["kind"]].from_description(description["model"])
+        given = {} if physics is None else {"physics": physics}
+        model = KINDS[description["kind"]].from_description(description["model"], **given)
         model.to(torch.float32 if stored == torch.float16 else stored).load_state_dict(weights)
     except (RuntimeError, TypeError) as error:
         what = str(error).splitlines()[0]
@@ -182,11 +190,14 @@ def pretrained_names() -> list[str]:
     return sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
 
 
-def load_pretrained(source: str | os.PathLike) -> Checkpoint:
+def load_pretrained(
+    source: str | os.PathLike, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
+) -> Checkpoint:
     """Load a trained model: one of :func:`pretrained_names`, or the path of a run folder or checkpoint file.
 
     ``"./cheetah"`` is a folder that has the name of a model. The checkpoint's ``metrics`` hold the model's errors.
-    CheckpointError if there is no such source, or the file cannot be used.
+    ``physics`` is the function that a forward model corrects; :class:`~torchrl_gn.dynamics.MujocoPhysics` rebuild
+    themselves. CheckpointError if there is no such source, or the file cannot be used; ValueError if it needs physics.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -206,7 +217,7 @@ def load_pretrained(source: str | os.PathLike) -> Checkpoint:
             f"There is no checkpoint at {source}, and no trained model of that name comes with the package; those that"
             f" do are {names}.{hint}"
         )
-    return read_checkpoint(source)
+    return read_checkpoint(source, physics=physics)
 
 
 def _digest(tensors: Mapping[str, Tensor], text: str) -> str:

@@ -80,7 +80,7 @@ def fit(
         ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
-    scheduled = _make_optimizer(model.model.core, optimizer, lr)
+    scheduled = _make_optimizer(model.model, optimizer, lr)
     loss = ForwardModelLoss(model, noise=noise, generator=torch.Generator().manual_seed(seed))
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
     transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()

@@ -28,7 +28,7 @@ class CompiledExecutor:
     Raises:
         FileNotFoundError: without a C++ compiler on a CPU.
         RuntimeError: with a torch before 2.13.
-        TypeError: of a core that is evaluated by message passing.
+        TypeError: of a core that is evaluated by message passing, or physics outside torch.
     """
 
     fixed_batch, runs_all = True, False
@@ -40,6 +40,8 @@ class CompiledExecutor:
         if isinstance(program.core, UnfoldedCore):
             kind = type(program.core.core).__name__
             raise TypeError(f"{kind} has no fold() and is evaluated by message passing: use executor='eager'.")
+        if program.physics is not None and program.physics.outside:
+            raise TypeError("The physics run outside torch, which cannot compile them: use executor='eager'.")
         self.version = 0
         self._load(program)
 
@@ -71,7 +73,7 @@ class CompiledExecutor:
     def _start(self, state: Tensor, action: Tensor) -> Graph:
         program = self.program
         assert program.recurrent is not None
-        canonical = program.canonicalizer(state, program.parameters)
+        canonical = eager.canonical_state(program, state, action)
         return program.recurrent.start(eager.dynamic_graph(program, canonical, action))
 
 

@@ -9,6 +9,7 @@ from torch.nn.functional import pad
 from torchrl_gn.dynamics.features.canonical_state import CanonicalState
 from torchrl_gn.dynamics.features.feature import StepInputs
 from torchrl_gn.dynamics.program import Executor, StepProgram
+from torchrl_gn.maths import quaternion
 from torchrl_gn.networks.graph import Graph, graph_concat
 
 
@@ -45,6 +46,21 @@ def rollout_by_steps(
     return torch.stack(states, dim=-3), hidden
 
 
+def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> CanonicalState:
+    """Canonical state of ``[*B, N, 13]``, with the change that the program's physics predict in its frame."""
+    canonical = program.canonicalizer(state, program.parameters)
+    if program.physics is None:
+        return canonical
+    after = program.physics(state, action)
+    if after.shape != state.shape:
+        raise ValueError(f"The physics must give next states {list(state.shape)}, not {list(after.shape)}.")
+    change = program.layout.delta(state, after.to(state.dtype))
+    if canonical.rotation is not None:
+        back = quaternion.conjugate(canonical.rotation.quaternion)
+        change = program.layout.rotate_delta(change, back, canonical.rotation.matrix.mT)
+    return canonical._replace(change=change)
+
+
 def features(program: StepProgram, canonical: CanonicalState, action: Tensor) -> tuple[Tensor, Tensor]:
     """Dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised."""
     inputs = StepInputs(canonical, program.controls(action), program.parameters)
@@ -72,7 +88,7 @@ def delta(
     program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
 ) -> tuple[Tensor, Graph | None]:
     """Predicted change ``[*B, N, 12]``, zero in fixed components, and hidden state; default: from the initial one."""
-    canonical = program.canonicalizer(state, program.parameters)
+    canonical = canonical_state(program, state, action)
     graph = dynamic_graph(program, canonical, action)
     if program.recurrent is not None:
         assert program.static is not None
@@ -85,6 +101,8 @@ def delta(
 def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predicted: Tensor) -> Tensor:
     """Change ``[*B, N, 12]`` of a state from the network's output ``[*B, N, F_out]``."""
     residual = program.output(predicted, state.dtype)
+    if canonical.change is not None:
+        residual = canonical.change + residual
     if canonical.rotation is not None:
         residual = program.layout.rotate_delta(residual, *canonical.rotation)
     if program.timestep is not None:

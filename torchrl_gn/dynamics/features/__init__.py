@@ -14,6 +14,7 @@ from torchrl_gn.dynamics.features.feature import StepInputs as StepInputs
 from torchrl_gn.dynamics.features.feature import graph_edges as graph_edges
 from torchrl_gn.dynamics.features.joint_axes import JointAxes as JointAxes
 from torchrl_gn.dynamics.features.pair_contacts import PairContacts as PairContacts
+from torchrl_gn.dynamics.features.physics_change import PhysicsChange as PhysicsChange
 
 FEATURES: dict[str, type[Feature]] = {
     "body_state": BodyState,
@@ -21,5 +22,6 @@ FEATURES: dict[str, type[Feature]] = {
     "contacts": Contacts,
     "controls": Controls,
     "joint_axes": JointAxes,
+    "physics_change": PhysicsChange,
 }
 """Features by the names that checkpoints have for them."""

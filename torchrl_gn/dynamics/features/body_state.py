@@ -58,6 +58,6 @@ class _Bound(Float64Buffers):
             self.constants({"visible": visible})
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        state, matrices, _ = inputs.canonical
+        state, matrices = inputs.canonical[:2]
         shown = state * self.visible.to(state.dtype) if self.hides else state
         return self.layout.encode(shown, self.encoding, matrices)

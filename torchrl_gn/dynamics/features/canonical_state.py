@@ -36,6 +36,7 @@ class CanonicalState(NamedTuple):
     state: Tensor  # [*B, N, 13] recentred, at yaw 0
     matrices: Tensor | None  # [*B, N, 3, 3] of its orientations; None if the state has none
     rotation: FrameRotation | None  # from the yaw frame to the world; None without a yaw frame
+    change: Tensor | None = None  # [*B, N, 12] in this frame, as known physics predict it; None without physics
 
 
 @dataclass(frozen=True)

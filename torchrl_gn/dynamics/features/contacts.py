@@ -64,7 +64,7 @@ class BoundContacts(Float64Buffers):
         For each of four points: its distance from the plane (metres), the same and that of the next step clipped to
         2 cm and scaled to 1, and its velocity (m/s).
         """
-        state, matrices, _ = inputs.canonical
+        state, matrices = inputs.canonical[:2]
         if not self.any:
             return state.new_zeros((*state.shape[:-1], 6 * SLOTS))
         assert matrices is not None

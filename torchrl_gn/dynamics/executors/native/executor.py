@@ -15,6 +15,7 @@ from torchrl_gn.dynamics.executors.native.pool import Pool
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
 from torchrl_gn.dynamics.executors.native.traced_program import MixedStatesError, TracedProgram
 from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.dynamics.watched import version_of
 from torchrl_gn.networks.core import ListedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.layers import LayerList
@@ -41,6 +42,7 @@ class NativeExecutor:
         self.native: Native | None = None
         self.version, self.pool = 0, Pool()
         self._reason: str | None = None
+        self._maths: tuple = ()
         self.update(program)
 
     @property
@@ -51,7 +53,8 @@ class NativeExecutor:
     def update(self, program: StepProgram) -> None:
         """Take another program of the same scene: its state maths are traced again only if they differ."""
         before, self.version = self.native, self.version + 1
-        same_maths = same(_maths_of(self.program), _maths_of(program))
+        maths = _maths_of(program)
+        same_maths, self._maths = same(self._maths, maths), maths
         self.program, self.eager = program, EagerExecutor(program)
         layers, self._reason = list_layers(program)
         if layers is None:
@@ -175,6 +178,8 @@ def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     core = program.core
     if program.recurrent is not None:
         return None, "a recurrent model runs by torch operations"
+    if program.physics is not None and program.physics.outside:
+        return None, "its physics run outside, so it runs by torch operations"
     if program.movable.device.type != "cpu":
         return None, f"on {program.movable.device.type}, it runs by torch operations"
     if program.dtype not in (*library.DTYPES, torch.bfloat16):
@@ -186,5 +191,7 @@ def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
 
 
 def _maths_of(program: StepProgram) -> tuple:
-    """All parts of a program but its network."""
-    return tuple(getattr(program, field.name) for field in fields(program) if field.name != "core")
+    """All parts of a program but its network, and how often the physics' tensors were changed."""
+    parts = tuple(getattr(program, field.name) for field in fields(program) if field.name != "core")
+    known = () if program.physics is None else (*program.physics.parameters(), *program.physics.buffers())
+    return *parts, *map(version_of, known)

@@ -228,6 +228,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "sqrt": _elementwise(ex.sqrt, 1),
     "sin": _elementwise(ex.sin, 1),
     "cos": _elementwise(ex.cos, 1),
+    "atan": lambda a: _elementwise(ex.atan2, 2)(a, 1.0),
     "abs": _elementwise(ex.absolute, 1),
     "atan2": _elementwise(ex.atan2, 2),
     "maximum": _elementwise(ex.maximum, 2),

@@ -77,10 +77,10 @@ class StateMaths:
         """
         graph, (varying, actions, outputs) = self._graph, self._groups
         of_after, of_inputs = graph.inputs(3, len(self._after)), graph.inputs(4, len(self._inputs))
-        last = gradient(graph, self._after, of_after, [*outputs, *varying])
+        last = gradient(graph, self._after, of_after, [*outputs, *varying, *actions])
         first = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
-        of_state = [a + b for a, b in zip(last[len(outputs) :], first, strict=False)]
-        results = [last[: len(outputs)], [*of_state, *first[len(varying) :]]]
+        both = [a + b for a, b in zip(last[len(outputs) :], first, strict=True)]
+        results = [last[: len(outputs)], both]
         return assemble(graph, [*self._groups, of_after, of_inputs], results)
 
 
@@ -110,14 +110,14 @@ def _forward(
     full[predicted] = outputs.reshape(len(predicted), width)
 
     def before(state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-        canonical = program.canonicalizer(state, program.parameters)
+        canonical = eager.canonical_state(program, state, action)
         nodes, edges = eager.features(program, canonical, action)
         return program.nodes(nodes, torch.float64), program.edges(edges, torch.float64)
 
-    def after(state: Tensor, predicted: Tensor) -> tuple[Tensor, ...]:
-        canonical = program.canonicalizer(state, program.parameters)
+    def after(state: Tensor, action: Tensor, predicted: Tensor) -> tuple[Tensor, ...]:
+        canonical = eager.canonical_state(program, state, action)
         change = eager.change(program, state, canonical, predicted)
         return program.layout.apply(state, change), change
 
     inputs = [each for part in trace(before, symbols, actions) for each in part.ravel().tolist()]
-    return symbols, actions, outputs, inputs, trace(after, symbols, full)
+    return symbols, actions, outputs, inputs, trace(after, symbols, actions, full)

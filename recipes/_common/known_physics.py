@@ -1,0 +1,60 @@
+"""The physics that a recipe's ``physics=`` names."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torchrl_gn.dynamics import MujocoPhysics, Physics
+from torchrl_gn.dynamics.physics import as_physics
+from torchrl_gn.scenes import KinematicTree, Scene
+from torchrl_gn.training import plain_config
+
+
+def load_physics(source: str | None, options: Mapping[str, Any] | None, robot: Scene | KinematicTree) -> Physics | None:
+    """Physics for a robot's residual model; None without.
+
+    Args:
+        source: an MJCF file; ``"scene"``, the robot's own scene; or ``PATH.py:NAME`` or ``MODULE:NAME``, a function of
+            state and action, or a class that is made of the robot.
+        options: of :class:`~torchrl_gn.dynamics.MujocoPhysics` or of that class.
+
+    Raises:
+        ValueError: if the source names nothing, or a function is given options.
+    """
+    options = plain_config(options or {})
+    if source is None:
+        return None
+    tree = robot if isinstance(robot, KinematicTree) else None
+    if source == "scene":
+        if tree is not None:
+            raise ValueError("physics=scene is for simulated systems: name the robot's MJCF file, or a function.")
+        return MujocoPhysics(robot, **options)
+    if ":" not in source:
+        return MujocoPhysics(Path(source), tree, **options)
+    place, name = source.rsplit(":", 1)
+    found = getattr(_module(place), name, None)
+    if not callable(found):
+        raise ValueError(f"physics={source}: there is no function or class {name!r} in {place}.")
+    if isinstance(found, type):
+        return as_physics(found(robot, **options))
+    if options:
+        raise ValueError(f"physics={source} is a function, which takes no physics_options; make it a class.")
+    return as_physics(found)
+
+
+def _module(place: str) -> Any:
+    if not place.endswith(".py"):
+        return importlib.import_module(place)
+    if not Path(place).is_file():
+        raise ValueError(f"physics: there is no file {place}.")
+    spec = importlib.util.spec_from_file_location(Path(place).stem, place)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,240 @@
+"""MuJoCo's simulation as physics that a forward model corrects."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.rollout import Rollout
+from torch import Tensor
+
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.dynamics.physics import Physics
+from torchrl_gn.processor import usable_cores
+from torchrl_gn.scenes import KinematicTree, Scene, UnsupportedSceneError, load_scene, scene_from_description
+
+_GROUPS = {
+    "mass": ("body_mass", "body_inertia"),
+    "friction": ("dof_damping", "dof_frictionloss", "geom_friction"),
+}
+_DIFFERENCE = 1e-6  # of the coordinates, for central differences
+_MEMORY = 2**23  # numbers of MuJoCo's output held at a time
+
+
+class MujocoPhysics(Physics):
+    """MuJoCo's prediction of a scene's bodies, or of a robot's joints.
+
+    Simulates batches by ``mujoco.rollout``; a gradient costs two simulations for each coordinate, rate and action.
+    States of a ``tree`` become angles and rates of the scene's hinges; a scene's body states become joint coordinates
+    (:class:`~torchrl_gn.dynamics.joint_coordinates.JointCoordinates`). Unstable simulations give NaN.
+
+    Args:
+        scene: the scene, or MJCF file or text of one.
+        tree: a robot known by its joint encoders, whose states are predicted instead of the scene's.
+        joints: names of the scene's joints, one for each of the tree's. Default: those of equal name, or, if the
+            numbers are equal, all in order.
+        scale: factors on parts of the model: ``mass`` (with inertia), ``friction`` (damping, joint and contact
+            friction), or any array of ``mjModel``, as ``{"dof_armature": 2.0}``.
+        num_threads: of the simulation; default: the cores this process may use.
+
+    Raises:
+        UnsupportedSceneError: if joint coordinates do not follow from the states.
+        ValueError: if joints, commands, control step or scales do not fit.
+    """
+
+    outside = True
+
+    def __init__(
+        self,
+        scene: Scene | str | Path,
+        tree: KinematicTree | None = None,
+        *,
+        joints: Sequence[str] | None = None,
+        scale: Mapping[str, float] | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        super().__init__()
+        if not isinstance(scene, Scene):
+            scene = load_scene(scene, timestep=None if tree is None else tree.timestep)
+        self.scene, self.tree, self.scale, self.num_threads = scene, tree, dict(scale or {}), num_threads
+        self.simulated = _scaled(scene, self.scale)
+        self._pool: Rollout | None = None
+        self._data: list[mujoco.MjData] = []
+        model = scene.model
+        if model.nv != scene.physics_size - 1 - model.nq:
+            raise UnsupportedSceneError(f"Scene {scene.name!r} has a state beside positions and velocities.")
+        if tree is None:
+            self.joints, self.coordinates = None, JointCoordinates(scene)
+            return
+        self.joints = _matched(scene, tree, joints)
+        if not np.isclose(tree.timestep, scene.timestep, rtol=1e-6):
+            raise ValueError(
+                f"Scene {scene.name!r} has control steps of {scene.timestep:g} s, robot {tree.name!r} of"
+                f" {tree.timestep:g} s: load_scene(..., timestep={tree.timestep:g})."
+            )
+        order = [scene.joint_names.index(joint) for joint in self.joints]
+        motors = [int(scene.edge_action[2 * joint]) for joint in order]
+        for name, motor, commands in zip(self.joints, motors, tree.commands, strict=True):
+            if len(commands) != (motor >= 0):
+                raise ValueError(
+                    f"Joint {name!r} of scene {scene.name!r} has {int(motor >= 0)} motors, but robot {tree.name!r} has"
+                    f" {len(commands)} commands there."
+                )
+        indices = [commands[0] for motor, commands in zip(motors, tree.commands, strict=True) if motor >= 0]
+        self.constants(
+            {
+                "order": torch.tensor(order),  # joint of each of the tree's
+                "back": torch.tensor(np.argsort(order)),
+                "command": torch.tensor(indices, dtype=torch.long)[np.argsort([m for m in motors if m >= 0])],
+            }
+        )
+
+    order: Tensor
+    back: Tensor
+    command: Tensor
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        given = state.double()
+        if self.tree is None:
+            position, velocity = self.coordinates(given)
+            after = _Advance.apply(self, position, velocity, action.double())
+            return cast(Tensor, after).unflatten(-1, (-1, 13)).to(state.dtype)
+        joints = given[..., 1:, :]
+        position = torch.atan2(joints[..., 1], joints[..., 0])[..., self.back]
+        velocity = joints[..., 2][..., self.back]
+        after = cast(Tensor, _Advance.apply(self, position, velocity, action.double()[..., self.command]))
+        angle, rate = (each[..., self.order] for each in after.chunk(2, dim=-1))
+        moved = torch.stack((angle.cos(), angle.sin(), rate), dim=-1)
+        moved = torch.cat((moved, joints[..., 3:]), dim=-1)  # of further channels it knows nothing
+        return torch.cat((given[..., :1, :], moved), dim=-2).to(state.dtype)
+
+    def advance(self, position: np.ndarray, velocity: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """Coordinates and rates ``[n, nq + nv]``, or body states ``[n, N * 13]``, a control step later."""
+        model, timestep = self.simulated.model, self.simulated.model.opt.timestep
+        # Sensors show the state before a physics step: one more step shows the last.
+        steps = self.scene.substeps + (self.tree is None)
+        start = np.concatenate((np.ones((len(position), 1)), position, velocity), axis=1)
+        finite = np.isfinite(start).all(1) & np.isfinite(action).all(1)
+        rest = np.concatenate((np.ones(1), model.qpos0, np.zeros(model.nv)))
+        start, action = np.where(finite[:, None], start, rest), np.where(finite[:, None], action, 0.0)
+        rows, parts = max(1, _MEMORY // (steps * (model.nsensordata + start.shape[1] + model.nu))), []
+        for first in range(0, len(start), rows):
+            part = slice(first, first + rows)
+            held = np.repeat(action[part, None], steps, axis=1) if model.nu else None
+            pool = self._simulation()
+            with _quiet():
+                after, sensors = pool.rollout(model, self._data, start[part], held, nstep=steps)
+            # MuJoCo resets an unstable simulation, and its time.
+            finite[part] &= after[:, -1, 0] > 1 + (steps - 0.5) * timestep
+            parts.append(sensors[:, -1, self.scene.sensor_slice] if self.tree is None else after[:, -1, 1:])
+        after = np.concatenate(parts) if parts else np.empty((0, 13 * self.scene.num_nodes))
+        return np.where(finite[:, None], after, np.nan)
+
+    def _simulation(self) -> Rollout:
+        if self._pool is None:
+            threads = self.num_threads or usable_cores()
+            self._pool = Rollout(nthread=threads if threads > 1 else 0)
+            self._data = [mujoco.MjData(self.simulated.model) for _ in range(threads)]
+        return self._pool
+
+    def description(self) -> dict:
+        tree = None if self.tree is None else self.tree.description()
+        joints = None if self.joints is None else list(self.joints)
+        return {"scene": self.scene.description(), "tree": tree, "joints": joints, "scale": self.scale}
+
+    @classmethod
+    def from_description(cls, description: Mapping) -> MujocoPhysics:
+        """Rebuild from :meth:`description`."""
+        tree = description["tree"]
+        return cls(
+            scene_from_description(description["scene"]),
+            None if tree is None else KinematicTree.from_description(tree),
+            joints=description["joints"],
+            scale=description["scale"],
+        )
+
+    def __getstate__(self) -> dict:
+        return {**super().__getstate__(), "_pool": None, "_data": []}  # copies start their own threads
+
+    def extra_repr(self) -> str:
+        return f"scene={self.scene.name!r}, scale={self.scale}"
+
+
+class _Advance(torch.autograd.Function):
+    """A control step, differentiated by central differences."""
+
+    @staticmethod
+    def forward(ctx, physics: MujocoPhysics, *inputs: Tensor) -> Tensor:
+        ctx.save_for_backward(*inputs)
+        ctx.physics = physics
+        count = inputs[0].shape[:-1].numel()
+        arrays = [each.detach().cpu().numpy().reshape(count, each.shape[-1]) for each in inputs]
+        after = torch.from_numpy(physics.advance(*arrays)).to(inputs[0].device)
+        return after.view(*inputs[0].shape[:-1], after.shape[-1])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        inputs = ctx.saved_tensors
+        sizes = [each.shape[-1] for each in inputs]
+        flat = torch.cat(inputs, dim=-1).reshape(-1, sum(sizes)).cpu().numpy()
+        steps = _DIFFERENCE * np.eye(sum(sizes))[:, None]
+        shifted = np.concatenate((flat + steps, flat - steps)).reshape(-1, sum(sizes))  # [2 * K * n, K]
+        after = ctx.physics.advance(*np.split(shifted, np.cumsum(sizes)[:-1], axis=1))
+        ahead, behind = after.reshape(2, sum(sizes), len(flat), after.shape[-1])
+        found = np.einsum("knm,nm->nk", ahead - behind, gradient.reshape(len(flat), -1).cpu().numpy())
+        parts = torch.from_numpy(found / (2 * _DIFFERENCE)).to(gradient.device).split(sizes, dim=-1)
+        return None, *(part.view_as(each) for part, each in zip(parts, inputs, strict=True))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep MuJoCo from printing warnings of unstable simulations, unless the user has a handler."""
+    own = mujoco.get_mju_user_warning() is None
+    if own:
+        mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        if own:
+            mujoco.set_mju_user_warning(None)
+
+
+def _scaled(scene: Scene, scale: Mapping[str, float]) -> Scene:
+    """The scene with parts of its model multiplied."""
+    if not scale:
+        return scene
+    model = copy.copy(scene.model)
+    for name, factor in scale.items():
+        for array in _GROUPS.get(name, (name,)):
+            values = getattr(model, array, None)
+            if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
+                raise ValueError(f"scale={name!r} is not known; use one of {list(_GROUPS)} or an array of mjModel.")
+            values *= factor
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(scene, model=model)
+
+
+def _matched(scene: Scene, tree: KinematicTree, joints: Sequence[str] | None) -> tuple[str, ...]:
+    """Names of the scene's joints, one for each of the tree's."""
+    if joints is None:
+        same = set(tree.joint_names) == set(scene.joint_names)
+        joints = tree.joint_names if same else scene.joint_names
+    kinds = {name: int(kind) for name, kind in zip(scene.joint_names, scene.model.jnt_type, strict=True)}
+    if sorted(joints) != sorted(scene.joint_names) or len(joints) != tree.num_joints:
+        raise ValueError(
+            f"Robot {tree.name!r} has joints {list(tree.joint_names)}, scene {scene.name!r} {list(scene.joint_names)}:"
+            " give joints=, the scene's joint for each of the robot's."
+        )
+    if wrong := [name for name in joints if kinds[name] != mujoco.mjtJoint.mjJNT_HINGE]:
+        raise UnsupportedSceneError(
+            f"Joints {wrong} of scene {scene.name!r} are no hinges, whose angles encoders show."
+        )
+    return tuple(joints)

@@ -1,0 +1,39 @@
+"""Errors of what predicts without learning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from torchrl_gn.dynamics import ConstantVelocity
+from torchrl_gn.evaluation.error_table import ErrorTable
+from torchrl_gn.evaluation.errors import evaluate_errors
+from torchrl_gn.maths.state_layout import BODY_STATE, joint_layout
+from torchrl_gn.scenes import KinematicTree, Scene
+
+
+def baseline_errors(
+    scene: Scene | KinematicTree,
+    trajectories: TensorDictBase,
+    physics: Callable[[Tensor, Tensor], Tensor] | None = None,
+    **options: Any,
+) -> dict[str, ErrorTable]:
+    """Error tables of ``"constant velocity"`` and, if given, of ``"physics"`` alone.
+
+    Persistence is what all errors are relative to: it has 1 everywhere. ``options`` are those of
+    :func:`~torchrl_gn.evaluation.evaluate_errors`.
+    """
+    layout = joint_layout(scene.extras) if isinstance(scene, KinematicTree) else BODY_STATE
+    known: dict[str, Callable] = {"constant velocity": ConstantVelocity(layout, float(scene.timestep))}
+    if physics is not None:
+        known["physics"] = physics
+    tables = {}
+    for name, function in known.items():
+        module: Any = TensorDictModule(function, ["state", "action"], [("next", "state")])
+        module.layout, module.scene = layout, scene
+        tables[name] = evaluate_errors(module, trajectories, **options)
+    return tables

@@ -1,0 +1,75 @@
+"""Fit the parameters of known physics to trajectories."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_gn.data import trajectory_buffer
+from torchrl_gn.evaluation.errors import squared_errors
+from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout, joint_layout
+from torchrl_gn.scenes import KinematicTree, Scene
+from torchrl_gn.training.optimizers import clip_gradients
+
+
+def fit_physics(
+    physics: nn.Module,
+    scene: Scene | KinematicTree,
+    trajectories: TensorDictBase,
+    *,
+    steps: int = 300,
+    window: int = 20,
+    batch_size: int = 128,
+    lr: float = 2e-2,
+    seed: int = 0,
+) -> list[float]:
+    """Fit the parameters of physics that require gradients, in place, by Adam, and freeze them.
+
+    Minimises the rollout error over windows: each component's squared error relative to the persistence baseline's.
+    Parameters should be of size 1, such as logarithms of factors: they share the learning rate, which falls to 0.
+
+    Args:
+        physics: module of state and action, see :class:`~torchrl_gn.dynamics.Physics`.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]`` and ``action`` ``[M, T, A]``.
+        steps: of the optimiser.
+        window: steps of the rollouts.
+
+    Returns:
+        The error of every optimiser step.
+
+    Raises:
+        FloatingPointError: if a gradient is not finite; nothing changes at that step.
+        ValueError: if no parameter requires a gradient.
+    """
+    layout: StateLayout = joint_layout(scene.extras) if isinstance(scene, KinematicTree) else BODY_STATE
+    moving = torch.as_tensor(scene.predicted)
+    parameters = [parameter for parameter in physics.parameters() if parameter.requires_grad]
+    if not parameters:
+        raise ValueError("The physics have no parameter that requires a gradient: there is nothing to fit.")
+    buffer = trajectory_buffer(trajectories, batch_size=batch_size, window=window, seed=seed)
+    optimizer = torch.optim.Adam(parameters, lr=lr)
+    errors: list[float] = []
+    for step in range(steps):
+        batch = buffer.sample()
+        actions, truth = cast(Tensor, batch["action"]), cast(Tensor, batch["next", "state"])
+        start = state = cast(Tensor, batch["state"])[:, 0]
+        predicted = []
+        for action in actions.unbind(1):
+            predicted.append(state := physics(state, action))
+        error, baseline = (
+            squared_errors(each, truth, layout)[:, :, moving].mean((0, 1, 2))
+            for each in (torch.stack(predicted, dim=1), start.unsqueeze(1).expand_as(truth))
+        )
+        moves = baseline > 0
+        loss = (error[moves] / baseline[moves]).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        clip_gradients(parameters, 1.0, f"step {step} of fitting the physics")
+        optimizer.param_groups[0]["lr"] = lr * (1 - step / steps)
+        optimizer.step()
+        errors.append(float(loss.detach()))
+    physics.requires_grad_(False)
+    return errors
