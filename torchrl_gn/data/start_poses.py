@@ -16,6 +16,7 @@ _TILT = 0.5  # rad, of the base of a robot
 _DEPTH = 1e-3  # metres that two geoms may overlap, more than in the reference pose
 _REDRAWS, _SHRINKS, _SHRINK = 8, 16, 0.7  # attempts at full size, then at sizes that fall to 0.3 %
 _EQUALITY_STEPS, _EQUALITY_ERROR = 20, 1e-4
+_BEYOND = 0.05  # of a joint's range: a reference pose farther beyond it, or a draw, is not used
 _SEARCH = 100  # random poses, if the reference pose penetrates
 _FAR = 1e3  # metres at which a plane is still looked for
 _KEYFRAMES = ("home", "stand")
@@ -52,6 +53,8 @@ class StartPoses:
     def __init__(self, scene: Scene):
         self.scene, self.model = scene, scene.model
         self._data = mujoco.MjData(self.model)
+        limited = (self.model.jnt_limited != 0) & (self.model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
+        self._limited = (self.model.jnt_qposadr[limited], *self.model.jnt_range[limited].T)
         self._load_reference()
         self._touching = _may_touch(self.model)
         self._bases = _bases(self.model, self._touching)
@@ -92,11 +95,10 @@ class StartPoses:
             mujoco.mj_resetDataKeyframe(model, data, key)
         data.time, data.qvel[:] = 0.0, 0.0
         mujoco.mj_normalizeQuat(model, data.qpos)
-        for joint in np.flatnonzero((model.jnt_limited != 0) & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))):
-            address, (low, high) = model.jnt_qposadr[joint], model.jnt_range[joint]
-            inside = np.clip(data.qpos[address], low, high)
-            far = abs(inside - data.qpos[address]) > 0.05 * (high - low)
-            data.qpos[address] = (low + high) / 2 if far else inside
+        there, low, high = self._limited
+        inside = np.clip(data.qpos[there], low, high)
+        far = np.abs(inside - data.qpos[there]) > _BEYOND * (high - low)
+        data.qpos[there] = np.where(far, (low + high) / 2, inside)
 
     def _avoid(self, depths: dict[tuple[int, int], float]) -> None:
         """Replace a reference pose that penetrates by the best of random ones, allow what is left, and warn."""
@@ -168,6 +170,9 @@ class StartPoses:
         data.qpos[:] = self._reference
         mujoco.mj_integratePos(model, data.qpos, change, 1.0)
         if self._hold_equalities() > self._equality_error:
+            return False
+        there, low, high = self._limited  # which the equality constraints may have left
+        if (np.abs(np.clip(data.qpos[there], low, high) - data.qpos[there]) > _BEYOND * (high - low)).any():
             return False
         self._lift()
         return not self._depths()
