@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -129,7 +130,7 @@ def test_bounds_redraw_and_count(tmp_path: Path, pendulum: Scene) -> None:
     for bad, message in (({"height": 1.0}, "no 'height'; use some of"), ({"speed": float("nan")}, "'speed'.*nan")):
         with pytest.raises(ValueError, match=message):
             collect_trajectories(pendulum, 5, 5, bounds=bad)
-    sizes = {"train": 20, "validation": 2, "test": 2, "steps": 50, "seed": 2}
+    sizes: Any = {"train": 20, "validation": 2, "test": 2, "steps": 50, "seed": 2}
     made = create_dataset(tmp_path / "d", pendulum, **sizes, bounds=bounds)
     assert made.manifest["request"]["bounds"] == bounds and made.rejected["train"] > 3
     with pytest.raises(RuntimeError, match="bounds is .*, not None"):
@@ -137,6 +138,6 @@ def test_bounds_redraw_and_count(tmp_path: Path, pendulum: Scene) -> None:
 
 
 def test_data_of_models_say_how_they_were_drawn(tmp_path: Path, pendulum: Scene) -> None:
-    sizes = {"train": 2, "validation": 1, "test": 1, "steps": 2}
+    sizes: Any = {"train": 2, "validation": 1, "test": 1, "steps": 2}
     assert create_dataset(tmp_path / "a", zoo.load("pole"), **sizes).manifest["request"]["draws"] == 2
     assert "draws" not in create_dataset(tmp_path / "b", load_scene("pendulum"), **sizes).manifest["request"]

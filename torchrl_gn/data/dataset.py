@@ -196,8 +196,9 @@ def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple)
         # Built chunk by chunk: thousands of models at once would take gigabytes.
         distinct, variant = np.unique(parameters, axis=0, return_inverse=True)
         scenes, variant = _variants(scene, distinct), variant.reshape(-1)  # some versions of NumPy keep the axis
-    options = {name: request.get(name) for name in ("steps", "seed", "knot_interval", "bounds")}
-    rows, rejected = collect_chunk(Simulator(scenes, num_threads), variant, key=key, **options)
+    options = {name: request[name] for name in ("steps", "seed", "knot_interval")}
+    bounds = request.get("bounds")
+    rows, rejected = collect_chunk(Simulator(scenes, num_threads), variant, key=key, bounds=bounds, **options)
     if parameters is not None:
         rows["parameters"] = variant_parameters(scenes, variant)
         rows["variant_parameters"] = torch.from_numpy(parameters)

@@ -17,8 +17,8 @@ ActuatorKind = Literal["motor", "position", "velocity"]
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # of targets, rad/s or m/s
 _SCALES = (0.2, 1.0)  # of motors, velocity targets and the speed of position targets, by sequence
-_WIDTHS = (0.05, 1.0)  # of the interval of position targets, as a share of the bounds
-_REVERSALS = (1.0, 4.0)  # time between reversals of velocity targets, in knot intervals
+_LEAST_WIDTH = 0.05  # of the interval of position targets, as a share of the bounds
+_LATEST_REVERSAL = 4.0  # time between reversals of velocity targets, in knot intervals
 
 
 def actuator_kind(model: mujoco.MjModel, actuator: int) -> ActuatorKind:
@@ -92,7 +92,7 @@ def _velocity_targets(
     sign = (-1.0) ** (np.arange(knots)[:, None, None] + rng.integers(2, size=size))
     values = rng.uniform(0.0, 1.0, (knots, *size)) * np.where(sign > 0, high, low)
     spline = CubicSpline(np.arange(knots), values, bc_type="natural")
-    interval = knot_interval * np.exp(rng.uniform(*np.log(_REVERSALS), size))[:, None]
+    interval = knot_interval * _LATEST_REVERSAL ** rng.uniform(0.0, 1.0, size)[:, None]
     time = rng.uniform(0.0, 1.0, size)[:, None] + np.arange(steps)[:, None] / interval
     return np.clip(evaluate_cubics(spline.c, time), low, high)
 
@@ -110,13 +110,12 @@ def _position_targets(
     from scipy.interpolate import CubicSpline  # here, as importing it takes a second
 
     start = np.clip(start, low, high)
-    width = (high - low) * np.exp(rng.uniform(*np.log(_WIDTHS), start.shape))
+    width = (high - low) * _LEAST_WIDTH ** rng.uniform(0.0, 1.0, start.shape)
     first = np.clip(start - rng.uniform(0.0, 1.0, start.shape) * width, low, high - width)
     knots = math.ceil((steps - 1) / knot_interval) + 2
     values = first + width * rng.uniform(0.0, 1.0, (knots, *start.shape))
     values[0] = start
-    at_rest = (1, np.zeros_like(start))
-    spline = CubicSpline(np.arange(knots), values, bc_type=(at_rest, at_rest))
+    spline = CubicSpline(np.arange(knots), values, bc_type="clamped")  # at rest at both ends
     interval = np.maximum(knot_interval, _peak_slope(spline.c) / fastest)
     time = np.arange(steps)[:, None] / interval[:, None]
     return np.clip(evaluate_cubics(spline.c, time), low, high)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from torchrl_gn.data.clearance import clearance, find_bases, may_touch
 from torchrl_gn.scenes.scene import Scene
 
 _WIDE_SHARE = 0.5  # share of the starts that may be anywhere within the joint limits
@@ -16,23 +16,14 @@ _TILT = 0.5  # rad, of the base of a robot
 _DEPTH = 1e-3  # metres that two geoms may overlap, more than in the reference pose
 _REDRAWS, _SHRINKS, _SHRINK = 8, 16, 0.7  # attempts at full size, then at sizes that fall to 0.3 %
 _EQUALITY_STEPS, _EQUALITY_ERROR = 20, 1e-4
+_BEYOND = 0.05  # of a joint's range: a reference pose farther beyond it, or a draw, is not used
 _SEARCH = 100  # random poses, if the reference pose penetrates
-_FAR = 1e3  # metres at which a plane is still looked for
 _KEYFRAMES = ("home", "stand")
 _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 class StartPoseWarning(UserWarning):
     """The reference pose of a model penetrates something."""
-
-
-@dataclass(frozen=True)
-class _Base:
-    """A body that moves up and down freely above planes."""
-
-    height: int  # its address in qpos
-    up: float  # world height of a unit of qpos
-    geoms: list[tuple[int, np.ndarray]]  # each plane, and the geoms of the body and what it carries that can touch it
 
 
 class StartPoses:
@@ -52,12 +43,14 @@ class StartPoses:
     def __init__(self, scene: Scene):
         self.scene, self.model = scene, scene.model
         self._data = mujoco.MjData(self.model)
+        limited = (self.model.jnt_limited != 0) & (self.model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
+        self._limited = (self.model.jnt_qposadr[limited], *self.model.jnt_range[limited].T)
         self._load_reference()
-        self._touching = _may_touch(self.model)
-        self._bases = _bases(self.model, self._touching)
+        self._touching = may_touch(self.model)
+        self._bases = find_bases(self.model, self._touching)
         self._equality_error = _EQUALITY_ERROR
         self._equality_error = max(_EQUALITY_ERROR, self._hold_equalities())
-        self._clearance = [max(_clearance(self.model, self._data, base), 0.0) for base in self._bases]
+        self._clearance = [max(clearance(self.model, self._data, base), 0.0) for base in self._bases]
         self._lift()
         self._reference = self._data.qpos.copy()
         self._allowed: dict[tuple[int, int], float] = {}
@@ -92,11 +85,10 @@ class StartPoses:
             mujoco.mj_resetDataKeyframe(model, data, key)
         data.time, data.qvel[:] = 0.0, 0.0
         mujoco.mj_normalizeQuat(model, data.qpos)
-        for joint in np.flatnonzero((model.jnt_limited != 0) & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))):
-            address, (low, high) = model.jnt_qposadr[joint], model.jnt_range[joint]
-            inside = np.clip(data.qpos[address], low, high)
-            far = abs(inside - data.qpos[address]) > 0.05 * (high - low)
-            data.qpos[address] = (low + high) / 2 if far else inside
+        there, low, high = self._limited
+        inside = np.clip(data.qpos[there], low, high)
+        far = np.abs(inside - data.qpos[there]) > _BEYOND * (high - low)
+        data.qpos[there] = np.where(far, (low + high) / 2, inside)
 
     def _avoid(self, depths: dict[tuple[int, int], float]) -> None:
         """Replace a reference pose that penetrates by the best of random ones, allow what is left, and warn."""
@@ -169,13 +161,16 @@ class StartPoses:
         mujoco.mj_integratePos(model, data.qpos, change, 1.0)
         if self._hold_equalities() > self._equality_error:
             return False
+        there, low, high = self._limited  # which the equality constraints may have left
+        if (np.abs(np.clip(data.qpos[there], low, high) - data.qpos[there]) > _BEYOND * (high - low)).any():
+            return False
         self._lift()
         return not self._depths()
 
     def _lift(self) -> None:
         """Move bases up or down to their clearance, and update the kinematics."""
         for base, wanted in zip(self._bases, self._clearance, strict=True):
-            now = _clearance(self.model, self._data, base)
+            now = clearance(self.model, self._data, base)
             if np.isfinite(now):
                 self._data.qpos[base.height] += (wanted - now) / base.up
         mujoco.mj_kinematics(self.model, self._data)
@@ -219,56 +214,6 @@ def reference_keyframe(model: mujoco.MjModel) -> int | None:
     """The keyframe ``home``, else ``stand``, else the first, or None if there is none."""
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, key) for key in range(model.nkey)]
     return next((names.index(name) for name in _KEYFRAMES if name in names), 0 if names else None)
-
-
-def _bases(model: mujoco.MjModel, touching: np.ndarray) -> list[_Base]:
-    """Bodies with a free joint, or with an unlimited vertical slide on the world, above planes that they can touch."""
-    kind, bases = mujoco.mjtJoint, []
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    planes = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (data.geom_xmat[:, 8] > 0.5))
-    for joint in range(model.njnt):
-        body, up = model.jnt_bodyid[joint], 1.0
-        if model.body_weldid[model.body_parentid[body]] != 0:
-            continue
-        height = int(model.jnt_qposadr[joint])
-        if model.jnt_type[joint] == kind.mjJNT_FREE:
-            height += 2
-        elif model.jnt_type[joint] == kind.mjJNT_SLIDE and not model.jnt_limited[joint]:
-            up = float(data.xaxis[joint, 2])
-            if abs(up) < 0.99:
-                continue
-        else:
-            continue
-        carried = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
-        geoms = [(int(plane), np.flatnonzero(carried & touching[plane])) for plane in planes]
-        if any(len(each) for _, each in geoms):
-            bases.append(_Base(height, up, geoms))
-    return bases
-
-
-def _clearance(model: mujoco.MjModel, data: mujoco.MjData, base: _Base) -> float:
-    """Least vertical distance to planes, metres; infinite if there is none near."""
-    least, position = np.inf, data.geom_xpos
-    for plane, geoms in base.geoms:
-        normal = data.geom_xmat[plane, 2::3]
-        bound = (position[geoms] - position[plane]) @ normal - model.geom_rbound[geoms]
-        for row in np.argsort(bound):
-            if bound[row] / normal[2] >= least:
-                break
-            distance = mujoco.mj_geomDistance(model, data, plane, geoms[row], _FAR, None)
-            if distance < _FAR:
-                least = min(least, distance / normal[2])
-    return least
-
-
-def _may_touch(model: mujoco.MjModel) -> np.ndarray:
-    """Pairs of geoms ``[G, G]`` bool whose contacts are not filtered out by their bits."""
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-        return np.zeros((model.ngeom, model.ngeom), dtype=bool)
-    touching = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
-    touching[model.pair_geom1, model.pair_geom2] = True
-    return touching | touching.T
 
 
 def _constraint_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

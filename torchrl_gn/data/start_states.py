@@ -105,6 +105,6 @@ def _randomize_joints(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Ge
     for joint in range(model.njnt):
         first = model.jnt_qposadr[joint]
         if model.jnt_limited[joint]:
-            qpos[:, first] = rng.uniform(*model.jnt_range[joint], n)
+            qpos[:, first] = rng.uniform(model.jnt_range[joint, 0], model.jnt_range[joint, 1], n)
         elif unlimited and model.jnt_type[joint] == kind.mjJNT_HINGE:
             qpos[:, first] = rng.uniform(-np.pi, np.pi, n)

@@ -1,0 +1,69 @@
+"""Bodies that move up and down freely, and their distance to the planes below."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+_FAR = 1e3  # metres at which a plane is still looked for
+
+
+@dataclass(frozen=True)
+class Base:
+    """A body that moves up and down freely above planes."""
+
+    height: int  # its address in qpos
+    up: float  # world height of a unit of qpos
+    geoms: list[tuple[int, np.ndarray]]  # each plane, and the geoms of the body and what it carries that can touch it
+
+
+def find_bases(model: mujoco.MjModel, touching: np.ndarray) -> list[Base]:
+    """Bodies with a free joint, or with an unlimited vertical slide on the world, above planes that they can touch."""
+    kind, bases = mujoco.mjtJoint, []
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    planes = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (data.geom_xmat[:, 8] > 0.5))
+    for joint in range(model.njnt):
+        body, up = model.jnt_bodyid[joint], 1.0
+        if model.body_weldid[model.body_parentid[body]] != 0:
+            continue
+        height = int(model.jnt_qposadr[joint])
+        if model.jnt_type[joint] == kind.mjJNT_FREE:
+            height += 2
+        elif model.jnt_type[joint] == kind.mjJNT_SLIDE and not model.jnt_limited[joint]:
+            up = float(data.xaxis[joint, 2])
+            if abs(up) < 0.99:
+                continue
+        else:
+            continue
+        carried = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+        geoms = [(int(plane), np.flatnonzero(carried & touching[plane])) for plane in planes]
+        if any(len(each) for _, each in geoms):
+            bases.append(Base(height, up, geoms))
+    return bases
+
+
+def clearance(model: mujoco.MjModel, data: mujoco.MjData, base: Base) -> float:
+    """Least vertical distance to planes, metres; infinite if there is none near."""
+    least, position = np.inf, data.geom_xpos
+    for plane, geoms in base.geoms:
+        normal = data.geom_xmat[plane, 2::3]
+        bound = (position[geoms] - position[plane]) @ normal - model.geom_rbound[geoms]
+        for row in np.argsort(bound):
+            if bound[row] / normal[2] >= least:
+                break
+            distance = mujoco.mj_geomDistance(model, data, plane, geoms[row], _FAR, None)
+            if distance < _FAR:
+                least = min(least, distance / normal[2])
+    return least
+
+
+def may_touch(model: mujoco.MjModel) -> np.ndarray:
+    """Pairs of geoms ``[G, G]`` bool whose contacts are not filtered out by their bits."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        return np.zeros((model.ngeom, model.ngeom), dtype=bool)
+    touching = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
+    touching[model.pair_geom1, model.pair_geom2] = True
+    return touching | touching.T
