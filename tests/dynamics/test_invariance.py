@@ -142,6 +142,7 @@ def test_upside_down_all_is_finite(make_model, random_states, random_actions, ex
     scene = zoo.load("crawler")
     bound = make_model(scene).to(dtype).requires_grad_(False).bind(scene)
     predictor = specialize(bound, executor=executor)
+    assert scene.yaw_frame is not None
     for across in ([1.0, 0, 0], [0, 1.0, 0], [0.6, 0.8, 0]):
         state = random_states(scene, 2 * len(TILTS), seed=3)
         rest = torch.as_tensor(scene.yaw_frame.rest)
@@ -164,6 +165,7 @@ def test_the_yaw_of_a_free_root(make_model, random_states):
     """It is 0 where the root tilts from rest about a horizontal axis, and adds up with rotations about the vertical."""
     scene = zoo.load("crawler")
     bound = make_model(scene).bind(scene)
+    assert scene.yaw_frame is not None
     rest = torch.as_tensor(scene.yaw_frame.rest)
     generator = torch.Generator().manual_seed(0)
     horizontal = torch.randn(20, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 1, 0])

@@ -16,7 +16,7 @@ from torchrl_gn.scenes.physical_parameters import joint_axes
 from .. import zoo
 
 SYSTEMS = ["cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", "jaco"]
-CONSTRAINED = [*SYSTEMS, "creature"]
+CONSTRAINED = [*SYSTEMS, "creature", "crawler"]
 
 
 def project(bound, state, delta):
@@ -100,7 +100,7 @@ def off_axis(scene, state):
     return relative, spin - (spin * axis).sum(-1, keepdim=True) * axis
 
 
-@pytest.mark.parametrize("name", ["jaco", "creature"])
+@pytest.mark.parametrize("name", ["jaco", "creature", "crawler"])
 def test_hinges_turn_about_their_axes_alone(make_model, random_actions, name):
     scene = zoo.load(name)
     bound = make_model(scene).bind(scene)

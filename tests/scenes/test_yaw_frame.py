@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from numpy.typing import ArrayLike
 
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import SYSTEMS, Scene, load_scene
@@ -316,7 +317,9 @@ def _bodies(model: mujoco.MjModel, start: mujoco.MjData, controls: np.ndarray, s
     return np.array(found), touched
 
 
-def _differ(model: mujoco.MjModel, axis: int, pivot=0.0, shift=0.0, *, before=0, steps=5) -> tuple[float, int]:
+def _differ(
+    model: mujoco.MjModel, axis: int, pivot: ArrayLike = 0.0, shift: ArrayLike = 0.0, *, before: int = 0, steps: int = 5
+) -> tuple[float, int]:
     """How far bodies come apart, metres and rotation matrices, in 20 steps if their start is rotated and shifted."""
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
     rng = np.random.default_rng(0)
@@ -325,7 +328,7 @@ def _differ(model: mujoco.MjModel, axis: int, pivot=0.0, shift=0.0, *, before=0,
     start.qvel[:] = rng.uniform(-1, 1, model.nv)
     mujoco.mj_step(model, start, before)
     controls = rng.uniform(-1, 1, (20, model.nu))
-    angle, place = 0.7, np.broadcast_to(pivot, 3)
+    angle, place, shift = 0.7, np.broadcast_to(pivot, 3), np.broadcast_to(shift, 3)
     states, touched = _bodies(model, start, controls, steps)
     rotated, _ = _bodies(model, _rotate(model, start, axis, angle, place, shift), controls, steps)
     matrix = quaternion.to_matrix(quaternion.exp(angle * torch.eye(3, dtype=torch.float64)[axis])).view(3, 3).numpy()

@@ -25,7 +25,7 @@ _Transmission = mujoco.mjtTrn
 class YawFrame:
     """Yaw of a rotation-invariant scene: the rotation of one root about a world axis."""
 
-    exact: bool  # False if contacts depend on the yaw: the model then shows it to the network
+    exact: bool  # False if contacts depend on the yaw, which the network then sees
     node: int  # root node, the heaviest tree's
     axis: int  # 0, 1 or 2 for the world's x, y or z
     pivot: np.ndarray  # [3] a point on the axis, metres; 0 if every root can move across it
@@ -75,37 +75,43 @@ def _yaw_frame_about(
 
 
 def _rotating_joints(model: mujoco.MjModel, body: int, axis: int) -> tuple[set[int], bool] | None:
-    """Joints that rotate a root about a world axis or move it across, and whether any does.
+    """Joints that rotate a root about a world axis or move it across, and whether they move it across.
 
-    None if it cannot rotate so, or cannot move in all directions across alike.
+    None if it cannot rotate so, if it can move across in one direction alone, or not in all directions alike.
     """
     kind, across = mujoco.mjtJoint, [index for index in range(3) if index != axis]
     first = int(model.body_jntadr[body])
     *slides, last = range(first, first + int(model.body_jntnum[body]))
-    rest, last_kind = reference_rotation(model, body), int(model.jnt_type[last])
-    if last_kind not in (kind.mjJNT_FREE, kind.mjJNT_BALL, kind.mjJNT_HINGE):
+    axes = model.jnt_axis[first : last + 1] @ reference_rotation(model, body).T  # [joints, 3] at the reference
+    rotates = {kind.mjJNT_FREE: True, kind.mjJNT_BALL: True, kind.mjJNT_HINGE: abs(axes[-1, axis]) > 1 - TOLERANCE}
+    if not rotates.get(kind(model.jnt_type[last])) or (model.jnt_type[slides] != kind.mjJNT_SLIDE).any():
         return None
-    if last_kind == kind.mjJNT_HINGE and abs(abs((rest @ model.jnt_axis[last])[axis]) - 1) > TOLERANCE:
-        return None
-    if (model.jnt_type[slides] != kind.mjJNT_SLIDE).any():
-        return None
-    lateral = [slide for slide in slides if abs((rest @ model.jnt_axis[slide])[axis]) < 1 - TOLERANCE]
-    directions = np.array([(rest @ model.jnt_axis[slide])[across] for slide in lateral])
-    dofs = model.jnt_dofadr[lateral]
-    if last_kind == kind.mjJNT_FREE:
+    lateral = [slide for slide in slides if abs(axes[slide - first, axis]) < 1 - TOLERANCE]
+    if model.jnt_type[last] == kind.mjJNT_FREE:
         directions, dofs = np.eye(2), model.jnt_dofadr[last] + np.array(across)
+    else:
+        directions, dofs = axes[[slide - first for slide in lateral]][:, across], model.jnt_dofadr[lateral]
     if len(dofs):
         orthonormal = directions.shape == (2, 2) and np.abs(directions @ directions.T - np.eye(2)).max() <= TOLERANCE
         if not orthonormal or not _isotropic(model, dofs) or len(actuators_of(model, *lateral)):
             return None
-    if last_kind != kind.mjJNT_HINGE:
-        for actuator in actuators_of(model, last):
-            # Forces on a free joint act along the world's axes, torques about the body's own, or the parent's.
-            forces, torques = np.split(model.actuator_gear[actuator], [3 * (last_kind == kind.mjJNT_FREE)])
-            own = model.actuator_trntype[actuator] == _Transmission.mjTRN_JOINT
-            if any(part[across].any() for part in (forces, torques[: 0 if own else 3]) if len(part)):
-                return None
+    if _pushes_across(model, last, across):
+        return None
     return {*lateral, last}, bool(len(dofs))
+
+
+def _pushes_across(model: mujoco.MjModel, joint: int, across: list[int]) -> bool:
+    """Whether a motor of a free joint or ball acts in a direction of the world across the axis."""
+    free = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+    if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+        return False
+    for actuator in actuators_of(model, joint):
+        # Forces on a free joint act along the world's axes, torques about the body's own, or the parent's.
+        forces, torques = np.split(model.actuator_gear[actuator], [3 if free else 0])
+        in_parent = model.actuator_trntype[actuator] == _Transmission.mjTRN_JOINTINPARENT
+        if free and forces[across].any() or in_parent and torques[across].any():
+            return True
+    return False
 
 
 def _isotropic(model: mujoco.MjModel, dofs: np.ndarray) -> bool:

@@ -68,8 +68,8 @@ class BoundCanonicalizer(Float64Buffers):
         super().__init__()
         self.layout = layout
         self.yaw_frame = frame = scene.yaw_frame if options.yaw else None
-        movable = None if frame is None else scene.movable[frame.node, 3:6]
-        self.tilts = frame is not None and bool(np.delete(movable, frame.axis).any())
+        # Whether the root can tilt, and so be upside down.
+        self.tilts = frame is not None and bool(np.delete(scene.movable[frame.node, 3:6], frame.axis).any())
         predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
         invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
         self.recenters = bool(options.recenter and invariant.any() and predicted.any())
@@ -92,7 +92,7 @@ class BoundCanonicalizer(Float64Buffers):
     def forward(self, state: Tensor, parameters: PhysicalParameters) -> CanonicalState:
         """Canonical state of ``[*B, N, 13]``: recentred, then rotated to yaw 0.
 
-        The world node keeps its frame; if bodies can touch the world, it rotates with the scene and shows the yaw.
+        The world node keeps its frame; if contacts depend on the yaw, it rotates with the scene and shows the yaw.
         """
         state, rotation = self.recentered(state), self.yaw_rotation(state, parameters)
         if self.yaw_frame is not None and rotation is not None:
