@@ -24,7 +24,7 @@ def build_model(
     given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
     optional = {"joint_axes": JointAxes(), "contacts": Contacts(), "contact_pairs": PairContacts()}
-    chosen = [feature for name, feature in optional.items() if shown.pop(name, False)]
+    chosen = [feature for name, feature in optional.items() if shown.pop(name)]
     features = (BodyState(**shown), Controls(), *chosen)
     return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.scenes.contact_pairs import MOST_CANDIDATES, MOST_PAIRS
+from torchrl_gn.scenes.contact_pairs import MOST_CANDIDATES, MOST_OF_ALL, MOST_PAIRS
 
 from .. import zoo
 
@@ -30,7 +30,7 @@ def test_a_finger_meets_box_and_table():
     assert names(scene) == {"world - mount", "world - link", "world - box", "mount - box", "link - box"}
     pairs = scene.contact_pairs
     counts = np.bincount(pairs.pair)
-    assert counts.max() <= MOST_CANDIDATES and (np.diff(counts) <= 0).all()
+    assert counts.max() <= MOST_CANDIDATES and counts.sum() <= MOST_OF_ALL and (np.diff(counts) <= 0).all()
     assert "can meet: world - box, " in str(scene)
     assert scene.contact_pairs is pairs
     again = zoo.load("pusher").contact_pairs
@@ -84,6 +84,15 @@ def test_a_plane_beside_that_of_the_contact_points_and_what_these_lack():
     np.testing.assert_allclose(surface, [2, 0, 0], atol=1e-9)
 
 
+def test_feet_find_a_wide_floor_of_boxes():
+    step = '<geom type="box" size="9 9 0.1" pos="0 0 {}"/>'
+    leg = '<body name="leg"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03"/></body>'
+    body = f'<body name="body" pos="0 0 1"><freejoint/><geom type="box" size="0.3 0.2 0.1"/>{leg}</body>'
+    scene = load_scene(f"<mujoco><worldbody>{step.format(0)}{body}</worldbody></mujoco>")
+    assert names(scene) == {"world - body", "world - leg"}
+    assert sorted(np.bincount(scene.contact_pairs.pair)) == [3, 8]
+
+
 def test_height_fields_are_named():
     scene = zoo.load("everything")
     assert scene.contact_pairs.ignored == ("ground",)
@@ -100,4 +109,4 @@ def test_the_most_frequent_pairs_are_kept():
 def test_the_paper_s_systems():
     found = {name: names(load_scene(name)) for name in ("pendulum", "cartpole", "acrobot", "swimmer6", "walker2d")}
     assert not any(found.values())  # their geoms' masks let them touch the floor alone, if anything
-    assert names(load_scene("cheetah")) == {"torso - bfoot", "bthigh - bfoot", "torso - ffoot"}
+    assert names(load_scene("cheetah")) == {"torso - bfoot", "torso - bshin", "bthigh - bfoot", "torso - ffoot"}

@@ -17,10 +17,12 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
 
 MOST_PAIRS = 24
-MOST_CANDIDATES = 16  # of each pair
+MOST_CANDIDATES = 32  # of each pair
+MOST_OF_ALL = 384  # candidates of all pairs
 _MARGIN = 0.05  # metres: geoms that come so near can meet
 _CONFIGURATIONS = 400
-_ENOUGH = 20  # configurations in which geoms are near are counted up to this
+_ENOUGH = 100  # configurations in which geoms are near are counted up to this
+_RARE = 0.15  # corners of a geom are left out if each is near less often, of the times that the geom is
 _GEOM, _JOINT, _DISABLE = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtDisableBit
 
 
@@ -42,7 +44,7 @@ class ContactPairs:
     half_size: np.ndarray  # [C, 3] half sizes of the box, metres
     radius: np.ndarray  # [C, 2] rounding of segment and box, metres
     has_ends: np.ndarray  # [C] bool, whether the segment's ends are candidates too
-    left_out: int = 0  # pairs beyond the MOST_PAIRS most frequent
+    left_out: int = 0  # less frequent pairs beyond the most that are kept
     ignored: tuple[str, ...] = ()  # names of geoms that can be touched but have no distance, such as height fields
 
     def __str__(self) -> str:
@@ -63,28 +65,29 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
     possible = _colliding(scene, node_of_geom)
     ignored = {geom for pair in possible for geom in pair if boxes[geom] is None}
     pairs = np.array([pair for pair in possible if not ignored & set(pair)], dtype=np.int64).reshape(-1, 2)
-    axes = {}
     found: dict[tuple[int, int], list[Candidate]] = {}
     for first, second in pairs.tolist():
-        nodes = int(node_of_geom[first]), int(node_of_geom[second])
-        axes[first, second] = _planar_axes(scene, data, *nodes)
-        found[first, second] = candidates(_known(boxes[first]), _known(boxes[second]), axes[first, second])
+        axes = _planar_axes(scene, data, int(node_of_geom[first]), int(node_of_geom[second]))
+        found[first, second] = candidates(_known(boxes[first]), _known(boxes[second]), axes)
     seen = _count_near(scene, pairs, found)
     of_nodes: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
     often: dict[tuple[int, int], int] = {}
     for geoms, (near, counts) in seen.items():
         a, b = (int(node_of_geom[geom]) for geom in geoms)
-        kept = [(int(count), each) for count, each in zip(counts, found[geoms], strict=True) if count]
+        sides = np.array([each.on_second for each in found[geoms]])
+        often_near = [bool((counts[sides == side] >= _RARE * near).any()) for side in (False, True)]
+        kept = [(int(n), each) for n, each in zip(counts, found[geoms], strict=True) if often_near[each.on_second]]
         if a > b:  # the lower node first
             a, b, kept = b, a, [(count, each._replace(on_second=not each.on_second)) for count, each in kept]
-        if kept:
-            of_nodes.setdefault((a, b), []).extend(kept)
-            often[a, b] = often.get((a, b), 0) + near
-    chosen = sorted(sorted(of_nodes), key=lambda nodes: -often[nodes])[:MOST_PAIRS]
-    lists = {nodes: sorted(of_nodes[nodes], key=lambda each: -each[0])[:MOST_CANDIDATES] for nodes in chosen}
-    chosen.sort(key=lambda nodes: -len(lists[nodes]))
+        of_nodes.setdefault((a, b), []).extend(kept)
+        often[a, b] = often.get((a, b), 0) + near
+    ranked = sorted(sorted(of_nodes), key=lambda nodes: -often[nodes])[:MOST_PAIRS]
+    lists = [[each for _, each in sorted(of_nodes[nodes], key=lambda each: -each[0])] for nodes in ranked]
+    lists = [each[:MOST_CANDIDATES] for each in lists]
+    fit = int((np.cumsum([len(each) for each in lists]) <= MOST_OF_ALL).sum())
+    chosen = sorted(zip(ranked[:fit], lists[:fit], strict=True), key=lambda each: -len(each[1]))
     names = tuple(_name(model, geom) for geom in sorted(ignored))
-    return _arrays(chosen, [[each for _, each in lists[nodes]] for nodes in chosen], len(of_nodes) - len(chosen), names)
+    return _arrays([nodes for nodes, _ in chosen], [each for _, each in chosen], len(of_nodes) - fit, names)
 
 
 def _arrays(
@@ -249,13 +252,16 @@ def _move_near(
     if own.all() or not own.any():
         return
     geom, other = int(rng.choice(np.flatnonzero(own))), int(rng.choice(np.flatnonzero(~own)))
-    plane = model.geom_type[other] == _GEOM.mjGEOM_PLANE
-    away = rng.normal(size=3)
-    away *= rng.uniform(0.3, 1) * (model.geom_rbound[[geom, other]].sum() + _MARGIN) / np.linalg.norm(away)
-    shift = data.geom_xpos[other] + away - data.geom_xpos[geom]
-    if plane:
-        normal = data.geom_xmat[other, 2::3]
-        shift = (shift @ normal) * normal
+    if model.geom_type[other] == _GEOM.mjGEOM_PLANE:
+        place, axis, side = np.append(rng.normal(size=2), 0), 2, 1
+    else:  # on a side of its bounding box, a large one more often
+        middle, half = model.geom_aabb[other, :3], model.geom_aabb[other, 3:]
+        area = np.prod(half) / half
+        axis, side = rng.choice(3, p=area / area.sum()), rng.choice([-1, 1])
+        place = middle + rng.uniform(-half, half)
+        place[axis] = middle[axis] + side * half[axis]
+    place[axis] += side * rng.uniform(0.2, 1) * (model.geom_rbound[geom] + _MARGIN)
+    shift = data.geom_xpos[other] + data.geom_xmat[other].reshape(3, 3) @ place - data.geom_xpos[geom]
     for joint in joints:
         start = int(model.jnt_qposadr[joint])
         if model.jnt_type[joint] == _JOINT.mjJNT_FREE:
