@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from torchrl_gn.data import Simulator, collect_trajectories, sample_start_states, spline_controls
 from torchrl_gn.scenes import Scene, SceneError, UnsupportedSceneError, load_scene, scene_from_description
+from torchrl_gn.scenes.control_bounds import require_bounds
 from torchrl_gn.scenes.systems.system import model_file
 
 from .. import zoo
@@ -233,7 +235,8 @@ def test_action_bounds_are_part_of_the_description(bounds):
 
 def test_bad_action_bounds_are_refused():
     text = zoo.mjcf("linkage")
-    for bounds in ((1, -1), (0, np.inf), (1,), {"free": (2, 2)}, "ab"):
+    wrong: list[Any] = [(1, -1), (0, np.inf), (1,), {"free": (2, 2)}, "ab"]
+    for bounds in wrong:
         with pytest.raises(ValueError, match="two finite numbers, low then high"):
             load_scene(text, action_bounds=bounds)
     with pytest.raises(ValueError, match=r"\['motor'\], which are none of the actuators \['turn'"):
@@ -244,7 +247,7 @@ def test_bad_action_bounds_are_refused():
 
 def test_random_actions_without_bounds_are_refused_by_name():
     scene = zoo.load("linkage")
-    with pytest.raises(SceneError, match=r"\['free'\] of scene 'linkage' have no bounds.*action_bounds"):
+    with pytest.raises(SceneError, match=r"Actions \['free'\] of scene 'linkage' have no bounds.*action_bounds"):
         collect_trajectories(scene, 2, 3)
     rollout = Simulator(scene).rollout(sample_start_states(scene, 2, 0), np.full((2, 3, 8), 0.05))
     assert rollout["stable"].all() and rollout["state"].isfinite().all()
@@ -274,7 +277,7 @@ def test_suite_domains_with_tendons_load(domain, controls):
     scene = load_scene(model_file(f"suite/{domain}.xml"))
     assert scene.edge_action.shape == (scene.num_edges, controls)
     assert set(range(scene.num_actions)) <= set(scene.edge_action.ravel().tolist())
-    scene.require_bounds()
+    require_bounds(scene)
 
 
 @pytest.mark.parametrize(("domain", "element"), [("quadruped", "yaw_front_left"), ("dog", "lumbar_extend")])

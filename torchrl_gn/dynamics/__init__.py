@@ -10,6 +10,7 @@ from torchrl_gn.dynamics.features import Contacts as Contacts
 from torchrl_gn.dynamics.features import Controls as Controls
 from torchrl_gn.dynamics.features import Feature as Feature
 from torchrl_gn.dynamics.features import JointAxes as JointAxes
+from torchrl_gn.dynamics.features import Wrenches as Wrenches
 from torchrl_gn.dynamics.model import ForwardModel as ForwardModel
 from torchrl_gn.dynamics.predictor import Predictor as Predictor
 from torchrl_gn.dynamics.specialized import SpecializedPredictor as SpecializedPredictor

@@ -9,7 +9,16 @@ from typing import Any, Literal, cast, get_args
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_gn.dynamics.features import FEATURES, BodyState, Canonicalizer, Contacts, Controls, Feature, JointAxes
+from torchrl_gn.dynamics.features import (
+    FEATURES,
+    BodyState,
+    Canonicalizer,
+    Contacts,
+    Controls,
+    Feature,
+    JointAxes,
+    Wrenches,
+)
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
@@ -111,6 +120,7 @@ class ForwardModel(nn.Module):
         if features is None:
             spatial = "orientation" in layout.names
             features = (BodyState(), Controls(), *((JointAxes(), Contacts()) if spatial else ()))
+            features += (Wrenches(),) * (spatial and Wrenches.suits(first))
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, first.num_edges
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)

@@ -12,11 +12,13 @@ from torchrl_gn.dynamics.features.controls import Controls as Controls
 from torchrl_gn.dynamics.features.feature import Feature as Feature
 from torchrl_gn.dynamics.features.feature import StepInputs as StepInputs
 from torchrl_gn.dynamics.features.joint_axes import JointAxes as JointAxes
+from torchrl_gn.dynamics.features.wrenches import Wrenches as Wrenches
 
 FEATURES: dict[str, type[Feature]] = {
     "body_state": BodyState,
     "contacts": Contacts,
     "controls": Controls,
     "joint_axes": JointAxes,
+    "wrenches": Wrenches,
 }
 """Features by the names that checkpoints have for them."""
