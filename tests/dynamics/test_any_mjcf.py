@@ -59,7 +59,7 @@ def difference(model: ForwardModel, scene: Scene, states: Tensor, actions: Tenso
 
 @pytest.mark.parametrize("executor", ["eager", "native"])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-5)])
-@pytest.mark.parametrize("name", ["quadrotor", "gripper", "tendon_arm", "linkage"])
+@pytest.mark.parametrize("name", ["quadrotor", "gripper", "tendon_arm", "machine"])
 def test_every_executor_predicts_scenes_with_other_actuators(name, dtype, tolerance, executor):
     scene = zoo.load(name)
     states, actions = simulate(scene)

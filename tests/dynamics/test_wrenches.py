@@ -31,7 +31,7 @@ def test_they_are_the_forces_of_rotors_in_the_world(random_states, random_action
 
 
 def test_scenes_with_actuators_at_sites_have_them():
-    for name, suits in (("quadrotor", True), ("linkage", True), ("gripper", False), ("arm", False)):
+    for name, suits in (("quadrotor", True), ("machine", True), ("gripper", False), ("arm", False)):
         scene = zoo.load(name)
         model = ForwardModel.for_scene(scene, **SMALL)
         assert (Wrenches() in model.features) == Wrenches.suits(scene) == suits

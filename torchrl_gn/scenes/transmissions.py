@@ -142,12 +142,12 @@ def _wrench(model: mujoco.MjModel, graph: Topology, site: int, gear: np.ndarray)
     """Force and torque ``[6]`` about the origin of a site's node, in its frame, of a gear in the site's frame."""
     body = int(model.site_bodyid[site])
     pos, quat = offset(model, body, int(graph.body[graph.node_of_body[body]]))
-    lever, orientation, force, torque = np.empty(3), np.empty(4), np.empty(3), np.empty(3)
-    mujoco.mju_rotVecQuat(lever, model.site_pos[site], quat)
+    point, orientation, force, torque = np.empty(3), np.empty(4), np.empty(3), np.empty(3)
+    mujoco.mju_rotVecQuat(point, model.site_pos[site], quat)
     mujoco.mju_mulQuat(orientation, quat, model.site_quat[site])
     mujoco.mju_rotVecQuat(force, gear[:3], orientation)
     mujoco.mju_rotVecQuat(torque, gear[3:], orientation)
-    return np.concatenate((force, torque + np.cross(pos + lever, force)))
+    return np.concatenate((force, torque + np.cross(pos + point, force)))
 
 
 def _constraints(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, EdgePair]]:
