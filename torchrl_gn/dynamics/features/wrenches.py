@@ -14,7 +14,7 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
 from torchrl_gn.scenes.topology import topology
-from torchrl_gn.scenes.transmissions import find_transmissions
+from torchrl_gn.scenes.transmissions import Transmissions, find_transmissions
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
@@ -62,14 +62,14 @@ class _Bound(Float64Buffers):
     def forward(self, inputs: StepInputs) -> Tensor:
         matrices = inputs.canonical.matrices
         assert matrices is not None
-        force, torque = (0.0, 0.0)
+        exerted = []
         for slot, control in enumerate(inputs.controls.split(1, dim=-1)):
             rotation = matrices[..., self.frame[:, slot], :, :]
             wrench = self.wrench[:, slot].to(matrices.dtype).unsqueeze(-1)  # [E, 2, 3, 1]
-            force = force + control * (rotation @ wrench[:, 0]).squeeze(-1)
-            torque = torque + control * (rotation @ wrench[:, 1]).squeeze(-1)
-        return torch.cat((force, torque), dim=-1)
+            both = [(rotation @ part).squeeze(-1) for part in wrench.unbind(1)]
+            exerted.append(control * torch.cat(both, dim=-1))
+        return sum(exerted[1:], exerted[0])
 
 
-def _transmissions(scene: Scene):
+def _transmissions(scene: Scene) -> Transmissions:
     return find_transmissions(scene.model, topology(scene.model))
