@@ -288,7 +288,7 @@ def test_package_is_typed():
 
 # Words that the field does not use, and the field's own (docs/concepts.md has the glossary).
 RETIRED = {
-    r"linking|linkage": "constraint projection, joint anchors",
+    r"linking|mechanism": "constraint projection, joint anchors",
     r"pins?|pinned|pin[_ ]finder": "joint anchor, anchor estimation",
     r"levers?|parent_arm": "anchor offset",
     r"headings?": "yaw, yaw frame",

@@ -658,7 +658,7 @@ def test_state_maths_with_too_many_registers(quick, inputs, monkeypatch):
 
 
 def zoo_cases() -> list:
-    few = ("arm", "everything", "odd", "soft", "tumbler", "parallel_hinges", "quadrotor", "linkage")
+    few = ("arm", "everything", "odd", "soft", "tumbler", "parallel_hinges", "quadrotor", "machine")
     return [pytest.param(name, marks=[] if name in few else pytest.mark.slow) for name in ZOO]
 
 

@@ -171,7 +171,7 @@ def test_gradients_of_linking_by_joints(make_model):
     )
 
 
-def test_a_linkage_moves_as_its_bodies_mean(scenes, make_model, random_actions):
+def test_a_mechanism_moves_as_its_bodies_mean(scenes, make_model, random_actions):
     """What the bodies disagree on is averaged; what they agree on is kept."""
     scene = scenes["swimmer6"]
     bound = make_model(scene, fitted=False).bind(scene)

@@ -28,7 +28,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_linkages_of_small_models(case):
+def test_mechanisms_of_small_models(case):
     upper, lower, roots = CASES[case]
     assert load_scene(XML.format(upper, lower)).joint_anchors.root.tolist() == roots
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,11 +11,12 @@ import pytest
 
 from torchrl_gn.data import Simulator, collect_trajectories, sample_start_states, spline_controls
 from torchrl_gn.scenes import Scene, SceneError, UnsupportedSceneError, load_scene, scene_from_description
+from torchrl_gn.scenes.control_bounds import require_bounds
 from torchrl_gn.scenes.systems.system import model_file
 
 from .. import zoo
 
-SCENES = ("quadrotor", "gripper", "tendon_arm", "linkage")
+SCENES = ("quadrotor", "gripper", "tendon_arm", "machine")
 BOUNDED = {"action_bounds": (-1.0, 1.0)}
 
 
@@ -61,7 +63,7 @@ def test_actuators_act_at_the_edges_of_what_they_move():
         ("elbow", "hinge"): ["pull"],
         ("flex", "tendon"): ["flex"],
     }
-    assert _actions(zoo.load("linkage")) == {
+    assert _actions(zoo.load("machine")) == {
         ("crank", "hinge"): ["turn", "brake"],
         ("rod", "hinge"): ["free"],
         ("rocker", "ball"): ["swing"],
@@ -100,7 +102,7 @@ def test_site_gears_are_wrenches_about_the_node():
 
 
 def test_refsite_gears_are_wrenches_on_the_second_site_reversed():
-    scene = zoo.load("linkage")
+    scene = zoo.load("machine")
     data, pair = _at_random_state(scene), [pair.name for pair in scene.pairs].index("aim")
     body, other = int(scene.body[scene.node_names.index("rocker")]), int(scene.body[scene.node_names.index("rod")])
     rotation = data.xmat[body].reshape(3, 3)
@@ -113,7 +115,7 @@ def test_refsite_gears_are_wrenches_on_the_second_site_reversed():
     np.testing.assert_allclose(expected, _moment(scene, data, scene.actuator_names.index("aim")), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["gripper", "linkage"])
+@pytest.mark.parametrize("name", ["gripper", "machine"])
 def test_gears_at_scalar_joints_are_moments(name):
     scene = zoo.load(name)
     data = _at_random_state(scene)
@@ -126,7 +128,7 @@ def test_gears_at_scalar_joints_are_moments(name):
 
 
 def test_static_features_of_slots_transmissions_and_constraints():
-    scene = zoo.load("linkage")
+    scene = zoo.load("machine")
     names, edges = scene.static.edge_names, scene.static.edges
     column = dict(zip(names, edges.T, strict=True))
     pendulum = load_scene("pendulum").static.edge_names
@@ -197,7 +199,7 @@ def test_anchors_of_constraints(kind, sites):
 def test_bounds_follow_from_forces_and_joints():
     scene = zoo.load("quadrotor", ('site="right" gear', 'site="right" gear'))
     assert (scene.action_low[3], scene.action_high[3]) == (0, 4)
-    scene = zoo.load("linkage")
+    scene = zoo.load("machine")
     servo, free = scene.actuator_names.index("servo"), scene.actuator_names.index("free")
     assert (scene.action_low[servo], scene.action_high[servo]) == (-0.1, 0.1)
     assert (scene.action_low[free], scene.action_high[free]) == (-np.inf, np.inf)
@@ -219,7 +221,7 @@ def test_a_motor_reaches_its_force_limit_at_its_bounds():
 
 @pytest.mark.parametrize("bounds", [(-2, 3), {"free": [-2, 3]}, {"free": (-2, 3), "turn": (-0.5, 0.25)}])
 def test_action_bounds_are_part_of_the_description(bounds):
-    text = zoo.mjcf("linkage")
+    text = zoo.mjcf("machine")
     scene = load_scene(text, action_bounds=bounds)
     free, turn = scene.actuator_names.index("free"), scene.actuator_names.index("turn")
     named = isinstance(bounds, dict) and "turn" in bounds
@@ -232,8 +234,9 @@ def test_action_bounds_are_part_of_the_description(bounds):
 
 
 def test_bad_action_bounds_are_refused():
-    text = zoo.mjcf("linkage")
-    for bounds in ((1, -1), (0, np.inf), (1,), {"free": (2, 2)}, "ab"):
+    text = zoo.mjcf("machine")
+    wrong: list[Any] = [(1, -1), (0, np.inf), (1,), {"free": (2, 2)}, "ab"]
+    for bounds in wrong:
         with pytest.raises(ValueError, match="two finite numbers, low then high"):
             load_scene(text, action_bounds=bounds)
     with pytest.raises(ValueError, match=r"\['motor'\], which are none of the actuators \['turn'"):
@@ -243,8 +246,8 @@ def test_bad_action_bounds_are_refused():
 
 
 def test_random_actions_without_bounds_are_refused_by_name():
-    scene = zoo.load("linkage")
-    with pytest.raises(SceneError, match=r"\['free'\] of scene 'linkage' have no bounds.*action_bounds"):
+    scene = zoo.load("machine")
+    with pytest.raises(SceneError, match=r"Actions \['free'\] of scene 'machine' have no bounds.*action_bounds"):
         collect_trajectories(scene, 2, 3)
     rollout = Simulator(scene).rollout(sample_start_states(scene, 2, 0), np.full((2, 3, 8), 0.05))
     assert rollout["stable"].all() and rollout["state"].isfinite().all()
@@ -254,7 +257,7 @@ def test_idle_actuators_and_mocap_bodies_are_printed():
     site = ('site="front" gear', 'site="post" gear')
     scene = zoo.load("quadrotor", site, ('<body name="drone"', '<site name="post"/><body name="drone"'))
     assert 0 not in scene.edge_action and "actuators that move nothing: front" in str(scene)
-    scene = zoo.load("linkage")
+    scene = zoo.load("machine")
     assert "target" not in scene.node_names and scene.attachments["target"].node == 0
     assert "mocap bodies, fixed at the pose of the model: target" in str(scene)
     assert "passive tendons, without edges: rope" in str(zoo.load("everything"))
@@ -274,7 +277,7 @@ def test_suite_domains_with_tendons_load(domain, controls):
     scene = load_scene(model_file(f"suite/{domain}.xml"))
     assert scene.edge_action.shape == (scene.num_edges, controls)
     assert set(range(scene.num_actions)) <= set(scene.edge_action.ravel().tolist())
-    scene.require_bounds()
+    require_bounds(scene)
 
 
 @pytest.mark.parametrize(("domain", "element"), [("quadruped", "yaw_front_left"), ("dog", "lumbar_extend")])
@@ -285,4 +288,28 @@ def test_suite_domains_with_activation_are_refused_by_name(domain, element):
 
 def test_adhesion_of_fixed_bodies_is_refused():
     with pytest.raises(UnsupportedSceneError, match="'stick'.*fixed to the world"):
-        zoo.load("linkage", ('body="pad"', 'body="target"'))
+        zoo.load("machine", ('body="pad"', 'body="target"'))
+
+
+@pytest.mark.parametrize(
+    ("name", "edit"),
+    [
+        ("quadrotor", ('name="front" pos="0.14', 'name="front" pos="0.15')),
+        ("quadrotor", ('site="front" gear', 'site="left" gear')),
+        ("gripper", ('joint="thumb" coef="0.5"', 'joint="thumb" coef="0.4"')),
+        ("gripper", ('name="grasp" tendon="close"', 'name="grasp" tendon="roll"')),
+        ("machine", ('cranklength="0.8"', 'cranklength="0.7"')),
+        ("machine", ('site="end" refsite="top"', 'site="end" refsite="slider"')),
+        ("machine", ('cranksite="pin"', 'cranksite="end"')),
+        ("machine", ('<adhesion name="stick" body="pad"', '<adhesion name="stick" body="rod"')),
+    ],
+)
+def test_fingerprints_tell_transmissions_apart(name, edit):
+    assert zoo.load(name, edit).fingerprint() != zoo.load(name).fingerprint()
+
+
+def test_numbers_beyond_float32_are_refused():
+    with pytest.raises(
+        SceneError, match=r"mass of body 'pad' in scene 'machine' is .*e\+99; give finite numbers below"
+    ):
+        zoo.load("machine", ('<geom type="sphere" size="0.06"/>', '<geom type="sphere" size="0.06" mass="1e99"/>'))

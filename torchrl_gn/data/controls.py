@@ -7,6 +7,7 @@ import math
 import numpy as np
 import torch
 
+from torchrl_gn.scenes.control_bounds import require_bounds
 from torchrl_gn.scenes.scene import Scene
 
 _MARGIN = 2  # knots before and after the sequence, against the spline's end conditions
@@ -27,7 +28,7 @@ def spline_controls(
     rng = np.random.default_rng(rng)
     if num == 0 or steps == 0 or scene.num_actions == 0:
         return np.zeros((num, steps, scene.num_actions))
-    scene.require_bounds()
+    require_bounds(scene)
 
     from scipy.interpolate import CubicSpline  # here, as importing it takes a second
 

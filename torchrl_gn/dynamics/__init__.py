@@ -12,6 +12,7 @@ from torchrl_gn.dynamics.features import Feature as Feature
 from torchrl_gn.dynamics.features import JointAxes as JointAxes
 from torchrl_gn.dynamics.features import PairContacts as PairContacts
 from torchrl_gn.dynamics.features import PhysicsChange as PhysicsChange
+from torchrl_gn.dynamics.features import Wrenches as Wrenches
 from torchrl_gn.dynamics.model import ForwardModel as ForwardModel
 from torchrl_gn.dynamics.mujoco_physics import MujocoPhysics as MujocoPhysics
 from torchrl_gn.dynamics.physics import ConstantVelocity as ConstantVelocity

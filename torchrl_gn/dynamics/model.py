@@ -18,6 +18,7 @@ from torchrl_gn.dynamics.features import (
     Feature,
     JointAxes,
     PhysicsChange,
+    Wrenches,
     graph_edges,
 )
 from torchrl_gn.dynamics.normalization import DYNAMIC_FLOOR
@@ -130,6 +131,7 @@ class ForwardModel(nn.Module):
         if features is None:
             spatial = "orientation" in layout.names
             features = (BodyState(), Controls(), *((JointAxes(), Contacts()) if spatial else ()))
+            features += (Wrenches(),) * (spatial and Wrenches.suits(first))
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)

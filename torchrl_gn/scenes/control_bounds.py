@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+
+from torchrl_gn.scenes.scene import Scene, SceneError
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.kinematic_tree import KinematicTree
 
 _JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -37,6 +43,17 @@ def set_control_bounds(
             bounds[actuator] = model.actuator_ctrlrange[actuator] = found
             model.actuator_ctrllimited[actuator] = 1
     return bounds[:, 0].copy(), bounds[:, 1].copy()
+
+
+def require_bounds(scene: Scene | KinematicTree) -> None:
+    """SceneError, which names them, if some actions have no bounds to draw from."""
+    names = getattr(scene, "actuator_names", [f"command {index}" for index in range(scene.num_actions)])
+    bounded = np.isfinite(scene.action_low) & np.isfinite(scene.action_high)
+    if unbounded := [name for name, known in zip(names, bounded, strict=True) if not known]:
+        raise SceneError(
+            f"Actions {unbounded} of scene {scene.name!r} have no bounds to draw from. Give their actuators a"
+            " ctrlrange, or load the scene with action_bounds={name: (low, high)}."
+        )
 
 
 def plain_bounds(chosen: ActionBounds) -> dict[str, list[float]] | list[float]:

@@ -19,14 +19,8 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
 
 _OBJECT, _GEOM, _WRAP, _JOINT = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtWrap, mujoco.mjtJoint
-_TRANSMISSION = mujoco.mjtTrn
 
-_TARGETS = {
-    _TRANSMISSION.mjTRN_TENDON: _OBJECT.mjOBJ_TENDON,
-    _TRANSMISSION.mjTRN_SITE: _OBJECT.mjOBJ_SITE,
-    _TRANSMISSION.mjTRN_SLIDERCRANK: _OBJECT.mjOBJ_SITE,
-    _TRANSMISSION.mjTRN_BODY: _OBJECT.mjOBJ_BODY,
-}
+_TARGETS = {"TENDON": _OBJECT.mjOBJ_TENDON, "BODY": _OBJECT.mjOBJ_BODY}  # of transmissions; others act at sites
 
 _OPTIONS = (
     *("timestep", "gravity", "wind", "density", "viscosity", "impratio"),
@@ -128,12 +122,11 @@ def _actuators(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
         types = [kind(getattr(model, f"actuator_{name}")[motor]).name for name, kind in kinds]
         group = int(model.actuator_group[motor])
         off = group >= 0 and model.opt.disableactuator >> group & 1
-        kind, ends = _TRANSMISSION(model.actuator_trntype[motor]), model.actuator_trnid[motor].tolist()
-        joints = (_TRANSMISSION.mjTRN_JOINT, _TRANSMISSION.mjTRN_JOINTINPARENT)
-        joint = [names.joints[ends[0]]] if kind in joints else []
+        ends, kind = model.actuator_trnid[motor].tolist(), types[0].removeprefix("mjTRN_")
+        joint = [names.joints[ends[0]]] if kind.startswith("JOINT") else []
         yield " ".join([of, *joint, *types, *["off"] * bool(off)])
-        for at in ends if not joint else ():
-            yield from names.element(_TARGETS.get(kind), at)
+        for at in () if joint else ends:
+            yield from names.element(_TARGETS.get(kind, _OBJECT.mjOBJ_SITE), at)
         yield from _arrays(of, model, "actuator", motor, _ACTUATORS)
         yield from _limits(of, model, "actuator", motor, ("forcerange", "forcelimited"))
 

@@ -130,14 +130,6 @@ class Scene:
         bounded = np.isfinite(self.action_low) & np.isfinite(self.action_high)
         return tuple(name for name, known in zip(self.actuator_names, bounded, strict=True) if not known)
 
-    def require_bounds(self) -> None:
-        """SceneError, which names them, if some actions have no bounds to draw from."""
-        if self.unbounded:
-            raise SceneError(
-                f"Actuators {list(self.unbounded)} of scene {self.name!r} have no bounds to draw actions from."
-                " Give them a ctrlrange, or load the scene with action_bounds={name: (low, high)}."
-            )
-
     def description(self) -> dict:
         """JSON-able values that rebuild the scene; SceneError if it is of an ``MjSpec``, whose XML rounds numbers."""
         if not self.origin:
@@ -188,8 +180,8 @@ class Scene:
         driven = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]
         tendons = [named(model, kind.mjOBJ_TENDON, tendon) for tendon in range(model.ntendon) if tendon not in driven]
         shown = {pair.name for pair in self.pairs if pair.element == "constraint"}
-        equalities = [named(model, kind.mjOBJ_EQUALITY, one) for one in np.flatnonzero(model.eq_active0)]
-        mocap = [named(model, kind.mjOBJ_BODY, body) for body in np.flatnonzero(model.body_mocapid >= 0)]
+        equalities = [named(model, kind.mjOBJ_EQUALITY, one) for one in np.flatnonzero(model.eq_active0).tolist()]
+        mocap = [named(model, kind.mjOBJ_BODY, body) for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
         notes = {
             "no bounds": self.unbounded,
             "actuators that move nothing": idle,

@@ -23,6 +23,7 @@ class Transmissions:
     pairs: tuple[EdgePair, ...]  # [P] the joints', then those of actuators, then those of equality constraints
     action: np.ndarray  # [P, C] control in each slot, by index; -1 without
     gear: np.ndarray  # [P, C, 6] what a unit of the actuator's force exerts there, see find_transmissions
+    frame: np.ndarray  # [P, C] node in whose frame the gear is a force and torque; -1 where it is another
     equality: np.ndarray  # [P] MuJoCo id of the pair's equality constraint, -1 without
 
 
@@ -35,17 +36,17 @@ def find_transmissions(model: mujoco.MjModel, graph: Topology) -> Transmissions:
     site is its force and torque about the node's origin in the node's frame, with a refsite those of the refsite's.
     """
     pairs = list(graph.pairs)
-    slots: list[dict[int, np.ndarray]] = [{} for _ in pairs]
+    slots: list[dict[int, tuple[np.ndarray, int]]] = [{} for _ in pairs]
     for actuator in range(len(model.actuator_trntype)):
         _refuse_hidden_states(model, actuator)
         kind = _TRANSMISSION(model.actuator_trntype[actuator])
-        for place, gear in _places(model, graph, actuator):
+        for place, exerted, node in _places(model, graph, actuator):
             at = place if isinstance(place, int) else _pair_between(pairs, place)
             if at == len(pairs):
                 assert not isinstance(place, int)
                 pairs.append(EdgePair(named(model, _OBJECT.mjOBJ_ACTUATOR, actuator), _plain(kind.name), *place))
                 slots.append({})
-            slots[at][actuator] = gear
+            slots[at][actuator] = exerted, node
     if model.npluginstate:
         raise UnsupportedSceneError(
             f"Plugin {named(model, _OBJECT.mjOBJ_PLUGIN, 0)!r} has a state that body states do not show. Remove it."
@@ -54,11 +55,13 @@ def find_transmissions(model: mujoco.MjModel, graph: Topology) -> Transmissions:
     equality = np.array([*[-1] * len(pairs), *(which for which, _ in constraints)], dtype=np.int64)
     pairs += [pair for _, pair in constraints]
     most = max(1, *map(len, slots)) if slots else 1
-    action, gear = np.full((len(pairs), most), -1, dtype=np.int64), np.zeros((len(pairs), most, 6))
+    action, frame = np.full((2, len(pairs), most), -1, dtype=np.int64)
+    gear = np.zeros((len(pairs), most, 6))
     for pair, acting in enumerate(slots):
-        for slot, (actuator, exerted) in enumerate(sorted(acting.items())):
-            action[pair, slot], gear[pair, slot] = actuator, exerted
-    return Transmissions(tuple(pairs), action, gear, equality)
+        for slot, actuator in enumerate(sorted(acting)):
+            action[pair, slot] = actuator
+            gear[pair, slot], frame[pair, slot] = acting[actuator]
+    return Transmissions(tuple(pairs), action, gear, frame, equality)
 
 
 def _refuse_hidden_states(model: mujoco.MjModel, actuator: int) -> None:
@@ -75,33 +78,35 @@ def _refuse_hidden_states(model: mujoco.MjModel, actuator: int) -> None:
         )
 
 
-def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[tuple[_Place, np.ndarray]]:
-    """Joints and pairs of nodes at which an actuator acts, and its gear there; none if it moves nothing."""
+def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[tuple[_Place, np.ndarray, int]]:
+    """Joints and pairs of nodes at which an actuator acts, its gear there, and the gear's node; none if it is idle."""
     kind, gear = _TRANSMISSION(model.actuator_trntype[actuator]), model.actuator_gear[actuator]
     target, other = map(int, model.actuator_trnid[actuator])
     label = f"Actuator {named(model, _OBJECT.mjOBJ_ACTUATOR, actuator)!r}"
     nodes = graph.node_of_body
     match kind:
         case _TRANSMISSION.mjTRN_JOINT | _TRANSMISSION.mjTRN_JOINTINPARENT:
-            yield target, gear
+            yield target, gear, -1
         case _TRANSMISSION.mjTRN_TENDON:
             for place, factor in _tendon_places(model, graph, target):
-                yield place, factor * gear
+                yield place, factor * gear, -1
         case _TRANSMISSION.mjTRN_SITE if other < 0:
             if node := int(nodes[model.site_bodyid[target]]):
-                yield (0, node), _wrench(model, graph, target, gear)
+                yield (0, node), _wrench(model, graph, target, gear), node
         case _TRANSMISSION.mjTRN_SITE | _TRANSMISSION.mjTRN_SLIDERCRANK:
-            ends = sorted({int(nodes[model.site_bodyid[site]]) for site in (target, other)})
-            if len(ends) == 2:
-                site = kind == _TRANSMISSION.mjTRN_SITE
-                yield (ends[0], ends[1]), _wrench(model, graph, other, gear) if site else gear
+            node, reference = (int(nodes[model.site_bodyid[site]]) for site in (target, other))
+            ends = min(node, reference), max(node, reference)
+            if node != reference and kind == _TRANSMISSION.mjTRN_SITE:
+                yield ends, _wrench(model, graph, other, gear), reference
+            elif node != reference:
+                yield ends, gear, -1
         case _TRANSMISSION.mjTRN_BODY:
             if not nodes[target]:
                 raise UnsupportedSceneError(
                     f"{label} acts on the contacts of a body fixed to the world, so on bodies that no edge can tell."
                     " Let it act on a moving body."
                 )
-            yield (0, int(nodes[target])), gear
+            yield (0, int(nodes[target])), gear, -1
         case _:
             raise UnsupportedSceneError(
                 f"{label} acts through a {_plain(kind.name)}, which no edge can represent. Remove it."
@@ -137,12 +142,12 @@ def _wrench(model: mujoco.MjModel, graph: Topology, site: int, gear: np.ndarray)
     """Force and torque ``[6]`` about the origin of a site's node, in its frame, of a gear in the site's frame."""
     body = int(model.site_bodyid[site])
     pos, quat = offset(model, body, int(graph.body[graph.node_of_body[body]]))
-    lever, orientation, force, torque = np.empty(3), np.empty(4), np.empty(3), np.empty(3)
-    mujoco.mju_rotVecQuat(lever, model.site_pos[site], quat)
+    point, orientation, force, torque = np.empty(3), np.empty(4), np.empty(3), np.empty(3)
+    mujoco.mju_rotVecQuat(point, model.site_pos[site], quat)
     mujoco.mju_mulQuat(orientation, quat, model.site_quat[site])
     mujoco.mju_rotVecQuat(force, gear[:3], orientation)
     mujoco.mju_rotVecQuat(torque, gear[3:], orientation)
-    return np.concatenate((force, torque + np.cross(pos + lever, force)))
+    return np.concatenate((force, torque + np.cross(pos + point, force)))
 
 
 def _constraints(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, EdgePair]]:

@@ -15,6 +15,7 @@ from torchrl_gn.dynamics.features.feature import graph_edges as graph_edges
 from torchrl_gn.dynamics.features.joint_axes import JointAxes as JointAxes
 from torchrl_gn.dynamics.features.pair_contacts import PairContacts as PairContacts
 from torchrl_gn.dynamics.features.physics_change import PhysicsChange as PhysicsChange
+from torchrl_gn.dynamics.features.wrenches import Wrenches as Wrenches
 
 FEATURES: dict[str, type[Feature]] = {
     "body_state": BodyState,
@@ -23,5 +24,6 @@ FEATURES: dict[str, type[Feature]] = {
     "controls": Controls,
     "joint_axes": JointAxes,
     "physics_change": PhysicsChange,
+    "wrenches": Wrenches,
 }
 """Features by the names that checkpoints have for them."""
