@@ -13,6 +13,7 @@ from torchrl_gn.training import load_pretrained
 SMALL = (
     "steps=2",
     "length=12",
+    "history=0",
     "burn_in=4",
     "validation_steps=6",
     "unroll_steps=3",
@@ -75,7 +76,7 @@ def test_delay_and_filter_follow_the_measurements(pendulum, call, tmp_path):
     """And past commands are seen by the models."""
     options = (f"log={pendulum}", "names={angle: q, velocity: dq, command: u}", "commands=[[0], []]")
     run, more = tmp_path / "run", ("lag=auto", "filter=auto", "history=2")
-    code, output, errors = call(*options, *more, f"run_dir={run}", *SMALL, recipe="real_robot")
+    code, output, errors = call(*options, f"run_dir={run}", *SMALL, *more, recipe="real_robot")
     assert code == 0, errors
     assert "Hz, a row every" in output and "delay (rows)" in output
     tree = load_pretrained(run / "feed-forward").scene()

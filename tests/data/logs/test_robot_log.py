@@ -206,7 +206,8 @@ def test_a_robot_without_motors_says_so(tmp_path):
         load_robot_log(tmp_path / "log.npz", timestep=0.01)
     read = load_robot_log(tmp_path / "log.npz", timestep=0.01, names={"command": ""})
     assert log_trajectories(read, 12)[0]["action"].shape == (6, 12, 0)
-    assert log_tree(read, "swing").num_actions == 0
+    assert log_tree(read, "swing").num_actions == 0 == log_tree(read, "swing", history=4).history
+    assert log_trajectories(read, 12, history=4)[0]["action"].shape == (5, 12, 0)
 
 
 def test_a_time_step_does_not_contradict_the_log(tmp_path):
@@ -227,6 +228,8 @@ def test_other_bad_input_is_named(tmp_path):
         load_robot_log(tmp_path / "log.npz")
     with pytest.raises(ValueError, match="No piece of the log has 70 transitions"):
         log_trajectories(smooth_log(), 70)
+    with pytest.raises(ValueError, match="No piece of the log has 48 transitions of 10 ms behind 3 of history"):
+        log_trajectories(smooth_log(), 48, history=3)
     with pytest.raises(ValueError, match="lag=-1"):
         log_trajectories(smooth_log(), 5, lag=-1)
     with pytest.raises(

@@ -11,8 +11,7 @@ from torchrl_gn.data.logs.robot_log import RobotLog, short_way, unbroken
 
 _PAST = 4  # rows before a command from which it is predicted, to find what is new in it
 _ROWS = 50_000  # commands from which delays are estimated
-_SIGNIFICANT = 4.0  # standard deviations by chance that a command's largest correlation must exceed
-_CHANCE = 3.0  # and its first one
+_SIGNIFICANT = 4.0  # standard deviations by chance that a correlation must exceed
 _ONSET = 0.1  # of the largest correlation: where a command begins to act
 
 
@@ -135,7 +134,7 @@ def _onset(response: np.ndarray) -> int | None:
     """First shift with a response, in standard deviations by chance ``[shifts]``; None if there is none."""
     if response.max() < _SIGNIFICANT:
         return None
-    return int(np.flatnonzero(response >= max(_ONSET * response.max(), _CHANCE))[0])
+    return int(np.flatnonzero(response >= max(_ONSET * response.max(), _SIGNIFICANT))[0])
 
 
 def _velocities(log: RobotLog, pieces: list[slice]) -> tuple[np.ndarray, np.ndarray, str]:

@@ -132,7 +132,8 @@ def log_trajectories(
     )
     if not num_trajectories:
         step = f"{1e3 * report.timestep:g} ms"
-        raise ValueError(f"No piece of the log has {steps} transitions of {step}; take fewer.\n{report}")
+        before = f" behind {history} of history" if history else ""
+        raise ValueError(f"No piece of the log has {steps} transitions of {step}{before}; take fewer.\n{report}")
     parts = {"state": states, "action": actions, "episode": which} | ({"smoothed": targets} if targets else {})
     entries = {key: torch.from_numpy(np.concatenate(part)) for key, part in parts.items()}
     return TensorDict(entries, batch_size=[num_trajectories]), report

@@ -151,5 +151,5 @@ def log_tree(
         action_low=low,
         action_high=high,
         joint_parents=tuple(joint_parents),
-        history=history,
+        history=history if count else 0,
     )
