@@ -195,7 +195,7 @@ def main(cfg: DictConfig) -> None:
     tracker = open_log(cfg, run, label=f"real_robot-{tree.name}")
     if physics is not None and physics.trained and cfg.physics_fit:
         if not residual & resumed.keys():
-            fit_physics(physics, tree, data["train"], steps=cfg.physics_fit, seed=cfg.seed)
+            fit_physics(physics, tree, data["train"], steps=cfg.physics_fit, window=min(20, horizon), seed=cfg.seed)
         physics.requires_grad_(False)
         tables["fitted physics"] = baseline_errors(tree, data["test"], physics, **measured)["physics"]
     metrics: dict[str, float] = {}

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from torchrl_gn.data import simulate_log
@@ -126,3 +129,72 @@ def test_shares_that_leave_nothing_are_refused(recipe):
         )
         with pytest.raises(ValueError, match="1 episodes cannot be split by share="):
             recipe.split(cfg, log)
+
+
+COASTING = """
+import torch
+from torch import nn
+
+
+class Coasting(nn.Module):
+    def __init__(self, robot, damping=1.0):
+        super().__init__()
+        self.step, self.logarithm = robot.timestep, nn.Parameter(torch.tensor(float(damping)).log())
+
+    def forward(self, state, action):
+        joints = state[..., 1:, :]
+        velocity = joints[..., 2] * (1 - self.step * self.logarithm.exp())
+        angle = torch.atan2(joints[..., 1], joints[..., 0]) + self.step * velocity
+        return torch.cat((state[..., :1, :], torch.stack((angle.cos(), angle.sin(), velocity), dim=-1)), dim=-2)
+
+
+def still(state, action):
+    return state
+"""
+
+
+@pytest.mark.slow
+def test_physics_are_fitted_corrected_and_resumed(pendulum, call, tmp_path):
+    run, file = tmp_path / "run", tmp_path / "coasting.py"
+    file.write_text(COASTING)
+    options = (
+        f"log={pendulum}",
+        "names={angle: q, velocity: dq, command: u}",
+        "commands=[[0], []]",
+        f"physics={file}:Coasting",
+        "physics_options={damping: 2.0}",
+        "physics_fit=3",
+        f"run_dir={run}",
+        *SMALL,
+    )
+    code, output, errors = call(*options, recipe="real_robot")
+    assert code == 0, errors
+    for row in ("constant velocity", "physics", "fitted physics", "feed-forward", "recurrent", "residual"):
+        assert f"\n{row} " in output
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["physics/rollout_error_8"] != metrics["fitted physics/rollout_error_8"]
+    path = run / "residual" / "checkpoint" / "checkpoint.safetensors"
+    with pytest.raises(ValueError, match="coasting:Coasting"):
+        load_pretrained(path)
+    assert call(*options, "steps=3", recipe="real_robot")[0] == 0
+    again = json.loads((run / "metrics.json").read_text())
+    for name in ("physics", "fitted physics"):  # not fitted again
+        assert again[f"{name}/rollout_error_8"] == metrics[f"{name}/rollout_error_8"]
+
+
+def test_what_names_no_physics_is_refused(tmp_path):
+    from _common.known_physics import load_physics
+
+    file, robot = tmp_path / "coasting.py", load_scene("pendulum")
+    file.write_text(COASTING)
+    assert load_physics(None, None, robot) is None
+    state = torch.ones(3)
+    assert load_physics(f"{file}:still", None, robot)(state, state) is state
+    for source, options, message in (
+        (f"{file}:moving", None, "no function or class 'moving'"),
+        (f"{file}:still", {"damping": 1.0}, "takes no physics_options"),
+        ("nowhere.py:still", None, "no file nowhere.py"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            load_physics(source, options, robot)
+    assert load_physics("scene", {"scale": {"mass": 2.0}}, robot).scale == {"mass": 2.0}

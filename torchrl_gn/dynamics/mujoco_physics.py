@@ -121,7 +121,7 @@ class MujocoPhysics(Physics):
         # Sensors show the state before a physics step: one more step shows the last.
         steps = self.scene.substeps + (self.tree is None)
         start = np.concatenate((np.ones((len(position), 1)), position, velocity), axis=1)
-        finite = np.isfinite(start).all(1) & np.isfinite(action).all(1)
+        finite = np.all(np.isfinite(np.concatenate((start, action), axis=1)), axis=1)
         rest = np.concatenate((np.ones(1), model.qpos0, np.zeros(model.nv)))
         start, action = np.where(finite[:, None], start, rest), np.where(finite[:, None], action, 0.0)
         rows, parts = max(1, _MEMORY // (steps * (model.nsensordata + start.shape[1] + model.nu))), []

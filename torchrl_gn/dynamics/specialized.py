@@ -267,8 +267,9 @@ def _width(inputs: InputScaling, full: int) -> int:
 
 def _frozen(physics: Physics | None) -> Physics | None:
     """The physics, or a copy of those that are trained."""
-    trained = physics is not None and physics.trained
-    return copy.deepcopy(physics).requires_grad_(False) if trained else physics
+    if physics is None or not physics.trained:
+        return physics
+    return copy.deepcopy(physics).requires_grad_(False)
 
 
 def _copied(scaling: Any) -> Any:
