@@ -26,7 +26,9 @@ from torchrl_gn.training import Budget, Trainer, fit_physics, load_pretrained, m
 from .. import zoo
 from ..sizes import SMALL
 
-TREE: Any = KinematicTree("pendulum", ("hinge",), 0.02, ((0,),), action_low=np.array([-2.0]), action_high=np.array([2.0]))
+TREE: Any = KinematicTree(
+    "pendulum", ("hinge",), 0.02, ((0,),), action_low=np.array([-2.0]), action_high=np.array([2.0])
+)
 
 
 class Pendulum(nn.Module):

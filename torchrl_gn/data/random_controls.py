@@ -11,6 +11,7 @@ import numpy as np
 from torchrl_gn.data.controls import check_knot_interval, evaluate_cubics, spline_controls
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_poses import reference_keyframe
+from torchrl_gn.scenes.control_bounds import require_bounds
 
 ActuatorKind = Literal["motor", "position", "velocity"]
 
@@ -64,7 +65,7 @@ def random_controls(
     if "system" in scene.origin or not (n and steps and scene.num_actions):
         return spline_controls(scene, n, steps, rng, knot_interval=knot_interval)
     check_knot_interval(knot_interval)
-    scene.require_bounds()
+    require_bounds(scene)
     model, low, high = scene.model, scene.action_low, scene.action_high
     kinds = np.array([actuator_kind(model, actuator) for actuator in range(model.nu)])
     key = reference_keyframe(model)

@@ -105,7 +105,7 @@ class BoundPairContacts(Float64Buffers):
         2 cm (2 inside, 0 outside); and, less and less from 2 to 10 cm, the velocity at which the bodies part (m/s), the
         receiver's velocity along the surface (m/s), the normal towards it, and the place from its origin (metres).
         """
-        state, matrices, _ = inputs.canonical
+        state, matrices = inputs.canonical.state, inputs.canonical.matrices
         if not self.rounds:
             return state.new_zeros((*state.shape[:-2], self.joint_edges, _SIZE * self.places))
         assert matrices is not None
