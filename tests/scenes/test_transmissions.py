@@ -300,7 +300,7 @@ def test_adhesion_of_fixed_bodies_is_refused():
         ("gripper", ('name="grasp" tendon="close"', 'name="grasp" tendon="roll"')),
         ("machine", ('cranklength="0.8"', 'cranklength="0.7"')),
         ("machine", ('site="end" refsite="top"', 'site="end" refsite="slider"')),
-        ("machine", ('cranksite="pin"', 'cranksite="end"')),
+        ("machine", ('cranksite="knee"', 'cranksite="end"')),
         ("machine", ('<adhesion name="stick" body="pad"', '<adhesion name="stick" body="rod"')),
     ],
 )
