@@ -27,6 +27,7 @@ from tensordict import TensorDictBase
 
 from _common import clean_exit, finish_run, open_log, with_help
 from _common.known_physics import load_physics
+from _common.mirrored import mirrored
 from _common.models import build_model
 from _common.progress import train_with_progress
 from torchrl_gn.data import (
@@ -151,8 +152,8 @@ def train(
     else:
         torch.manual_seed(cfg.seed)
         options = plain_config(cfg.models[name])
-        known = physics if options.pop("physics", False) else None
-        model = build_model(tree, cfg.model, physics=known, **options)
+        options["physics"] = physics if options.get("physics", False) else None
+        model = build_model(tree, cfg.model, **options)
     trainer = make_trainer(cfg, model, tree, data)
     if not resumed:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
@@ -175,29 +176,28 @@ def main(cfg: DictConfig) -> None:
     log, tree = read(cfg)
     print(tree)
     data = split(cfg, log)
+    if cfg.mirror:
+        tree, data["train"] = mirrored(tree, data["train"])
     run = RunFolder(cfg.run_dir, "real_robot")
     physics = load_physics(cfg.physics, cfg.physics_options, tree)
-    measured: dict[str, Any] = {
-        "burn_in": cfg.burn_in,
-        "horizons": {h for h in cfg.horizons if h <= horizon} | {horizon},
-    }
+    horizons = {steps for steps in cfg.horizons if steps <= horizon} | {horizon}
+    measured: dict[str, Any] = {"burn_in": cfg.burn_in, "horizons": horizons}
     tables = baseline_errors(tree, data["test"], physics, **measured)
     residual = {name for name, options in cfg.models.items() if options.get("physics", False)}
     names = [name for name in cfg.models if physics is not None or name not in residual]
     paths = {name: run.path / name / CHECKPOINT_FILE for name in names}
-    resumed = {
-        name: load_pretrained(path, physics=physics if name in residual else None)
-        for name, path in paths.items()
-        if path.exists()
-    }
+    there = {name: path for name, path in paths.items() if path.exists()}
+    known = dict.fromkeys(residual, physics)
+    resumed = {name: load_pretrained(path, physics=known.get(name)) for name, path in there.items()}
     for checkpoint in resumed.values():
         run.refuse_changes(checkpoint.config, cfg, free=MAY_CHANGE)
     tracker = open_log(cfg, run, label=f"real_robot-{tree.name}")
     if physics is not None and physics.trained and cfg.physics_fit:
-        if not residual & resumed.keys():
+        if not residual & resumed.keys():  # their checkpoint has the fitted parameters
             fit_physics(physics, tree, data["train"], steps=cfg.physics_fit, window=min(20, horizon), seed=cfg.seed)
-        physics.requires_grad_(False)
-        tables["fitted physics"] = baseline_errors(tree, data["test"], physics, **measured)["physics"]
+        tables["fitted physics"] = baseline_errors(tree, data["test"], physics.requires_grad_(False), **measured)[
+            "physics"
+        ]
     metrics: dict[str, float] = {}
     for name, path in paths.items():
         model, trainer = train(cfg, name, path, resumed.get(name), tree, data, tracker, physics)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from torchrl_gn.data import simulate_log
+from torchrl_gn.data import log_trajectories, log_tree, simulate_log
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained
 
@@ -198,3 +199,18 @@ def test_what_names_no_physics_is_refused(tmp_path):
         with pytest.raises(ValueError, match=message):
             load_physics(source, options, robot)
     assert load_physics("scene", {"scale": {"mass": 2.0}}, robot).scale == {"mass": 2.0}
+
+
+def test_the_mirror_image_of_a_pendulum_is_a_pendulum():
+    from _common.mirrored import mirrored
+
+    log = simulate_log(load_scene("acrobot"), 2, 30, 0)
+    data, tree = log_trajectories(log, 10)[0], log_tree(log, "acrobot", commands=[[], [0]])
+    both_ways, both = mirrored(tree, data)
+    assert (both_ways.action_low == -both_ways.action_high).all() and both_ways.action_high[0] >= tree.action_high[0]
+    image = both[len(data) :]
+    angles = [torch.atan2(s[..., 1:, 1], s[..., 1:, 0]) for s in both["state"].chunk(2)]
+    torch.testing.assert_close(angles[1], -angles[0])
+    assert torch.equal(image["action"], -data["action"]) and torch.equal(both[: len(data)]["state"], data["state"])
+    with pytest.raises(ValueError, match="not the channels"):
+        mirrored(log_tree(dataclasses.replace(log, extra={"torque": log.angle}), "acrobot", commands=[[], [0]]), data)
