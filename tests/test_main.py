@@ -60,7 +60,7 @@ def test_show_prints_the_scene(capsys):
 
 def test_show_draws_a_file_of_ones_own(tmp_path, capsys):
     file, image = tmp_path / "arm.xml", tmp_path / "new" / "arm.png"
-    file.write_text(zoo.mjcf("pole"))
+    file.write_text(zoo.mjcf("two_links"))
     assert main(["show", str(file), "--image", str(image)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == str(image)
     with Image.open(image) as picture:

@@ -20,6 +20,7 @@ from ..random_mjcf import random_mjcf
 
 HIDDEN_8 = {"latent": 8, "edge_hidden": (8,), "node_hidden": (8,), "global_hidden": (8,)}
 pytestmark = [
+    pytest.mark.filterwarnings("ignore::torchrl_gn.data.start_poses.StartPoseWarning"),
     pytest.mark.filterwarnings("ignore:Inertia matrix is too close to singular:UserWarning"),
     pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenParameterWarning"),  # of one that moves little
 ]

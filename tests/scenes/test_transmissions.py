@@ -16,6 +16,8 @@ from torchrl_gn.scenes.systems.system import model_file
 
 from .. import zoo
 
+pytestmark = pytest.mark.filterwarnings("ignore::torchrl_gn.data.start_poses.StartPoseWarning")
+
 SCENES = ("quadrotor", "gripper", "tendon_arm", "machine")
 BOUNDED = {"action_bounds": (-1.0, 1.0)}
 

@@ -80,19 +80,20 @@ class MujocoPhysics(Physics):
                 f" {tree.timestep:g} s: load_scene(..., timestep={tree.timestep:g})."
             )
         order = [scene.joint_names.index(joint) for joint in self.joints]
-        motors = [int(scene.edge_action[2 * joint]) for joint in order]
-        for name, motor, commands in zip(self.joints, motors, tree.commands, strict=True):
-            if len(commands) != (motor >= 0):
+        motors = [[motor for motor in scene.edge_action[2 * joint].tolist() if motor >= 0] for joint in order]
+        for name, own, commands in zip(self.joints, motors, tree.commands, strict=True):
+            if len(commands) != len(own):
                 raise ValueError(
-                    f"Joint {name!r} of scene {scene.name!r} has {int(motor >= 0)} motors, but robot {tree.name!r} has"
+                    f"Joint {name!r} of scene {scene.name!r} has {len(own)} motors, but robot {tree.name!r} has"
                     f" {len(commands)} commands there."
                 )
-        indices = [commands[0] for motor, commands in zip(motors, tree.commands, strict=True) if motor >= 0]
+        pairs = zip(motors, tree.commands, strict=True)
+        command_of = {motor: command for own, commands in pairs for motor, command in zip(own, commands, strict=True)}
         self.constants(
             {
                 "order": torch.tensor(order),  # joint of each of the tree's
                 "back": torch.tensor(np.argsort(order)),
-                "command": torch.tensor(indices, dtype=torch.long)[np.argsort([m for m in motors if m >= 0])],
+                "command": torch.tensor([command_of[motor] for motor in sorted(command_of)], dtype=torch.long),
             }
         )
 
