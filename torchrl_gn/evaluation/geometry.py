@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.topology import weld_roots
 
 _Geom = mujoco.mjtGeom
 _AZIMUTH, _ELEVATION = np.radians(-55.0), np.radians(18.0)
@@ -34,7 +35,7 @@ class SceneGeometry:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         node_of_root = {int(body): node for node, body in enumerate(scene.body)}
-        body_node = np.array([node_of_root[int(root)] for root in model.body_weldid])
+        body_node = np.array([node_of_root[int(root)] for root in weld_roots(model)])
         self.geom_node = body_node[model.geom_bodyid]  # [G] node that carries each geom
         # The offsets are the same in any configuration.
         roots = scene.body[self.geom_node]

@@ -12,6 +12,7 @@ import numpy as np
 from torchrl_gn.scenes.contact_points import SHAPES
 from torchrl_gn.scenes.contact_shapes import Candidate, RoundedBox, candidates, rounded_box
 from torchrl_gn.scenes.invariance import can_collide
+from torchrl_gn.scenes.topology import weld_roots
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
@@ -59,7 +60,7 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
     :class:`~torchrl_gn.scenes.contact_points.ContactPoints` has. The same scene always gives the same pairs.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
-    node_of_geom = np.searchsorted(scene.body, model.body_weldid)[model.geom_bodyid]
+    node_of_geom = np.searchsorted(scene.body, weld_roots(model))[model.geom_bodyid]
     mujoco.mj_kinematics(model, data)
     boxes = [rounded_box(model, data, geom, int(scene.body[node])) for geom, node in enumerate(node_of_geom)]
     possible = _colliding(scene, node_of_geom)
@@ -176,7 +177,7 @@ def _count_near(
     model, data = scene.model, mujoco.MjData(scene.model)
     seen: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
     reach = np.where(model.geom_type == _GEOM.mjGEOM_PLANE, np.inf, model.geom_rbound)
-    nodes = np.searchsorted(scene.body, model.body_weldid)[model.geom_bodyid]
+    nodes = np.searchsorted(scene.body, weld_roots(model))[model.geom_bodyid]
     counts = np.zeros(len(pairs), dtype=np.int64)
     for _ in _configurations(model, data) if len(pairs) else ():
         away = np.linalg.norm(data.geom_xpos[pairs[:, 0]] - data.geom_xpos[pairs[:, 1]], axis=1)

@@ -36,7 +36,7 @@ class Topology:
 
 def topology(model: mujoco.MjModel) -> Topology:
     """Graph structure of a compiled model; bodies fixed to the world, mocap bodies too, belong to node 0."""
-    weld = np.where(model.body_mocapid[model.body_weldid] >= 0, 0, model.body_weldid)
+    weld = weld_roots(model)
     body = np.unique(weld).astype(np.int64)
     node_of_body = np.searchsorted(body, weld)
     parent = node_of_body[model.body_parentid[body]]
@@ -46,6 +46,11 @@ def topology(model: mujoco.MjModel) -> Topology:
         kind = mujoco.mjtJoint(model.jnt_type[joint]).name.removeprefix("mjJNT_").lower()
         pairs.append(EdgePair(named(model, mujoco.mjtObj.mjOBJ_JOINT, joint), kind, int(parent[child]), child))
     return Topology(body, node_of_body, parent, tuple(pairs))
+
+
+def weld_roots(model: mujoco.MjModel) -> np.ndarray:
+    """Root ``[nbody]`` of the group that each body is welded to; of a mocap body the world."""
+    return np.where(model.body_mocapid[model.body_weldid] >= 0, 0, model.body_weldid)
 
 
 def named(model: mujoco.MjModel, kind: mujoco.mjtObj, element: int) -> str:
