@@ -29,16 +29,15 @@ def load_physics(source: str | None, options: Mapping[str, Any] | None, robot: S
     options = plain_config(options or {})
     if source is None:
         return None
-    tree = robot if isinstance(robot, KinematicTree) else None
     if source == "scene":
-        if tree is not None:
+        if isinstance(robot, KinematicTree):
             raise ValueError("physics=scene is for simulated systems: name the robot's MJCF file, or a function.")
         return MujocoPhysics(robot, **options)
     if ":" not in source:
-        return MujocoPhysics(Path(source), tree, **options)
+        return MujocoPhysics(Path(source), robot if isinstance(robot, KinematicTree) else None, **options)
     place, name = source.rsplit(":", 1)
-    found = getattr(_module(place), name, None)
-    if not callable(found):
+    found: Any = getattr(_module(place), name, None)
+    if found is None:
         raise ValueError(f"physics={source}: there is no function or class {name!r} in {place}.")
     if isinstance(found, type):
         return as_physics(found(robot, **options))
