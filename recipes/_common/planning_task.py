@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -87,7 +88,8 @@ def bind_model(cfg: DictConfig, scene: Scene):
 
 def reward_of(cfg: DictConfig, scene: Scene) -> Reward:
     """The task's reward, by name or of terms."""
-    return make_reward(cfg.reward if isinstance(cfg.reward, str) else OmegaConf.to_container(cfg.reward), scene)
+    named = isinstance(cfg.reward, str)
+    return make_reward(cfg.reward if named else cast(Any, OmegaConf.to_container(cfg.reward)), scene)
 
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:
