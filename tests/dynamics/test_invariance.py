@@ -156,7 +156,8 @@ def test_upside_down_all_is_finite(make_model, random_states, random_actions, ex
         assert gradient.abs().max() < 1e9
         alone = state[len(TILTS) :].detach().requires_grad_()
         others = predictor.rollout(alone, action[len(TILTS) :])[0]
-        torch.testing.assert_close(others, states[len(TILTS) :])
+        # In float32, products of other sizes round otherwise.
+        assert (others - states[len(TILTS) :]).norm() < 5e-6 * others.norm()
         own = torch.autograd.grad(others.square().sum(), alone)[0]
         assert (own - gradient[len(TILTS) :]).norm() < 1e-5 * own.norm()
 

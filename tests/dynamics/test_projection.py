@@ -42,7 +42,7 @@ def gaps(scene, state):
 
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_true_changes_are_linked_already(make_model, name):
-    scene = zoo.load(name, timestep=0.002 if name == "creature" else None)
+    scene = zoo.load(name, timestep={"creature": 0.002, "crawler": 0.005}.get(name))
     trajectories = collect_trajectories(scene, 2, 20)
     state, after = trajectories["state"][:, :-1], trajectories["state"][:, 1:]
     assert max(gaps(scene, state)) < 1e-12
