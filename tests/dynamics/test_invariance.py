@@ -159,7 +159,8 @@ def test_upside_down_all_is_finite(make_model, random_states, random_actions, ex
         # In float32, products of other sizes round otherwise.
         assert (others - states[len(TILTS) :]).norm() < 5e-6 * others.norm()
         own = torch.autograd.grad(others.square().sum(), alone)[0]
-        assert (own - gradient[len(TILTS) :]).norm() < 1e-5 * own.norm()
+        most = 1e-5 if dtype == torch.float64 else 1e-3  # a ReLU's mask may flip
+        assert (own - gradient[len(TILTS) :]).norm() < most * own.norm()
 
 
 def test_the_yaw_of_a_free_root(make_model, random_states):
