@@ -114,6 +114,34 @@ def test_joint_logs_follow_mujoco_whatever_the_order_of_joints():
     torch.testing.assert_close(swapped, MujocoPhysics(scene, tree)(state, action), rtol=0, atol=1e-12)
 
 
+def test_physics_act_by_the_present_commands_of_robots_with_past_ones():
+    scene = load_scene("acrobot")
+    log = simulate_log(scene, 3, 60, 0, delay=0, time_constant=0.0, play=0.0, quantum=0.0, noise=0.0)
+    options: dict[str, Any] = {"commands": [[], [0]]}
+    totals = []
+    for history in (0, 2):
+        tree = log_tree(log, "acrobot", history=history, **options)
+        data = log_trajectories(log, 40, history=history, lag=2 - history)[0]
+        physics = MujocoPhysics(scene, tree)
+        totals.append(baseline_errors(tree, data, physics, horizons=(1, 10))["physics"]["rollout_error_10"].total)
+        predictor = ForwardModel.for_scene(tree, physics=physics, **SMALL).double().bind(tree)
+        assert predictor.step(data["state"][:, 0], data["action"][:, 0].double())[0].isfinite().all()
+        assert fit_physics(Flywheel(), tree, data, steps=1, window=3)[0] > 0
+    assert totals[1] < totals[0]  # which had commands of two steps before
+
+
+class Flywheel(torch.nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain = torch.nn.Parameter(torch.ones(()))
+
+    def forward(self, state, action):
+        assert action.shape[-1] == 1
+        joints = state[..., 1:, :]
+        moved = torch.cat((joints[..., :2], joints[..., 2:] + 0.01 * self.gain * action.unsqueeze(-1)), -1)
+        return torch.cat((state[..., :1, :], moved), -2)
+
+
 def test_robots_that_do_not_fit_the_mjcf_are_refused():
     scene = load_scene("acrobot")
     for options, message in (

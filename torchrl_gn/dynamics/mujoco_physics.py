@@ -81,13 +81,14 @@ class MujocoPhysics(Physics):
             )
         order = [scene.joint_names.index(joint) for joint in self.joints]
         motors = [[motor for motor in scene.edge_action[2 * joint].tolist() if motor >= 0] for joint in order]
-        for name, own, commands in zip(self.joints, motors, tree.commands, strict=True):
+        present = tree.present.commands
+        for name, own, commands in zip(self.joints, motors, present, strict=True):
             if len(commands) != len(own):
                 raise ValueError(
                     f"Joint {name!r} of scene {scene.name!r} has {len(own)} motors, but robot {tree.name!r} has"
                     f" {len(commands)} commands there."
                 )
-        pairs = zip(motors, tree.commands, strict=True)
+        pairs = zip(motors, present, strict=True)
         command_of = {motor: command for own, commands in pairs for motor, command in zip(own, commands, strict=True)}
         self.constants(
             {

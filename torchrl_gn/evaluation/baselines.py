@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -10,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_gn.dynamics import ConstantVelocity
+from torchrl_gn.dynamics.features.controls import present_actions
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import evaluate_errors
 from torchrl_gn.maths.state_layout import BODY_STATE, joint_layout
@@ -32,8 +34,13 @@ def baseline_errors(
     if physics is not None:
         known["physics"] = physics
     tables = {}
+    present = present_actions(scene)
     for name, function in known.items():
-        module: Any = TensorDictModule(function, ["state", "action"], [("next", "state")])
+        module: Any = TensorDictModule(partial(_step, function, present), ["state", "action"], [("next", "state")])
         module.layout, module.scene = layout, scene
         tables[name] = evaluate_errors(module, trajectories, **options)
     return tables
+
+
+def _step(function: Callable[[Tensor, Tensor], Tensor], present: int, state: Tensor, action: Tensor) -> Tensor:
+    return function(state, action[..., :present])

@@ -51,7 +51,7 @@ def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> Cano
     canonical = program.canonicalizer(state, program.parameters)
     if program.physics is None:
         return canonical
-    after = program.physics(state, action)
+    after = program.physics(state, action[..., : program.controls.present])
     if after.shape != state.shape:
         raise ValueError(f"The physics must give next states {list(state.shape)}, not {list(after.shape)}.")
     change = program.layout.delta(state, after.to(state.dtype))

@@ -14,7 +14,7 @@ from torchrl_gn.maths.state_layout import StateLayout
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import KinematicTree, Scene
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,11 @@ def controls_per_edge(scene: Scene) -> int:
     return int(scene.edge_action.shape[1])
 
 
+def present_actions(scene: Scene | KinematicTree) -> int:
+    """How many numbers of an action are of the present step: the first, before those of past steps."""
+    return getattr(scene, "present", scene).num_actions
+
+
 class ControlInputs(Float64Buffers):
     """Actions at the edges that they act on, for one scene."""
 
@@ -60,6 +65,7 @@ class ControlInputs(Float64Buffers):
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
+        self.present = present_actions(scene)
         edge_action = torch.as_tensor(scene.edge_action).long()
         values = {
             "action_low": torch.as_tensor(scene.action_low),
