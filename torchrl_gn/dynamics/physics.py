@@ -14,9 +14,9 @@ from torchrl_gn.maths.state_layout import StateLayout
 class Physics(Float64Buffers):
     """Next state of one robot as its known physics predict it (base class).
 
-    ``physics(state [*B, N, C], action [*B, A])`` gives the next state ``[*B, N, C]``, differentiable in both. The action
-    is that of the present, also where the model reads past commands. A forward model built with ``physics=`` predicts
-    what is left, in each component's own way of changing::
+    ``physics(state [*B, N, C], action [*B, A])`` gives the next state ``[*B, N, C]``, differentiable in both. The
+    action is that of the present, also where the model reads past commands. A forward model built with ``physics=``
+    predicts what is left, in each component's own way of changing::
 
         next state = state + (physics(state, action) - state) + network
 
