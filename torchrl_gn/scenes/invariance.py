@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.topology import Topology
 
 TOLERANCE = 1e-9
@@ -92,25 +93,9 @@ def actuators_of(model: mujoco.MjModel, *joints: int) -> np.ndarray:
 def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
     """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis``."""
     fixed = graph.node_of_body[model.geom_bodyid] == 0
-    for other in np.flatnonzero(fixed):
-        normal = data.geom_xmat[other].reshape(3, 3)[:, 2]
-        plane = model.geom_type[other] == mujoco.mjtGeom.mjGEOM_PLANE
-        parallel = plane and abs(normal @ axis) < TOLERANCE
-        if not parallel and any(can_collide(model, int(other), int(moving)) for moving in np.flatnonzero(~fixed)):
-            return True
-    return False
-
-
-def can_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
-    """Whether two geoms' masks, or an explicit pair, let them collide."""
-    if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
-        return False
-    pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
-    return bool(
-        model.geom_contype[first] & model.geom_conaffinity[second]
-        or model.geom_contype[second] & model.geom_conaffinity[first]
-        or any({first, second} == set(pair) for pair in pairs)
-    )
+    plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    parallel = plane & (np.abs(data.geom_xmat[:, 2::3] @ axis) < TOLERANCE)
+    return bool(colliding_geoms(model)[np.ix_(fixed & ~parallel, ~fixed)].any())
 
 
 def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -> bool:
