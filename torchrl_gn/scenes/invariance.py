@@ -5,8 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.actuator_kinds import drive_joints
 from torchrl_gn.scenes.collisions import colliding_geoms
-from torchrl_gn.scenes.topology import Topology
+from torchrl_gn.scenes.topology import Topology, offset
 
 TOLERANCE = 1e-9
 _Disable = mujoco.mjtDisableBit
@@ -58,13 +59,9 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
 
 def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
     """World orientation ``[3, 3]`` at the reference of a body below fixed bodies."""
-    rotation = np.eye(3)
-    while body:
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, model.body_quat[body])
-        rotation = matrix.reshape(3, 3) @ rotation
-        body = int(model.body_parentid[body])
-    return rotation
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, offset(model, body, 0)[1])
+    return matrix.reshape(3, 3)
 
 
 def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
@@ -86,8 +83,7 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
 
 def actuators_of(model: mujoco.MjModel, *joints: int) -> np.ndarray:
     """Actuators that drive one of the joints directly."""
-    direct = np.isin(model.actuator_trntype, (_Transmission.mjTRN_JOINT, _Transmission.mjTRN_JOINTINPARENT))
-    return np.flatnonzero(direct & np.isin(model.actuator_trnid[:, 0], joints))
+    return np.flatnonzero(drive_joints(model) & np.isin(model.actuator_trnid[:, 0], joints))
 
 
 def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
