@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ from torchrl_gn.scenes import Scene, load_scene
 from .. import zoo
 from .conftest import repelled_hinge
 
-SIZES = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
+SIZES: dict[str, Any] = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
 
 
 @pytest.fixture(autouse=True)

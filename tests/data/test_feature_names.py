@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from torchrl_gn.training import load_pretrained
 
 from ..sizes import SMALL
 
-SIZES = {"train": 10, "validation": 2, "test": 3, "steps": 6, "variants": 10}
+SIZES: dict[str, Any] = {"train": 10, "validation": 2, "test": 3, "steps": 6, "variants": 10}
 pytestmark = pytest.mark.filterwarnings("error::torchrl_gn.scenes.SceneChangedWarning")
 
 

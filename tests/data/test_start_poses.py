@@ -143,7 +143,8 @@ def test_equality_constraints_hold(jacobian: str) -> None:
 
 def test_what_touches_nothing_turns_in_place() -> None:
     body = '<body pos="1 2 3"><freejoint/><geom size=".1" type="box" {}/></body>'
-    for rest in ('<option gravity="0 0 0"/>', '<option><flag contact="disable"/></option>', ""):
+    flags = ('contact="disable"', 'constraint="disable"', 'gravity="disable"')
+    for rest in ('<option gravity="0 0 0"/>', *(f"<option><flag {flag}/></option>" for flag in flags), ""):
         geom = "" if rest else 'contype="0" conaffinity="0"'
         world = f'<worldbody><geom type="plane" size="1 1 1"/>{body.format(geom)}</worldbody>'
         qpos = _qpos(load_scene(f"<mujoco>{rest}{world}</mujoco>".replace('size=".1"', 'size=".1 .1 .1"')), 400)

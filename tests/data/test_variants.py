@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from torchrl_gn.scenes import PhysicalParameters, Scene, load_scene, make_varian
 from .. import zoo
 
 SYSTEMS = ["pendulum", "cartpole", "swimmer3", "swimmer6", "cheetah", "jaco"]
-SIZES = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
+SIZES: dict[str, Any] = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
 SPLITS = ("train", "validation", "test")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -149,7 +149,11 @@ def test_robots_that_do_not_fit_the_mjcf_are_refused():
         ({"commands": ((0,), (1,))}, "has 0 motors"),
         ({"joint_names": ("a",), "commands": ((),)}, "give joints="),
     ):
-        given = {"joint_names": ("a", "b"), "timestep": scene.timestep, "commands": ((), (0,))} | options
+        given: dict[str, Any] = {
+            "joint_names": ("a", "b"),
+            "timestep": scene.timestep,
+            "commands": ((), (0,)),
+        } | options
         with pytest.raises(ValueError, match=message):
             MujocoPhysics(scene, KinematicTree("robot", **given))
     with pytest.raises(ValueError, match="scale='weight' is not known"):
@@ -180,7 +184,7 @@ def test_executors_agree_forward_and_gradient(core):
                 each[..., 1:, :] if each.ndim == 3 and each.shape[-1] == 3 else each for each in (found, expected)
             )
             torch.testing.assert_close(found, expected, rtol=2e-4, atol=2e-4)
-    native = specialize(bound).executor()
+    native = cast(Any, specialize(bound).executor())
     assert (native.reason is None) == (core == "gn")
 
 
@@ -190,7 +194,7 @@ def test_what_is_predicted_is_the_correction():
     program, state, action = loss.model.program(), data["state"][:, 4], data["action"][:, 4]
     canonical = eager.canonical_state(program, state, action)
     expected = model.layout.delta(state, Pendulum()(state, action))
-    assert torch.equal(canonical.change, expected)
+    assert canonical.change is not None and torch.equal(canonical.change, expected)
     none = torch.zeros(len(state), 2, 2)
     mean = model.residual_normalizer.mean
     change = eager.change(program, state, canonical, none)

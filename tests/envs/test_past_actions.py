@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
@@ -20,7 +22,7 @@ HISTORY, ACTIONS = 3, 1
 def model(request) -> tuple[Predictor, torch.Tensor, torch.Tensor]:
     """A model of a double pendulum with one motor, and logged states and actions."""
     log = simulate_log(load_scene("acrobot"), 3, 60, 0)
-    tree = log_tree(log, "double", commands=[[0], []], history=HISTORY)
+    tree = cast(Any, log_tree(log, "double", commands=[[0], []], history=HISTORY))
     data, _ = log_trajectories(log, 20, history=HISTORY)
     torch.manual_seed(0)
     core = {"core": "recurrent", "hidden_state": [4, 4, 4]} if request.param == "recurrent" else {}
@@ -86,4 +88,4 @@ def test_a_planner_hands_past_actions_on(model, specialized):
     for step in range(1, 6):
         assert torch.equal(past[step, : min(step, HISTORY)], executed["action"][:step, 0].flip(0)[:HISTORY])
     primer = planner.make_tensordict_primer()
-    assert "past_actions" in primer.primers.keys()
+    assert primer.primers is not None and "past_actions" in primer.primers.keys()

@@ -11,7 +11,8 @@ import torch
 from omegaconf import OmegaConf
 
 from torchrl_gn.data import log_trajectories, log_tree, simulate_log
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.dynamics import MujocoPhysics
+from torchrl_gn.scenes import KinematicTree, load_scene
 from torchrl_gn.training import load_pretrained
 
 SMALL = (
@@ -84,7 +85,7 @@ def test_delay_and_filter_follow_the_measurements(pendulum, call, tmp_path):
     assert code == 0, errors
     assert "Hz, a row every" in output and "delay (rows)" in output
     tree = load_pretrained(run / "feed-forward").scene()
-    assert tree.commands == ((0, 1, 2), ()) and tree.history == 2
+    assert isinstance(tree, KinematicTree) and tree.commands == ((0, 1, 2), ()) and tree.history == 2
 
 
 @pytest.mark.parametrize(
@@ -190,7 +191,8 @@ def test_what_names_no_physics_is_refused(tmp_path):
     file.write_text(COASTING)
     assert load_physics(None, None, robot) is None
     state = torch.ones(3)
-    assert load_physics(f"{file}:still", None, robot)(state, state) is state
+    still = load_physics(f"{file}:still", None, robot)
+    assert still is not None and still(state, state) is state
     for source, options, message in (
         (f"{file}:moving", None, "no function or class 'moving'"),
         (f"{file}:still", {"damping": 1.0}, "takes no physics_options"),
@@ -198,7 +200,8 @@ def test_what_names_no_physics_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             load_physics(source, options, robot)
-    assert load_physics("scene", {"scale": {"mass": 2.0}}, robot).scale == {"mass": 2.0}
+    heavy = load_physics("scene", {"scale": {"mass": 2.0}}, robot)
+    assert isinstance(heavy, MujocoPhysics) and heavy.scale == {"mass": 2.0}
 
 
 def test_the_mirror_image_of_a_pendulum_is_a_pendulum():
@@ -208,9 +211,9 @@ def test_the_mirror_image_of_a_pendulum_is_a_pendulum():
     data, tree = log_trajectories(log, 10)[0], log_tree(log, "acrobot", commands=[[], [0]])
     both_ways, both = mirrored(tree, data)
     assert (both_ways.action_low == -both_ways.action_high).all() and both_ways.action_high[0] >= tree.action_high[0]
-    image = both[len(data) :]
     angles = [torch.atan2(s[..., 1:, 1], s[..., 1:, 0]) for s in both["state"].chunk(2)]
     torch.testing.assert_close(angles[1], -angles[0])
-    assert torch.equal(image["action"], -data["action"]) and torch.equal(both[: len(data)]["state"], data["state"])
+    assert torch.equal(both["action"][len(data) :], -data["action"])
+    assert torch.equal(both["state"][: len(data)], data["state"])
     with pytest.raises(ValueError, match="not the channels"):
         mirrored(log_tree(dataclasses.replace(log, extra={"torque": log.angle}), "acrobot", commands=[[], [0]]), data)

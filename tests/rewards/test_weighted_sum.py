@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 import pytest
 import torch
@@ -27,7 +29,8 @@ def test_rewards_add_and_scale(swimmer):
     torch.testing.assert_close(values(-total, swimmer), -expected)
     assert isinstance(total, WeightedSum) and len(total.terms) == 3
     assert repr(total).count("Velocity") == 2
-    for wrong in (lambda: forward + 1, lambda: forward * "2", lambda: forward - None):
+    plain = cast(Any, forward)
+    for wrong in (lambda: plain + 1, lambda: plain * "2", lambda: plain - None):
         with pytest.raises(TypeError):
             wrong()
 
@@ -41,7 +44,7 @@ def test_one_of_them_may_need_a_target(swimmer):
     expected = values(reach, swimmer, task) + 0.1 * values(effort, swimmer)
     torch.testing.assert_close(values(total, swimmer, task), expected)
     with pytest.raises(ValueError, match="one at most needs a target"):
-        reach + Distance(swimmer.scene, "head")
+        _ = reach + Distance(swimmer.scene, "head")
     with pytest.raises(ValueError, match="needs no target"):
         (effort + effort).task_of(swimmer.state, target)
 

@@ -221,6 +221,13 @@ def test_a_motor_reaches_its_force_limit_at_its_bounds():
     assert (scene.action_low[0], scene.action_high[0]) == (-3, 0.5)
 
 
+def test_a_servo_holds_its_joint_at_both_ends_of_its_range_at_its_bounds():
+    scene = load_scene("""<mujoco><compiler angle="radian"/><worldbody><body>
+      <joint name="a" range="-.5 1"/><geom size=".1"/></body></worldbody><actuator>
+      <general joint="a" gear="2" gainprm="4" biastype="affine" biasprm="1 -2 0"/></actuator></mujoco>""")
+    assert (scene.action_low.tolist(), scene.action_high.tolist()) == ([-0.75], [0.75])
+
+
 @pytest.mark.parametrize("bounds", [(-2, 3), {"free": [-2, 3]}, {"free": (-2, 3), "turn": (-0.5, 0.25)}])
 def test_action_bounds_are_part_of_the_description(bounds):
     text = zoo.mjcf("machine")

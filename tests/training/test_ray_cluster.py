@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -32,7 +33,8 @@ def test_results_come_in_order(cluster):
 
 
 def test_a_data_set_is_the_same(cluster, tmp_path):
-    scene, sizes = load_scene("pendulum"), {"train": 600, "validation": 1, "test": 1, "steps": 3}
+    scene = load_scene("pendulum")
+    sizes: dict[str, Any] = {"train": 600, "validation": 1, "test": 1, "steps": 3}
     spread = create_dataset(tmp_path / "spread", scene, **sizes, map_chunks=cluster.imap, num_threads=1)
     here = create_dataset(tmp_path / "here", scene, **sizes)
     assert spread.manifest["chunks"] == here.manifest["chunks"]  # checksums and all

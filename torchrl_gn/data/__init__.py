@@ -16,7 +16,6 @@ from torchrl_gn.data.logs import load_robot_log as load_robot_log
 from torchrl_gn.data.logs import log_trajectories as log_trajectories
 from torchrl_gn.data.logs import log_tree as log_tree
 from torchrl_gn.data.logs import simulate_log as simulate_log
-from torchrl_gn.data.random_controls import actuator_kind as actuator_kind
 from torchrl_gn.data.random_controls import random_controls as random_controls
 from torchrl_gn.data.replay import TrajectoryStorage as TrajectoryStorage
 from torchrl_gn.data.replay import WindowSampler as WindowSampler
@@ -26,3 +25,4 @@ from torchrl_gn.data.simulate import UnstableSimulationError as UnstableSimulati
 from torchrl_gn.data.start_poses import StartPoses as StartPoses
 from torchrl_gn.data.start_poses import StartPoseWarning as StartPoseWarning
 from torchrl_gn.data.start_states import sample_start_states as sample_start_states
+from torchrl_gn.scenes.actuator_kinds import actuator_kind as actuator_kind

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.topology import weld_roots
+
 _FAR = 1e3  # metres at which a plane is still looked for
 
 
@@ -21,13 +23,13 @@ class Base:
 
 def find_bases(model: mujoco.MjModel, touching: np.ndarray) -> list[Base]:
     """Bodies with a free joint, or with an unlimited vertical slide on the world, above planes that they can touch."""
-    kind, bases = mujoco.mjtJoint, []
+    kind, bases, roots = mujoco.mjtJoint, [], weld_roots(model)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     planes = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (data.geom_xmat[:, 8] > 0.5))
     for joint in range(model.njnt):
         body, up = model.jnt_bodyid[joint], 1.0
-        if model.body_weldid[model.body_parentid[body]] != 0:
+        if roots[model.body_parentid[body]] != 0:
             continue
         height = int(model.jnt_qposadr[joint])
         if model.jnt_type[joint] == kind.mjJNT_FREE:
@@ -58,12 +60,3 @@ def clearance(model: mujoco.MjModel, data: mujoco.MjData, base: Base) -> float:
             if distance < _FAR:
                 least = min(least, distance / normal[2])
     return least
-
-
-def may_touch(model: mujoco.MjModel) -> np.ndarray:
-    """Pairs of geoms ``[G, G]`` bool whose contacts are not filtered out by their bits."""
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-        return np.zeros((model.ngeom, model.ngeom), dtype=bool)
-    touching = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
-    touching[model.pair_geom1, model.pair_geom2] = True
-    return touching | touching.T

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import mujoco
 import numpy as np
@@ -11,26 +10,13 @@ import numpy as np
 from torchrl_gn.data.controls import check_knot_interval, evaluate_cubics, spline_controls
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_poses import reference_keyframe
+from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints, holding_controls
 from torchrl_gn.scenes.control_bounds import require_bounds
 
-ActuatorKind = Literal["motor", "position", "velocity"]
-
-_JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # of targets, rad/s or m/s
 _SCALES = (0.2, 1.0)  # of motors, velocity targets and the speed of position targets, by sequence
 _LEAST_WIDTH = 0.05  # of the interval of position targets, as a share of the bounds
 _LATEST_REVERSAL = 4.0  # time between reversals of velocity targets, in knot intervals
-
-
-def actuator_kind(model: mujoco.MjModel, actuator: int) -> ActuatorKind:
-    """Whether an actuator follows position targets, velocity targets, or neither."""
-    gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
-    fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0
-    if not fixed or model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE:
-        return "motor"
-    if bias[1] != 0:
-        return "position"
-    return "velocity" if math.isclose(bias[2], -gain, rel_tol=1e-6) else "motor"
 
 
 def random_controls(
@@ -78,7 +64,7 @@ def random_controls(
         controls[..., reversing] = scale * _velocity_targets(*ends, n, steps, knot_interval, rng)
     if (servos := kinds == "position").any():
         variant = np.arange(n) % len(simulator.scenes) if variant is None else variant
-        start = _holding_targets(simulator, physics, variant)[:, servos]
+        start = _holding_targets(simulator, physics, variant, np.flatnonzero(servos))
         fastest = (scale[:, 0] * _fastest_targets(model) * scene.timestep)[:, servos]
         controls[..., servos] = _position_targets(start, low[servos], high[servos], fastest, steps, knot_interval, rng)
     return controls
@@ -133,24 +119,22 @@ def _peak_slope(coefficients: np.ndarray) -> np.ndarray:
 
 def _fastest_targets(model: mujoco.MjModel) -> np.ndarray:
     """Fastest change ``[A]`` of position targets, in the controls' units a second."""
-    fastest = np.ptp(model.actuator_ctrlrange, axis=1)
+    fastest, at_joints = np.ptp(model.actuator_ctrlrange, axis=1), drive_joints(model)
     for actuator in range(model.nu):
         joint, slope = model.actuator_trnid[actuator, 0], model.actuator_biasprm[actuator, 1]
-        by_joint = model.actuator_trntype[actuator] in _JOINT_TRANSMISSIONS
-        if slope and by_joint and (speed := _SPEEDS.get(int(model.jnt_type[joint]))):
+        if slope and at_joints[actuator] and (speed := _SPEEDS.get(int(model.jnt_type[joint]))):
             a_unit = abs(model.actuator_gear[actuator, 0] * slope / model.actuator_gainprm[actuator, 0])
             fastest[actuator] = min(fastest[actuator], speed * a_unit)
     return fastest
 
 
-def _holding_targets(simulator: Simulator, physics: np.ndarray, variant: np.ndarray) -> np.ndarray:
-    """Controls ``[n, A]`` at which position servos exert no force on states ``[n, S]`` at rest."""
-    data, targets = mujoco.MjData(simulator.scene.model), np.zeros((len(physics), simulator.scene.num_actions))
+def _holding_targets(simulator: Simulator, physics: np.ndarray, variant: np.ndarray, servos: np.ndarray) -> np.ndarray:
+    """Controls ``[n, servos]`` at which position servos exert no force on states ``[n, S]`` at rest."""
+    data, targets = mujoco.MjData(simulator.scene.model), np.zeros((len(physics), len(servos)))
     for row, state in enumerate(physics):
         model = simulator.scenes[variant[row]].model
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         for stage in ("kinematics", "comPos", "tendon", "transmission"):
             getattr(mujoco, f"mj_{stage}")(model, data)
-        gain = np.where(model.actuator_gainprm[:, 0] == 0, 1.0, model.actuator_gainprm[:, 0])
-        targets[row] = -(model.actuator_biasprm[:, 0] + model.actuator_biasprm[:, 1] * data.actuator_length) / gain
+        targets[row] = holding_controls(model, servos, data.actuator_length[servos])
     return targets

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.processor import usable_cores
+from torchrl_gn.scenes.messages import quiet_mujoco
 from torchrl_gn.scenes.scene import Scene
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
@@ -157,7 +157,7 @@ class Simulator:
         if zero.any():
             start = start.copy()
             start[zero, 0] = 1.0
-        with _quiet():
+        with quiet_mujoco():
             after, sensors = self._pool.rollout(
                 [self.scenes[i].model for i in which] if len(self.scenes) > 1 else self.scene.model,
                 self._data,
@@ -230,16 +230,3 @@ def _check_topology(scenes: tuple[Scene, ...]) -> None:
                     f"Scenes simulated together must have equal topology, but {what} of scene 0 ({first.name!r})"
                     f" is {ours} and of scene {i} ({scene.name!r}) {theirs}."
                 )
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep MuJoCo from printing warnings and writing MUJOCO_LOG.TXT, unless the user has a handler."""
-    if mujoco.get_mju_user_warning() is not None:
-        yield
-        return
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(None)

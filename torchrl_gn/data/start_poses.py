@@ -7,8 +7,10 @@ import warnings
 import mujoco
 import numpy as np
 
-from torchrl_gn.data.clearance import clearance, find_bases, may_touch
+from torchrl_gn.data.clearance import clearance, find_bases
+from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.topology import named, weld_roots
 
 _WIDE_SHARE = 0.5  # share of the starts that may be anywhere within the joint limits
 _NEAR = 0.3  # largest perturbation of the others, as a share of that
@@ -46,7 +48,7 @@ class StartPoses:
         limited = (self.model.jnt_limited != 0) & (self.model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
         self._limited = (self.model.jnt_qposadr[limited], *self.model.jnt_range[limited].T)
         self._load_reference()
-        self._touching = may_touch(self.model)
+        self._touching = colliding_geoms(self.model)
         self._bases = find_bases(self.model, self._touching)
         self._equality_error = _EQUALITY_ERROR
         self._equality_error = max(_EQUALITY_ERROR, self._hold_equalities())
@@ -139,8 +141,9 @@ class StartPoses:
         change, vertical = np.zeros((n, 6)), np.zeros((n, 3))
         here = self._reference[first + 3 : first + 7]
         carried = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
-        fixed = model.body_weldid[model.geom_bodyid] == 0
-        if not (model.opt.gravity.any() and self._touching[np.ix_(carried, fixed)].any()):
+        fixed = weld_roots(model)[model.geom_bodyid] == 0
+        falls = model.opt.gravity.any() and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        if not (falls and self._touching[np.ix_(carried, fixed)].any()):
             change[:, 3:] = spread * _rotation_between(here, _ball(rng, n, None))
             return change
         geoms = np.flatnonzero(model.geom_bodyid == body)
@@ -251,5 +254,5 @@ def _geom(model: mujoco.MjModel, geom: int) -> str:
     if geom < 0:
         return "a flex"
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
-    body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom]))
+    body = named(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom]))
     return f"geom {name!r}" if name else f"a geom of body {body!r}"

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -19,6 +18,7 @@ from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.physics import Physics
 from torchrl_gn.processor import usable_cores
 from torchrl_gn.scenes import KinematicTree, Scene, UnsupportedSceneError, load_scene, scene_from_description
+from torchrl_gn.scenes.messages import quiet_mujoco
 
 _GROUPS = {
     "mass": ("body_mass", "body_inertia"),
@@ -131,7 +131,7 @@ class MujocoPhysics(Physics):
             part = slice(first, first + rows)
             held = np.repeat(action[part, None], steps, axis=1) if model.nu else None
             pool = self._simulation()
-            with _quiet():
+            with quiet_mujoco():
                 after, sensors = pool.rollout(model, self._data, start[part], held, nstep=steps)
             # MuJoCo resets an unstable simulation, and its time.
             finite[part] &= after[:, -1, 0] > 1 + (steps - 0.5) * timestep
@@ -194,19 +194,6 @@ class _Advance(torch.autograd.Function):
         found = np.einsum("knm,nm->nk", ahead - behind, gradient.reshape(len(flat), -1).cpu().numpy())
         parts = torch.from_numpy(found / (2 * _DIFFERENCE)).to(gradient.device).split(sizes, dim=-1)
         return None, *(part.view_as(each) for part, each in zip(parts, inputs, strict=True))
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep MuJoCo from printing warnings of unstable simulations, unless the user has a handler."""
-    own = mujoco.get_mju_user_warning() is None
-    if own:
-        mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        if own:
-            mujoco.set_mju_user_warning(None)
 
 
 def _scaled(scene: Scene, scale: Mapping[str, float]) -> Scene:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from numbers import Integral
 from typing import Any, cast
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
@@ -57,8 +56,11 @@ def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int
         raise ValueError(f"{env} has no reward to plan for; give it one, as make_reward(task, scene).")
     if scene.num_actions == 0:
         raise ValueError(f"Scene {scene.name!r} has no actions to plan.")
-    if not (np.isfinite(scene.action_low) & np.isfinite(scene.action_high)).all():
-        raise ValueError(f"Scene {scene.name!r} has actions without bounds; give its motors a ctrlrange.")
+    if scene.unbounded:
+        raise ValueError(
+            f"Scene {scene.name!r} has actions without bounds, {list(scene.unbounded)}: give their actuators a"
+            " ctrlrange, or load it with action_bounds={name: (low, high)}."
+        )
     if (scene.action_low > scene.action_high).any():
         worst = int((scene.action_low - scene.action_high).argmax())
         raise ValueError(

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.contact_points import SHAPES
 from torchrl_gn.scenes.contact_shapes import Candidate, RoundedBox, candidates, rounded_box
-from torchrl_gn.scenes.invariance import can_collide
-from torchrl_gn.scenes.topology import weld_roots
+from torchrl_gn.scenes.topology import named, weld_roots
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
@@ -24,7 +24,7 @@ _MARGIN = 0.05  # metres: geoms that come so near can meet
 _CONFIGURATIONS = 400
 _ENOUGH = 100  # configurations in which geoms are near are counted up to this
 _RARE = 0.15  # corners of a geom are left out if each is near less often, of the times that the geom is
-_GEOM, _JOINT, _DISABLE = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtDisableBit
+_GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
     for first, second in pairs.tolist():
         axes = _planar_axes(scene, data, int(node_of_geom[first]), int(node_of_geom[second]))
         found[first, second] = candidates(_known(boxes[first]), _known(boxes[second]), axes)
-    seen = _count_near(scene, pairs, found)
+    seen = _count_near(scene, node_of_geom, pairs, found)
     of_nodes: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
     often: dict[tuple[int, int], int] = {}
     for geoms, (near, counts) in seen.items():
@@ -87,7 +87,7 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
     lists = [each[:MOST_CANDIDATES] for each in lists]
     fit = int((np.cumsum([len(each) for each in lists]) <= MOST_OF_ALL).sum())
     chosen = sorted(zip(ranked[:fit], lists[:fit], strict=True), key=lambda each: -len(each[1]))
-    names = tuple(_name(model, geom) for geom in sorted(ignored))
+    names = tuple(named(model, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in sorted(ignored))
     return _arrays([nodes for nodes, _ in chosen], [each for _, each in chosen], len(of_nodes) - fit, names)
 
 
@@ -124,31 +124,10 @@ def _known(box: RoundedBox | None) -> RoundedBox:
     return box
 
 
-def _name(model: mujoco.MjModel, geom: int) -> str:
-    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"geom{geom}"
-
-
 def _colliding(scene: Scene, node_of_geom: np.ndarray) -> list[tuple[int, int]]:
     """Pairs of geoms on different nodes that MuJoCo lets collide, without those that contact points show."""
-    model, weld = scene.model, scene.model.body_weldid[scene.model.geom_bodyid]
-    above = np.where(weld > 0, model.body_weldid[model.body_parentid[weld]], -1)  # the welded body that it hangs on
-    explicit = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
-    excluded = set(model.exclude_signature.tolist())
-    family = not model.opt.disableflags & _DISABLE.mjDSBL_FILTERPARENT
-    found = []
-    for second in range(model.ngeom):
-        for first in range(second):
-            bodies = sorted((int(model.geom_bodyid[first]), int(model.geom_bodyid[second])))
-            if node_of_geom[first] == node_of_geom[second] or _shown(scene, first, second):
-                continue
-            if not can_collide(model, first, second):
-                continue
-            if frozenset((first, second)) not in explicit:
-                related = above[first] == weld[second] > 0 or above[second] == weld[first] > 0
-                if (family and related) or (bodies[0] << 16) + bodies[1] in excluded:
-                    continue
-            found.append((first, second))
-    return found
+    pairs = ((first, second) for second, first in np.argwhere(np.tril(colliding_geoms(scene.model))).tolist())
+    return [pair for pair in pairs if node_of_geom[pair[0]] != node_of_geom[pair[1]] and not _shown(scene, *pair)]
 
 
 def _shown(scene: Scene, first: int, second: int) -> bool:
@@ -171,13 +150,12 @@ def _planar_axes(scene: Scene, data: mujoco.MjData, *nodes: int) -> tuple[np.nda
 
 
 def _count_near(
-    scene: Scene, pairs: np.ndarray, found: dict[tuple[int, int], list[Candidate]]
+    scene: Scene, nodes: np.ndarray, pairs: np.ndarray, found: dict[tuple[int, int], list[Candidate]]
 ) -> dict[tuple[int, int], tuple[int, np.ndarray]]:
     """How often two geoms, and each of their candidates, are near, of those that ever are."""
     model, data = scene.model, mujoco.MjData(scene.model)
     seen: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
     reach = np.where(model.geom_type == _GEOM.mjGEOM_PLANE, np.inf, model.geom_rbound)
-    nodes = np.searchsorted(scene.body, weld_roots(model))[model.geom_bodyid]
     counts = np.zeros(len(pairs), dtype=np.int64)
     for _ in _configurations(model, data) if len(pairs) else ():
         away = np.linalg.norm(data.geom_xpos[pairs[:, 0]] - data.geom_xpos[pairs[:, 1]], axis=1)
@@ -237,10 +215,11 @@ def _random_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Ge
 def _floating(model: mujoco.MjModel) -> dict[int, list[int]]:
     """Bodies below the world's with a free joint or slides without limits, and these joints."""
     found: dict[int, list[int]] = {}
+    roots = weld_roots(model)
     for joint in range(model.njnt):
         body, kind = int(model.jnt_bodyid[joint]), model.jnt_type[joint]
         free = kind == _JOINT.mjJNT_FREE or (kind == _JOINT.mjJNT_SLIDE and not model.jnt_limited[joint])
-        if free and model.body_weldid[model.body_parentid[body]] == 0:
+        if free and roots[model.body_parentid[body]] == 0:
             found.setdefault(body, []).append(joint)
     return found
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.invariance import can_collide
+from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.topology import Topology
 
 if TYPE_CHECKING:
@@ -42,12 +42,10 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
     Takes spheres, ends of capsules, corners of boxes and ends of ellipsoid axes; cylinders and meshes give no points.
     ``data`` must be at its reference, kinematics done.
     """
-    of_geom = graph.node_of_body[model.geom_bodyid]
+    of_geom, colliding = graph.node_of_body[model.geom_bodyid], colliding_geoms(model)
     for plane in np.flatnonzero((model.geom_type == _GEOM.mjGEOM_PLANE) & (of_geom == 0)):
         spheres = []
-        for geom in np.flatnonzero(of_geom > 0):
-            if not can_collide(model, int(plane), int(geom)):
-                continue
+        for geom in np.flatnonzero((of_geom > 0) & colliding[plane]):
             node = int(of_geom[geom])
             root = graph.body[node]
             rotation, frame = data.geom_xmat[geom].reshape(3, 3), data.xmat[root].reshape(3, 3)

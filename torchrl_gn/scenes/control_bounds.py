@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints, holding_controls
 from torchrl_gn.scenes.scene import Scene, SceneError
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes.kinematic_tree import KinematicTree
 
-_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 ActionBounds = Mapping[str, Sequence[float]] | Sequence[float]
@@ -47,12 +47,10 @@ def set_control_bounds(
 
 def require_bounds(scene: Scene | KinematicTree) -> None:
     """SceneError, which names them, if some actions have no bounds to draw from."""
-    names = getattr(scene, "actuator_names", [f"command {index}" for index in range(scene.num_actions)])
-    bounded = np.isfinite(scene.action_low) & np.isfinite(scene.action_high)
-    if unbounded := [name for name, known in zip(names, bounded, strict=True) if not known]:
+    if scene.unbounded:
         raise SceneError(
-            f"Actions {unbounded} of scene {scene.name!r} have no bounds to draw from. Give their actuators a"
-            " ctrlrange, or load the scene with action_bounds={name: (low, high)}."
+            f"Actions {list(scene.unbounded)} of scene {scene.name!r} have no bounds to draw from. Give their actuators"
+            " a ctrlrange, or load the scene with action_bounds={name: (low, high)}."
         )
 
 
@@ -71,18 +69,17 @@ def _checked(pair: Sequence[float], of: str) -> tuple[float, float]:
 
 def _implied(model: mujoco.MjModel, actuator: int) -> tuple[float, float] | None:
     """Bounds that follow from the limit of a motor's force, or of a position servo's joint."""
-    gain, bias = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator]
-    kind, joint = model.actuator_biastype[actuator], int(model.actuator_trnid[actuator, 0])
-    if model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED or gain == 0:
-        return None
-    if kind == mujoco.mjtBias.mjBIAS_NONE and model.actuator_forcelimited[actuator]:
-        ends = model.actuator_forcerange[actuator] / gain
+    gain, joint = float(model.actuator_gainprm[actuator, 0]), int(model.actuator_trnid[actuator, 0])
+    if actuator_kind(model, actuator) == "position":
+        if not (drive_joints(model)[actuator] and model.jnt_limited[joint] and model.jnt_type[joint] in _SCALAR):
+            return None
+        ends = holding_controls(model, actuator, model.jnt_range[joint] * model.actuator_gear[actuator, 0])
     elif (
-        (kind == mujoco.mjtBias.mjBIAS_AFFINE and bias[0] == 0 and bias[1] == -gain)
-        and model.actuator_trntype[actuator] in _JOINTS
-        and (model.jnt_limited[joint] and model.jnt_type[joint] in _SCALAR)
+        (model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0)
+        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+        and model.actuator_forcelimited[actuator]
     ):
-        ends = model.jnt_range[joint] * model.actuator_gear[actuator, 0]
+        ends = model.actuator_forcerange[actuator] / gain
     else:
         return None
     low, high = sorted(map(float, ends))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.topology import Topology
+from torchrl_gn.scenes.actuator_kinds import drive_joints
+from torchrl_gn.scenes.collisions import colliding_geoms
+from torchrl_gn.scenes.topology import Topology, offset
 
 TOLERANCE = 1e-9
 _Disable = mujoco.mjtDisableBit
@@ -57,13 +59,9 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
 
 def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
     """World orientation ``[3, 3]`` at the reference of a body below fixed bodies."""
-    rotation = np.eye(3)
-    while body:
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, model.body_quat[body])
-        rotation = matrix.reshape(3, 3) @ rotation
-        body = int(model.body_parentid[body])
-    return rotation
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, offset(model, body, 0)[1])
+    return matrix.reshape(3, 3)
 
 
 def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
@@ -85,32 +83,15 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
 
 def actuators_of(model: mujoco.MjModel, *joints: int) -> np.ndarray:
     """Actuators that drive one of the joints directly."""
-    direct = np.isin(model.actuator_trntype, (_Transmission.mjTRN_JOINT, _Transmission.mjTRN_JOINTINPARENT))
-    return np.flatnonzero(direct & np.isin(model.actuator_trnid[:, 0], joints))
+    return np.flatnonzero(drive_joints(model) & np.isin(model.actuator_trnid[:, 0], joints))
 
 
 def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
     """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis``."""
     fixed = graph.node_of_body[model.geom_bodyid] == 0
-    for other in np.flatnonzero(fixed):
-        normal = data.geom_xmat[other].reshape(3, 3)[:, 2]
-        plane = model.geom_type[other] == mujoco.mjtGeom.mjGEOM_PLANE
-        parallel = plane and abs(normal @ axis) < TOLERANCE
-        if not parallel and any(can_collide(model, int(other), int(moving)) for moving in np.flatnonzero(~fixed)):
-            return True
-    return False
-
-
-def can_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
-    """Whether two geoms' masks, or an explicit pair, let them collide."""
-    if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
-        return False
-    pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
-    return bool(
-        model.geom_contype[first] & model.geom_conaffinity[second]
-        or model.geom_contype[second] & model.geom_conaffinity[first]
-        or any({first, second} == set(pair) for pair in pairs)
-    )
+    plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    parallel = plane & (np.abs(data.geom_xmat[:, 2::3] @ axis) < TOLERANCE)
+    return bool(colliding_geoms(model)[np.ix_(fixed & ~parallel, ~fixed)].any())
 
 
 def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -> bool:

@@ -38,6 +38,7 @@ class KinematicTree:
 
     yaw_frame = None
     contact_points = None
+    contact_pairs = None
 
     def __post_init__(self) -> None:
         settle = partial(object.__setattr__, self)
@@ -88,6 +89,12 @@ class KinematicTree:
     @property
     def num_actions(self) -> int:
         return 1 + max((index for indices in self.commands for index in indices), default=-1)
+
+    @property
+    def unbounded(self) -> tuple[str, ...]:
+        """Commands that have no bounds."""
+        bounded = np.isfinite(self.action_low) & np.isfinite(self.action_high)
+        return tuple(f"command {index}" for index in np.flatnonzero(~bounded))
 
     @property
     def present(self) -> KinematicTree:

@@ -21,6 +21,7 @@ import re
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.actuator_kinds import drive_joints
 from torchrl_gn.scenes.scene import StaticGraph
 from torchrl_gn.scenes.topology import Topology, offset
 from torchrl_gn.scenes.transmissions import Transmissions, anchors
@@ -172,12 +173,14 @@ def _actuator_columns(model: mujoco.MjModel) -> Columns:
         *("biasprm", "cranklength", "ctrllimited", "ctrlrange", "dynprm", "forcelimited", "forcerange"),
         *("gainprm", "gear", "acc0", "length0", "lengthrange"),
     )
-    joint = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
-    others = not np.isin(model.actuator_trntype, list(map(int, joint))).all()
     return [
         *_one_hot("actuator_biastype", model.actuator_biastype, mujoco.mjtBias, "mjBIAS_"),
         *_one_hot("actuator_dyntype", model.actuator_dyntype, mujoco.mjtDyn, "mjDYN_"),
         *_one_hot("actuator_gaintype", model.actuator_gaintype, mujoco.mjtGain, "mjGAIN_"),
         *[(f"actuator_{name}", getattr(model, f"actuator_{name}")) for name in vectors],
-        *(_one_hot("actuator_trntype", model.actuator_trntype, mujoco.mjtTrn, "mjTRN_") if others else ()),
+        *(
+            _one_hot("actuator_trntype", model.actuator_trntype, mujoco.mjtTrn, "mjTRN_")
+            if not drive_joints(model).all()
+            else ()
+        ),
     ]

@@ -140,14 +140,22 @@ def _pair_between(pairs: list[EdgePair], nodes: tuple[int, int]) -> int:
 
 def _wrench(model: mujoco.MjModel, graph: Topology, site: int, gear: np.ndarray) -> np.ndarray:
     """Force and torque ``[6]`` about the origin of a site's node, in its frame, of a gear in the site's frame."""
-    body = int(model.site_bodyid[site])
-    pos, quat = offset(model, body, int(graph.body[graph.node_of_body[body]]))
-    point, orientation, force, torque = np.empty(3), np.empty(4), np.empty(3), np.empty(3)
-    mujoco.mju_rotVecQuat(point, model.site_pos[site], quat)
+    _, point, quat = _in_node(model, graph, int(model.site_bodyid[site]), model.site_pos[site])
+    orientation, force, torque = np.empty(4), np.empty(3), np.empty(3)
     mujoco.mju_mulQuat(orientation, quat, model.site_quat[site])
     mujoco.mju_rotVecQuat(force, gear[:3], orientation)
     mujoco.mju_rotVecQuat(torque, gear[3:], orientation)
-    return np.concatenate((force, torque + np.cross(pos + point, force)))
+    return np.concatenate((force, torque + np.cross(point, force)))
+
+
+def _in_node(
+    model: mujoco.MjModel, graph: Topology, body: int, point: np.ndarray
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """Node of a body, a point ``[3]`` of the body in the node's frame, and the body's quaternion ``[4]`` there."""
+    node, rotated = int(graph.node_of_body[body]), np.empty(3)
+    pos, quat = offset(model, body, int(graph.body[node]))
+    mujoco.mju_rotVecQuat(rotated, point, quat)
+    return node, pos + rotated, quat
 
 
 def _constraints(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, EdgePair]]:
@@ -175,11 +183,7 @@ def anchors(model: mujoco.MjModel, graph: Topology, equality: int) -> list[tuple
         else:
             # A weld has one anchor, in the second body, and the second body's position in the first.
             body, point = at, data[3 * (end == (0 if weld else 1)) :][:3]
-        node = int(graph.node_of_body[body])
-        pos, quat = offset(model, body, int(graph.body[node]))
-        rotated = np.empty(3)
-        mujoco.mju_rotVecQuat(rotated, point, quat)
-        found.append((node, pos + rotated))
+        found.append(_in_node(model, graph, body, point)[:2])
     return found
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.invariance import (
     TOLERANCE,
     acts_on_position,
@@ -143,20 +144,14 @@ def contacts_depend_on_yaw(model: mujoco.MjModel, data: mujoco.MjData, graph: To
 
 def _colliding_pairs(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, int, int, np.ndarray]]:
     """Pairs of geoms that can collide, the dimension of their contact and two coefficients of sliding friction."""
-    if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
+    node, colliding = graph.node_of_body[model.geom_bodyid], np.triu(colliding_geoms(model))
+    if not colliding.any():
         return
-    node = graph.node_of_body[model.geom_bodyid]
-    explicit = list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
-    for index, (first, second) in enumerate(explicit):
+    for index, pair in enumerate(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)):
+        first, second = sorted(pair)
+        colliding[first, second] = False
         if node[first] or node[second]:
             yield first, second, int(model.pair_dim[index]), model.pair_friction[index, :2]
-    filters = not model.opt.disableflags & _Disable.mjDSBL_FILTERPARENT
-    masks = model.geom_contype[:, None] & model.geom_conaffinity
-    for first, second in np.argwhere(np.triu(masks | masks.T, 1)).tolist():
-        one, other = int(node[first]), int(node[second])
-        related = filters and one and other and (graph.parent[one] == other or graph.parent[other] == one)
-        low, high = sorted(model.geom_bodyid[[first, second]].tolist())
-        excluded = (low << 16) + high in model.exclude_signature
-        if one != other and not related and not excluded and not {(first, second), (second, first)} & set(explicit):
-            size, priority = model.geom_condim[[first, second]], model.geom_priority[[first, second]]
-            yield first, second, int(size[priority == priority.max()].max()), np.zeros(2)
+    for first, second in np.argwhere(colliding).tolist():
+        size, priority = model.geom_condim[[first, second]], model.geom_priority[[first, second]]
+        yield first, second, int(size[priority == priority.max()].max()), np.zeros(2)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchrl_gn.data import RobotLog, load_robot_log, log_trajectories, log_tree, trajectory_buffer
-from torchrl_gn.scenes import scene_from_description
+from torchrl_gn.scenes import KinematicTree, scene_from_description
 
 STEP = 0.01
 
@@ -182,12 +182,15 @@ def test_past_commands_are_those_of_the_steps_before(resample, lag):
     plain, _ = log_trajectories(log, 12, resample=resample, lag=lag, overlap=True)
     past, report = log_trajectories(log, 12, resample=resample, lag=lag, overlap=True, history=3)
     assert past["action"].shape[-1] == 8 and len(past) == len(plain) - 2 * 3  # of each episode the first steps
-    later = torch.cat([plain[plain["episode"] == episode][3:] for episode in (0, 1)])
+    later = {
+        name: torch.cat([plain[name][plain["episode"] == episode][3:] for episode in (0, 1)])
+        for name in ("state", "action")
+    }
     assert torch.equal(past["state"], later["state"]) and torch.equal(past["action"][..., :2], later["action"])
     for step in (1, 2, 3):
         for episode in (0, 1):
-            before = plain[plain["episode"] == episode]["action"][3 - step : -step]
-            own = past[past["episode"] == episode]["action"]
+            before = plain["action"][plain["episode"] == episode][3 - step : -step]
+            own = past["action"][past["episode"] == episode]
             assert torch.equal(own[..., 2 * step : 2 * step + 2], before)
     assert report.short == log_trajectories(log, 15, resample=resample, lag=lag, overlap=True)[1].short
 
@@ -198,7 +201,8 @@ def test_a_graph_has_the_past_commands_at_their_joints():
     assert tree.commands == ((1, 3, 5), (0, 2, 4)) and tree.num_actions == 6
     assert tree.action_low.tolist() == 3 * log.command_bounds()[0].tolist()
     again = scene_from_description(tree.description())
-    assert again.history == 2 and again.fingerprint() == tree.fingerprint() != log_tree(log, "arm").fingerprint()
+    assert isinstance(again, KinematicTree) and again.history == 2
+    assert again.fingerprint() == tree.fingerprint() != log_tree(log, "arm").fingerprint()
     assert tree.present.commands == ((1,), (0,)) and tree.present.action_high.tolist() == tree.action_high[:2].tolist()
     assert "2 commands and those of 2 past steps" in str(tree) and "parent base: commands 1\n" in str(tree)
     with pytest.raises(ValueError, match="must be as many for each of 2 past steps"):

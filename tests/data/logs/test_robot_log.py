@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -113,7 +114,13 @@ def test_an_infinity_hides_no_jump(channel):
 
 def test_rows_that_a_trajectory_holds_are_not_left_over():
     log = smooth_log((25, 3))
-    for options, short in (({}, 3), ({"resample": 0.02}, 3), ({"lag": 4}, 3 + 8), ({"overlap": True}, 3)):
+    cases: list[tuple[dict[str, Any], int]] = [
+        ({}, 3),
+        ({"resample": 0.02}, 3),
+        ({"lag": 4}, 3 + 8),
+        ({"overlap": True}, 3),
+    ]
+    for options, short in cases:
         assert log_trajectories(log, 12, **options)[1].short == short
 
 
@@ -256,7 +263,7 @@ def test_a_chain_is_a_graph_that_comes_back_from_its_description():
 
 def test_a_chain_of_numpy_numbers_can_be_saved():
     plain = log_tree(smooth_log(joints=3), "arm", commands=[[2], [0], [1]], joint_parents=[-1, 0, 0])
-    own = {"commands": np.array([[2], [0], [1]]), "joint_parents": np.array([-1, 0, 0])}
+    own: dict[str, Any] = {"commands": np.array([[2], [0], [1]]), "joint_parents": np.array([-1, 0, 0])}
     tree = log_tree(dataclasses.replace(smooth_log(joints=3), timestep=np.float32(0.01)), "arm", **own)
     assert json.loads(json.dumps(tree.description())) == tree.description()
     assert tree.fingerprint() == plain.fingerprint()
@@ -271,8 +278,8 @@ def test_bounds_are_of_every_command():
 
 def test_a_simulated_robot_has_the_faults_of_a_real_one():
     scene = load_scene("jaco")
-    faults = {"delay": 0, "time_constant": 0.0, "play": 0.0, "quantum": 0.0, "noise": 0.0}
-    clean, coarse = (simulate_log(scene, 3, 30, 0, **(faults | own)) for own in ({}, {"quantum": 0.01}))
+    faults: dict[str, Any] = {"delay": 0, "time_constant": 0.0, "play": 0.0, "quantum": 0.0, "noise": 0.0}
+    clean, coarse = (simulate_log(scene, 3, 30, 0, **{**faults, **own}) for own in ({}, {"quantum": 0.01}))
     assert clean.angle.shape == (3 * 29, 9) and clean.length.tolist() == [29] * 3
     np.testing.assert_allclose(coarse.angle / 0.01, np.round(coarse.angle / 0.01), atol=1e-9)
     assert 0 < np.abs(clean.angle - coarse.angle).max() <= 0.005 + 1e-9

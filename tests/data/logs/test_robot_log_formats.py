@@ -86,7 +86,7 @@ def test_velocities_are_differences_where_there_are_none(arrays, tmp_path):
     trajectories, report = log_trajectories(log, 10)
     assert report.not_finite == 2 and trajectories["state"].isfinite().all()  # the first row of each episode
     np.testing.assert_allclose(log.velocity[1:30], np.diff(arrays["angle"][:30], axis=0) / STEP)
-    turning = RobotLog(*(arrays[name] for name in ("angle", "velocity", "command")), np.array(LENGTH), STEP)
+    turning = RobotLog(arrays["angle"], arrays["velocity"], arrays["command"], np.array(LENGTH), STEP)
     np.savez(tmp_path / "turning.npz", angle=turning.angle + np.pi, command=turning.command, timestep=STEP)
     wrapped = (turning.angle + 2 * np.pi) % (2 * np.pi) - np.pi
     np.savez(tmp_path / "wrapped.npz", angle=wrapped, command=turning.command, timestep=STEP)

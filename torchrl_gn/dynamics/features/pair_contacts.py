@@ -18,6 +18,7 @@ from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
     from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes.contact_pairs import ContactPairs
 
 _NEAR = 0.02  # metres: up to this distance the fine features vary
 _FAR = 0.1  # metres: from this distance on all features are 0
@@ -58,8 +59,8 @@ class PairContacts(Feature):
         return BoundPairContacts(scene, self.places)
 
 
-def _pairs(scene: Scene):
-    if getattr(scene, "contact_pairs", None) is None:
+def _pairs(scene: Scene) -> ContactPairs:
+    if scene.contact_pairs is None:
         raise ValueError(
             f"PairContacts needs states of bodies; scene {scene.name!r} has others: leave the feature out."
         )

@@ -1,0 +1,34 @@
+"""Kinds of actuators: motors, position servos and velocity servos."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+ActuatorKind = Literal["motor", "position", "velocity"]
+
+
+def actuator_kind(model: mujoco.MjModel, actuator: int) -> ActuatorKind:
+    """Whether an actuator follows position targets, velocity targets, or neither."""
+    gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
+    fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0
+    if not fixed or model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE:
+        return "motor"
+    if bias[1] != 0:
+        return "position"
+    return "velocity" if math.isclose(bias[2], -gain, rel_tol=1e-6) else "motor"
+
+
+def holding_controls(model: mujoco.MjModel, servos: np.ndarray | int, length: np.ndarray) -> np.ndarray:
+    """Controls at which position servos exert no force on transmissions of these lengths, at rest."""
+    gain, bias = model.actuator_gainprm[servos, 0], model.actuator_biasprm[servos]
+    return length * (-bias[..., 1] / gain) - bias[..., 0] / gain
+
+
+def drive_joints(model: mujoco.MjModel) -> np.ndarray:
+    """``[A]`` bool, actuators that drive a joint directly."""
+    kind = mujoco.mjtTrn
+    return np.isin(model.actuator_trntype, (int(kind.mjTRN_JOINT), int(kind.mjTRN_JOINTINPARENT)))
