@@ -222,7 +222,7 @@ def reference_keyframe(model: mujoco.MjModel) -> int | None:
 def _constraint_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Dense Jacobian ``[nefc, nv]`` of all constraints."""
     if not mujoco.mj_isSparse(model):
-        return data.efc_J.reshape(data.nefc, model.nv)
+        return data.efc_J.ravel()[: data.nefc * model.nv].reshape(data.nefc, model.nv)  # rows may be left over
     dense = np.zeros((data.nefc, model.nv))
     for row in range(data.nefc):
         first, count = data.efc_J_rowadr[row], data.efc_J_rownnz[row]
