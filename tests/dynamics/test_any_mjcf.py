@@ -98,6 +98,8 @@ def refusal(message: str, text: str) -> str:
     names = set(re.findall(r'name="(\w+)"', text))
     quoted = set(re.findall(r"'(\w+)'", message))
     located = re.search(r"line \d+|'(world|(joint|body|actuator)\d+)'|has no joint", message)
+    # As old versions of MuJoCo say it.
+    located = located or re.search(r"huge value in QACC at DOF \d+", message)
     assert quoted & names or located, message
     return re.sub(r"'\w*'|[\d.-]+", "#", message.replace("\n", " "))
 

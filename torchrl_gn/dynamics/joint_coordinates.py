@@ -60,7 +60,9 @@ class JointCoordinates(Float64Buffers):
             axes = np.stack([model.jnt_axis[joint] for joint in joints], axis=1)
             hinged = kinds[-1] == _KINDS.mjJNT_HINGE
             slid = len(kinds) - hinged
-            if any(kind != _KINDS.mjJNT_SLIDE for kind in kinds[:slid]) or np.linalg.matrix_rank(axes[:, :slid]) < slid:
+            if any(kind != _KINDS.mjJNT_SLIDE for kind in kinds[:slid]) or (
+                slid and np.linalg.matrix_rank(axes[:, :slid]) < slid  # NumPy 1 takes no empty matrix
+            ):
                 names = [scene.joint_names[joint] for joint in joints]
                 raise UnsupportedSceneError(
                     f"The coordinates of joints {names} of scene {scene.name!r} do not follow from body states here: a"

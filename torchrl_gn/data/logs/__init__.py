@@ -1,8 +1,8 @@
 """Logs of robots that joint encoders know: files, graphs, trajectories, measurements, simulated logs."""
 
-from torchrl_gn.data.logs.inspect_log import JointDelay as JointDelay
-from torchrl_gn.data.logs.inspect_log import LogInspection as LogInspection
-from torchrl_gn.data.logs.inspect_log import inspect_log as inspect_log
+from torchrl_gn.data.logs.log_inspection import JointDelay as JointDelay
+from torchrl_gn.data.logs.log_inspection import LogInspection as LogInspection
+from torchrl_gn.data.logs.log_inspection import inspect_log as inspect_log
 from torchrl_gn.data.logs.log_noise import channel_weights as channel_weights
 from torchrl_gn.data.logs.logged_trajectories import LogReport as LogReport
 from torchrl_gn.data.logs.logged_trajectories import log_trajectories as log_trajectories
