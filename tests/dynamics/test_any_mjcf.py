@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import re
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -98,12 +99,13 @@ def refusal(message: str, text: str) -> str:
     names = set(re.findall(r'name="(\w+)"', text))
     quoted = set(re.findall(r"'(\w+)'", message))
     located = re.search(r"line \d+|'(world|(joint|body|actuator)\d+)'|has no joint", message)
-    # As old versions of MuJoCo say it.
-    located = located or re.search(r"huge value in QACC at DOF \d+", message)
     assert quoted & names or located, message
     return re.sub(r"'\w*'|[\d.-]+", "#", message.replace("\n", " "))
 
 
+@pytest.mark.skipif(
+    tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 6), reason="compiling raises the solver's warnings there"
+)
 def test_random_models_load_or_are_refused_by_name():
     outcomes = collections.Counter(check(seed, "eager") for seed in range(SEEDS))
     assert outcomes["loaded"] > SEEDS / 2 and len(outcomes) > 3

@@ -50,6 +50,8 @@ def drop_missing_visuals(spec: mujoco.MjSpec, exists: Callable[[Path], bool]) ->
         for mesh in spec.meshes
         if mesh.file and not exists(Path(spec.meshdir, mesh.file))
     }
+    if not missing:
+        return []
     users: dict[str, list] = {name: [] for name in missing}
     for body in spec.bodies:
         for geom in body.geoms:
