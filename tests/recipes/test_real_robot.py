@@ -88,24 +88,15 @@ def test_delay_and_filter_follow_the_measurements(pendulum, call, tmp_path):
     assert isinstance(tree, KinematicTree) and tree.commands == ((0, 1, 2), ()) and tree.history == 2
 
 
+SPLIT = {"length": 10, "resample": None, "lag": 0, "jump": 50.0, "history": 0, "filter": 0, "data_seed": 0}
+
+
 @pytest.mark.parametrize(
     ("share", "episodes"), [("{validation: 0.4, test: 0.4}", 5), ("{validation: 0.2, test: 0.2}", 4)]
 )
 def test_episodes_stay_whole_where_there_are_enough(share, episodes, recipe):
     log = simulate_log(load_scene("acrobot"), episodes, 62, 0)
-    cfg = OmegaConf.create(
-        {
-            "length": 10,
-            "resample": None,
-            "lag": 0,
-            "jump": 50.0,
-            "history": 0,
-            "filter": 0,
-            "data_seed": 0,
-            "share": OmegaConf.create(share),
-        }
-    )
-    parts = recipe.split(cfg, log)
+    parts = recipe.split(OmegaConf.create({**SPLIT, "share": OmegaConf.create(share)}), log)
     which = {part: set(data["episode"].tolist()) for part, data in parts.items()}
     if episodes == 5:
         assert sorted(map(len, which.values())) == [1, 2, 2] and set.union(*which.values()) == set(range(5))
@@ -117,18 +108,7 @@ def test_episodes_stay_whole_where_there_are_enough(share, episodes, recipe):
 def test_shares_that_leave_nothing_are_refused(recipe):
     log = simulate_log(load_scene("acrobot"), 1, 62, 0)
     for share in ({"validation": 0.6, "test": 0.6}, {"validation": 0.0, "test": 0.5}):
-        cfg = OmegaConf.create(
-            {
-                "length": 10,
-                "resample": None,
-                "lag": 0,
-                "jump": 50.0,
-                "history": 0,
-                "filter": 0,
-                "data_seed": 0,
-                "share": share,
-            }
-        )
+        cfg = OmegaConf.create({**SPLIT, "share": share})
         with pytest.raises(ValueError, match="1 episodes cannot be split by share="):
             recipe.split(cfg, log)
 

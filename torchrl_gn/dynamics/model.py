@@ -127,7 +127,7 @@ class ForwardModel(nn.Module):
         ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core.
         """
         first = cast(Scene, scene if isinstance(scene, (Scene, KinematicTree)) else scene[0])
-        layout = joint_layout(first.extras) if isinstance(first, KinematicTree) else BODY_STATE
+        layout = layout_of(first)
         if features is None:
             spatial = "orientation" in layout.names
             features = (BodyState(), Controls(), *((JointAxes(), Contacts()) if spatial else ()))
@@ -254,3 +254,8 @@ class ForwardModel(nn.Module):
             **rest.pop("core_options"),
             **rest,
         )
+
+
+def layout_of(scene: Scene | KinematicTree) -> StateLayout:
+    """Layout of a scene's body states, or of the states of a robot known by its joints."""
+    return joint_layout(scene.extras) if isinstance(scene, KinematicTree) else BODY_STATE

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchrl_gn.dynamics import ConstantVelocity
 from torchrl_gn.dynamics.features.controls import present_actions
+from torchrl_gn.dynamics.model import layout_of
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import evaluate_errors
-from torchrl_gn.maths.state_layout import BODY_STATE, joint_layout
 from torchrl_gn.scenes import KinematicTree, Scene
 
 
@@ -29,7 +29,7 @@ def baseline_errors(
     Persistence is what all errors are relative to: it has 1 everywhere. ``options`` are those of
     :func:`~torchrl_gn.evaluation.evaluate_errors`.
     """
-    layout = joint_layout(scene.extras) if isinstance(scene, KinematicTree) else BODY_STATE
+    layout = layout_of(scene)
     known: dict[str, Callable] = {"constant velocity": ConstantVelocity(layout, float(scene.timestep))}
     if physics is not None:
         known["physics"] = physics

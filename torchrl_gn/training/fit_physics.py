@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from torchrl_gn.data import trajectory_buffer
 from torchrl_gn.dynamics.features.controls import present_actions
+from torchrl_gn.dynamics.model import layout_of
 from torchrl_gn.evaluation.errors import squared_errors
-from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout, joint_layout
 from torchrl_gn.scenes import KinematicTree, Scene
 from torchrl_gn.training.optimizers import clip_gradients
 
@@ -45,7 +45,7 @@ def fit_physics(
         FloatingPointError: if a gradient is not finite; nothing changes at that step.
         ValueError: if no parameter requires a gradient.
     """
-    layout: StateLayout = joint_layout(scene.extras) if isinstance(scene, KinematicTree) else BODY_STATE
+    layout = layout_of(scene)
     moving = torch.as_tensor(scene.predicted)
     parameters = [parameter for parameter in physics.parameters() if parameter.requires_grad]
     if not parameters:
