@@ -12,9 +12,9 @@ speed-ups over `reference` and jraph, peak memory, and errors against the refere
 
 `baselines=[jraph,mujoco]` times others in turn with them. `jraph` is the same network with the same weights as jraph
 users write it, under `jax.jit` in float32: the network alone, from graph features to output nodes, which are checked to
-be ours, and the gradient in node and edge features. Ours go from state to state, with features and projection. The
-process is then kept on as many cores as `threads`, and JAX computes in the calling thread. `mujoco` is the true physics
-in C, on one thread. A baseline has no row where it has no such work.
+be ours, and gradients in node and edge features for one in the outputs. Ours go from state to state, with features and
+projection. The process is then kept on as many cores as `threads`, and JAX computes in the calling thread. `mujoco` is
+the true physics in C, on one thread. A baseline has no row where it has no such work.
 
 `bound` is the share that a step reaches of its least time: the larger of its FLOPs at the rate of a large product, and
 of its weights read once at the bandwidth of reading as many bytes again and again. FLOPs and weights are those of the
@@ -43,7 +43,7 @@ from _common import as_list, clean_exit, finish_run, open_run, with_help
 from _common.speed_baselines import make_baselines
 from _common.speed_measure import Way, measure, timed
 from _common.speed_table import least_times, report
-from _common.speed_work import make_works, pull, step_once, train_work
+from _common.speed_work import make_works, pull, train_work
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.executors import EXECUTORS
@@ -109,7 +109,7 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
             if panel.startswith("horizon"):
                 run = functools.partial(pull, way.model, state, action.unsqueeze(1).expand(-1, x, -1))
             else:
-                run = functools.partial(step_once, way.model, state, action)
+                run = functools.partial(way.model.step, state, action)
             seconds = [timed(run, way.fast)[1] for _ in range(max(4, cfg.repeats // 2))]
             line = panels.setdefault(panel, {}).setdefault(name, ([], []))
             line[0].append(x)

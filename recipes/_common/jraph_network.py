@@ -50,19 +50,21 @@ class JraphNetwork:
         self.weights = {name: _weights(block) for name, block in (("first", core.first), ("second", core.second))}
         network = functools.partial(_network, _ACTIVATIONS[core.activation])
 
-        def loss(features: Any, weights: Any, graph: Any) -> Any:
-            nodes, edges = features
-            return jnp.square(network(weights, graph._replace(nodes=nodes, edges=edges))).sum()
+        def pull(weights: Any, graph: Any, gradient: Any) -> Any:
+            def outputs(nodes: Any, edges: Any) -> Any:
+                return network(weights, graph._replace(nodes=nodes, edges=edges))
 
-        self._predict, self._gradient = jax.jit(network), jax.jit(jax.value_and_grad(loss))
+            return jax.vjp(outputs, graph.nodes, graph.edges)[1](gradient)
+
+        self._predict, self._gradient = jax.jit(network), jax.jit(pull)
 
     def predict(self, graph: Any) -> Any:
         """Output nodes ``[B * N, F_out]`` of a batched graph."""
         return self._predict(self.weights, graph).block_until_ready()
 
-    def gradient(self, graph: Any) -> tuple[Any, tuple[Any, Any]]:
-        """Sum of the squared outputs, and its gradient in the features of nodes and edges."""
-        return jax.block_until_ready(self._gradient((graph.nodes, graph.edges), self.weights, graph))
+    def gradient(self, graph: Any, gradient: Any) -> tuple[Any, Any]:
+        """Gradients in the features of nodes and edges for that in the output nodes."""
+        return jax.block_until_ready(self._gradient(self.weights, graph, gradient))
 
 
 def batched(graph: Graph) -> Any:

@@ -33,7 +33,7 @@ class Baseline(Protocol):
         ...
 
     def gradient(self, state: Tensor, action: Tensor) -> Run:
-        """A step, and the gradient of a scalar of its output in its inputs."""
+        """Gradients of a step in its inputs for one in its output."""
         ...
 
 
@@ -65,7 +65,8 @@ class JraphBaseline:
 
     def gradient(self, state: Tensor, action: Tensor) -> Run:
         inputs = self._batched(self._seen(state, action)[0])
-        return lambda: self._network.gradient(inputs)
+        gradient = self._network.predict(inputs)  # of half the sum of their squares
+        return lambda: self._network.gradient(inputs, gradient)
 
     @torch.no_grad()
     def _seen(self, state: Tensor, action: Tensor) -> tuple[Graph, Tensor]:

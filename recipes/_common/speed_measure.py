@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from torch import Tensor
 from tqdm import tqdm
@@ -35,13 +35,14 @@ class Way:
 
 @dataclass
 class Work:
-    """Something to time: ``run`` does it with a way and gives a result to compare, ``others`` do it without one."""
+    """Something to time: ``run`` does it with a way, ``others`` without one; ``compared`` is what errors are of."""
 
     name: str
-    run: Callable[[Way], Tensor | None]
+    run: Callable[[Way], Any]
     steps: int = 1
     repeats: int = 9
     others: Mapping[str, Callable[[], object]] = field(default_factory=dict)
+    compared: Callable[[Any], Tensor] = lambda result: result
     milliseconds: dict[str, list[float]] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     megabytes: dict[str, float] = field(default_factory=dict)
@@ -78,7 +79,7 @@ def measure(works: Sequence[Work], ways: Mapping[str, Way], reference: Predictor
     turns = sum((work.repeats + 1) * (len(ways) + len(work.others)) for work in works)
     bar = tqdm(total=turns, desc="measuring", leave=False)
     for work in works:
-        expected = None if reference is None else work.run(Way(reference))
+        expected = None if reference is None else work.compared(work.run(Way(reference)))
         runs = {
             name: functools.partial(timed, functools.partial(work.run, way), way.fast) for name, way in ways.items()
         }
@@ -89,8 +90,8 @@ def measure(works: Sequence[Work], ways: Mapping[str, Way], reference: Predictor
             bar.update()
             if name == "compiled":
                 compile_seconds[work.name] = seconds
-            if isinstance(result, Tensor) and expected is not None:
-                work.errors[name] = float((result - expected).norm() / expected.norm())
+            if name in ways and expected is not None:
+                work.errors[name] = float((work.compared(result) - expected).norm() / expected.norm())
             calls[name] = max(1, min(_MOST_CALLS, int(_TURN_SECONDS / run()[1])))
         for _ in range(work.repeats):
             for name, run in runs.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
 import torch
@@ -17,12 +17,6 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training import make_optimizer
 
 
-@torch.no_grad()
-def step_once(model: Predictor, state: Tensor, action: Tensor) -> Tensor:
-    """Next state."""
-    return model.step(state, action)[0]
-
-
 def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
     """Gradient of a rollout to its actions."""
     leaf = actions.clone().requires_grad_()
@@ -31,11 +25,9 @@ def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
     return leaf.grad
 
 
-def pull_once(model: Predictor, state: Tensor, action: Tensor) -> Tensor:
-    """Gradient of a scalar of the next state to state and action, in one row."""
-    state, action = (tensor.clone().requires_grad_() for tensor in (state, action))
-    loss = model.step(state, action)[0][..., 7:].square().sum()
-    return torch.cat([gradient.flatten() for gradient in torch.autograd.grad(loss, (state, action))])
+def pull_once(model: Predictor, leaves: Sequence[Tensor], gradient: Tensor) -> tuple[Tensor, ...]:
+    """Gradients in state and action for that in the next state."""
+    return torch.autograd.grad(model.step(*leaves)[0], leaves, gradient)
 
 
 def make_works(
@@ -55,40 +47,51 @@ def make_works(
     def step(batch: int) -> Work:
         state, actions = first(batch)
 
-        def run(way: Way) -> Tensor:
-            return step_once(way.model, state, actions[:, 0]) - state
+        action = actions[:, 0].contiguous()
 
-        return Work(f"step, batch {batch}", run, 1, cfg.repeats, others("step", state, actions[:, 0]))
+        def run(way: Way) -> Tensor:
+            return way.model.step(state, action)[0]
+
+        return Work(
+            f"step, batch {batch}", run, 1, cfg.repeats, others("step", state, action), lambda after: after - state
+        )
 
     def single_steps(batch: int, horizon: int) -> Work:
         start, actions = first(batch, horizon)
 
         def run(way: Way) -> Tensor:
             state = start
-            for action in actions.unbind(1):
-                state = step_once(way.model, state, action)
-            return state - start
+            for action in each:
+                state = way.model.step(state, action)[0]
+            return state
 
-        return Work(f"{horizon} single steps, batch {batch}", run, horizon, cfg.repeats)
+        each = [action.contiguous() for action in actions.unbind(1)]
+        name = f"{horizon} single steps, batch {batch}"
+        return Work(name, run, horizon, cfg.repeats, compared=lambda after: after - start)
 
     def rollout(batch: int, horizon: int) -> Work:
         state, actions = first(batch, horizon)
 
         def run(way: Way) -> Tensor:
-            with torch.no_grad():
-                return way.model.rollout(state, actions)[0][:, -1] - state
+            return way.model.rollout(state, actions)[0]
 
-        return Work(
-            f"rollout of {horizon}, batch {batch}", run, horizon, cfg.repeats, others("rollout", state, actions)
-        )
+        baselines = others("rollout", state, actions)
+        name = f"rollout of {horizon}, batch {batch}"
+        return Work(name, run, horizon, cfg.repeats, baselines, lambda states: states[:, -1] - state)
 
     def step_gradient(batch: int) -> Work:
         state, actions = first(batch)
+        leaves = [tensor.clone().requires_grad_() for tensor in (state, actions[:, 0])]
+        gradient = 2 * state * (torch.arange(state.shape[-1]) >= 7)
 
-        def run(way: Way) -> Tensor:
-            return pull_once(way.model, state, actions[:, 0])
+        def run(way: Way) -> tuple[Tensor, ...]:
+            return pull_once(way.model, leaves, gradient)
 
-        return Work(f"gradient of a step, batch {batch}", run, 1, cfg.repeats, others("gradient", state, actions[:, 0]))
+        def compared(gradients: Sequence[Tensor]) -> Tensor:
+            return torch.cat([each.flatten() for each in gradients])
+
+        baselines = others("gradient", state, actions[:, 0])
+        return Work(f"gradient of a step, batch {batch}", run, 1, cfg.repeats, baselines, compared)
 
     def gradient(batch: int, horizon: int) -> Work:
         state, actions = first(batch, horizon)

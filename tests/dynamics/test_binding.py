@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -188,3 +189,81 @@ def test_several_threads_step_while_weights_change(quick, inputs):
                 next(predictor.model.parameters()).copy_(weights[round_ % 2])
         assert all(results)
     assert torch.equal(predictor.step(state, action)[0], expected[1])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 3), (24,), (60,)])
+def test_gradients_are_those_of_the_general_way(quick, inputs, general_steps, dtype, batch):
+    predictor = quick(dtype=dtype)
+    state, action = inputs(predictor, *batch)
+    predictor.step(state, action)
+    leaves = state.requires_grad_(), action.requires_grad_()
+    gradient = torch.randn_like(state)
+    expected = torch.autograd.grad(predictor.executor().step(*leaves)[0], leaves, gradient)
+    general_steps.clear()
+    found = torch.autograd.grad(predictor.step(*leaves)[0], leaves, gradient)
+    assert all(map(torch.equal, found, expected))
+    assert len(general_steps) == (batch == (60,))  # whose activations come from a pool
+    only = torch.autograd.grad(predictor.step(state.detach(), action)[0].sum(), action)[0]  # an expanded gradient
+    whole = torch.autograd.grad(predictor.executor().step(*leaves)[0], action, torch.ones_like(state))[0]
+    assert torch.equal(only, whole)
+
+
+def test_gradients_add_up_over_steps_and_threads(quick, inputs):
+    predictor = quick(dtype=torch.float64)
+    state, action = inputs(predictor, 3)
+    predictor.step(state, action)
+
+    def pull(step) -> torch.Tensor:
+        leaf = action.clone().requires_grad_()
+        after = state
+        for _ in range(5):
+            after = step(after, leaf)[0]
+        after.square().sum().backward()
+        assert leaf.grad is not None
+        return leaf.grad
+
+    expected = pull(predictor.executor().step)
+    assert torch.equal(pull(predictor.step), expected)
+    with ThreadPoolExecutor(3) as pool:
+        assert all(torch.equal(each, expected) for each in pool.map(lambda _: pull(predictor.step), range(30)))
+
+
+def test_what_gradients_refuse(quick, inputs):
+    predictor = quick()
+    state, action = inputs(predictor, 3)
+    predictor.step(state, action)
+    leaf = action.requires_grad_()
+    after = predictor.step(state, leaf)[0]
+    assert after.grad_fn is not None and "SpecializedStep" in after.grad_fn.name()
+    after.sum().backward()
+    with pytest.raises(RuntimeError, match="second time"):
+        after.sum().backward()
+    first = torch.autograd.grad(predictor.step(state, leaf)[0].square().sum(), leaf, create_graph=True)[0]
+    with pytest.raises(RuntimeError, match="first order; use executor='eager'"):
+        torch.autograd.grad(first.sum(), leaf)
+    after, other = predictor.step(state, leaf)[0], state.clone()
+    changed = predictor.step(other, leaf)[0]
+    other.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        changed.sum().backward()
+    with pytest.raises(RuntimeError, match="such gradient; use executor='eager'"):
+        torch.autograd.grad(after, leaf, torch.ones(2, *after.shape, dtype=after.dtype), is_grads_batched=True)
+    after = predictor.step(state, leaf)[0]
+    with torch.no_grad():
+        next(predictor.model.parameters()).mul_(1.5)
+    predictor.step(state, leaf)
+    with pytest.raises(RuntimeError, match="weights changed between a prediction and its gradient"):
+        after.sum().backward()
+
+
+def test_a_gradient_outlives_the_predictor(quick, inputs):
+    predictor = quick()
+    state, action = inputs(predictor, 3)
+    predictor.step(state, action)
+    leaf = action.requires_grad_()
+    expected = torch.autograd.grad(predictor.step(state, leaf)[0].sum(), leaf)[0]
+    after = predictor.step(state, leaf)[0]
+    del predictor
+    gc.collect()
+    assert torch.equal(torch.autograd.grad(after.sum(), leaf)[0], expected)

@@ -1,4 +1,4 @@
-"""Call a single step without ctypes, where torch's and Python's headers are there to build it."""
+"""Call a single step, and its gradient, without ctypes, where torch's and Python's headers are there to build it."""
 
 from __future__ import annotations
 
@@ -60,8 +60,26 @@ def make_plan(executor: Executor | None, scene: Scene, watched: Watched, casts: 
     if (binding := load_binding()) is None:
         return None
     network, maths = native.network, native.traced.special[0]
-    run = ctypes.cast(network.library.gn_rollout, ctypes.c_void_p).value
-    tensors = watched.owners, watched.names, watched.tensors, watched.versions
-    sizes = library.TILE, scene.num_nodes, scene.state_size, scene.num_actions
-    kept = native, maths
-    return binding.plan(kept, attributes, casts, *tensors, run, network.pointer, network.kind, maths.reference, *sizes)
+    code = network.library
+    functions = (ctypes.cast(each, ctypes.c_void_p).value for each in (code.gn_rollout, code.gn_rollout_adjoint))
+    return binding.make_plan(
+        (native, maths),
+        maths.add_adjoint,
+        vars(executor),
+        native.version,
+        attributes,
+        casts,
+        watched.owners,
+        watched.names,
+        watched.tensors,
+        watched.versions,
+        *functions,
+        network.pointer,
+        network.kind,
+        network.kept,
+        maths.reference,
+        library.TILE,
+        scene.num_nodes,
+        scene.state_size,
+        scene.num_actions,
+    )
