@@ -55,10 +55,10 @@ class Method:
     seconds: dict[int, float] = field(default_factory=dict)
 
 
-def trained(cfg: DictConfig, run: RunFolder) -> list[Path]:
-    """Run folders of the models to measure, training those that are not there."""
+def trained(cfg: DictConfig, run: RunFolder) -> list[str]:
+    """Run folders, files or names of the models to measure, training those that are not there."""
     if cfg.checkpoints:
-        return [Path(folder) for folder in cfg.checkpoints]
+        return list(cfg.checkpoints)
     variants = {f"gn_{size}": [f"model.hidden={size}"] for size in cfg.sizes}
     for hidden in cfg.mlps:
         variants[f"mlp_{len(hidden)}x{hidden[0]}"] = ["model.core=mlp", f"model.hidden={list(hidden)}"]
@@ -66,7 +66,7 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[Path]:
     shared += ["steps=null", f"minutes={cfg.minutes}", "clock=processor", *cfg.training]
     runs = [Run(FORWARD_MODEL, run.path / "models" / name, (*shared, *sizes), name) for name, sizes in variants.items()]
     refuse_failures(run_all(runs, 1))
-    return [each.folder for each in runs]
+    return [str(each.folder) for each in runs]
 
 
 def title(model: ForwardModel) -> tuple[str, str]:
@@ -83,14 +83,14 @@ def predict(model: Predictor, fast: bool, physics: Tensor, state: Tensor, action
         return model.rollout(state, actions)[0]
 
 
-def learned(folders: list[Path], scene: Scene) -> list[Method]:
+def learned(checkpoints: list[str], scene: Scene) -> list[Method]:
     """Every trained model, evaluated in every way."""
     methods = []
-    for folder in folders:
-        model = load_pretrained(folder).model.requires_grad_(False)
+    for checkpoint in checkpoints:
+        model = load_pretrained(checkpoint).model.requires_grad_(False)
         bound, (kind, name) = model.bind(scene), title(model)
         if any(other.name.startswith(f"{name},") for other in methods):
-            name = f"{name} ({folder.name})"
+            name = f"{name} ({Path(checkpoint).name})"
         ways = {"reference": (model.bind(scene, reference=True), False), "specialised": (specialize(bound), True)}
         if product_speeds().pays(torch.bfloat16):
             ways["bfloat16"] = (specialize(bound, dtype=torch.bfloat16), True)

@@ -7,6 +7,7 @@ Runs episodes in MuJoCo with the paper's horizons (SM "Planning configuration"),
 planner:
 
 - gn: gradients through the learned model (paper, SM "MPC planner with learned models")
+- ilqr: iLQG's algorithm through the learned model, linearised by its gradients
 - cem, mppi: TorchRL's planners on the learned model
 - ilqg: on MuJoCo (paper, SM "Baseline Mujoco-based planner")
 - cem_true, mppi_true: TorchRL's planners on MuJoCo
@@ -21,11 +22,11 @@ cheetah). The same `run_dir` goes on with the saved episodes, also with more ste
 
 If MuJoCo's simulation becomes unstable, the episode ends: its states and rewards are NaN from there on and count in no
 number, and the table says how many episodes ended so. With a recurrent model only gn carries the hidden state; cem and
-mppi start each plan without one.
+mppi start each plan without one, and ilqr refuses it.
 
 Writes config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
-a video of the first episode (<planner>.gif); for gn and ilqg also with the states planned a horizon before, if the
-episode is longer than that. All options: recipes/config/mpc.yaml. Results: docs/results.md.
+a video of the first episode (<planner>.gif); for gn, ilqr and ilqg also with the states planned a horizon before, if
+the episode is longer than that. All options: recipes/config/mpc.yaml. Results: docs/results.md.
 """
 
 from __future__ import annotations
@@ -96,6 +97,9 @@ def make_planner(
         return RandomControl(env.scene, cfg.episodes, cfg.steps, cfg.seed + 2, float(name == "random"), step=done)
     if name == "ilqg":
         return ILQGPlanner(env, cfg.horizon, seed=seed, **cfg.ilqg)
+    if name == "ilqr":
+        assert imagined is not None
+        return ILQGPlanner(imagined, cfg.horizon, seed=seed, **cfg.ilqr)
     if name == "gn":
         assert imagined is not None
         more = {key: value for key, value in cfg.gn.items() if key != "lr"}
@@ -123,8 +127,8 @@ def execute(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEn
                 started = time.perf_counter()
                 now = policy(episodes.now.copy())
                 seconds = time.perf_counter() - started
-                if name in ("gn", "ilqg"):
-                    episodes.records["planned"].append(planned_state(env, imagined if name == "gn" else None, now))
+                if name in ("gn", "ilqr", "ilqg"):
+                    episodes.records["planned"].append(planned_state(env, None if name == "ilqg" else imagined, now))
                 stepped = env.step(now)
                 episodes.now = stepped.exclude("next", "action", "done", "terminated")
                 episodes.now.update(stepped["next"].exclude("reward", "done", "terminated"))

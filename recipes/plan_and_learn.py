@@ -41,9 +41,8 @@ def planning(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
     options = (*task_options(cfg), f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"executor={cfg.executor}")
     options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
     last = index == cfg.rounds
-    options += (f"video={str(last).lower()}", "gn.iterations=3", *as_list(cfg.planning))
-    if last:
-        options += (f"planner={override(['gn', *cfg.baselines])}",)
+    planners = [cfg.planner, *(cfg.baselines if last else ())]
+    options += (f"video={str(last).lower()}", f"planner={override(planners)}", "gn.iterations=3", *as_list(cfg.planning))
     return Run(MPC, folder / f"executed{index}", options, f"planning, round {index}")
 
 
@@ -55,7 +54,7 @@ def learning(cfg: DictConfig, folder: Path, index: int, model: str | None, execu
     if model is None:
         options += (f"minutes={cfg.first_minutes}",)
     else:
-        extra = ",".join(str(run.folder / "gn.safetensors") for run in executed)
+        extra = ",".join(str(run.folder / f"{cfg.planner}.safetensors") for run in executed)
         options += (f"start_from={model}", f"data.extra=[{extra}]", f"minutes={cfg.minutes}", f"lr={cfg.lr}")
     # The model's own options hold for one that is begun with.
     more = [each for each in as_list(cfg.training) if model is None or not each.startswith("model.")]
@@ -104,19 +103,19 @@ def main(cfg: DictConfig) -> None:
         if failed:
             break
         measured = execution.numbers(math.nan)  # not one: a reward where every episode became unstable
-        for planner in ("gn", *(cfg.baselines if index == cfg.rounds else ())):
+        for planner in (cfg.planner, *(cfg.baselines if index == cfg.rounds else ())):
             of = {
                 name.removeprefix(f"{planner}/"): value
                 for name, value in measured.items()
                 if name.startswith(f"{planner}/")
             }
-            label = f"round {index}" if planner == "gn" else planner
+            label = f"round {index}" if planner == cfg.planner else planner
             metrics |= {f"{label}/{name}": value for name, value in of.items()}
             reward = f"{of['mean_reward']:.3g} ({of['mean_reward_std']:.2g})"
-            cells = [f"{value:.1e}" for value in errors.values()] if planner == "gn" and errors else ["", ""]
+            cells = [f"{value:.1e}" for value in errors.values()] if planner == cfg.planner and errors else ["", ""]
             lines.append(f"| {label} | {reward} | {of['planning_ms']:.0f} | " + " | ".join(cells) + " |")
     kept = [run for run in executed if run.metrics is not None]
-    rewards = [load_file(run.folder / "gn.safetensors")["reward"] for run in kept]
+    rewards = [load_file(run.folder / f"{cfg.planner}.safetensors")["reward"] for run in kept]
     if rewards:
         curves = {f"round {index}": values for index, values in enumerate(rewards)}
         plot_rewards(curves, folder.file("rewards.png"), timestep=scene.timestep, ylabel="reward")

@@ -75,7 +75,7 @@ def planned_state(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase)
         ahead = env.simulator.rollout(now["physics"][:1], actions[:1])
         return ahead["state"][0, -1].where(ahead["stable"][0], torch.nan)
     # As many rows as the planner has: a compiled model is compiled for every number of them.
-    rows = cast(Tensor, now["plan", "actions"]).shape[1]
+    rows = cast(Tensor, now["plan", "actions"]).shape[1] if now["plan", "actions"].ndim == 4 else 1
     many = cast(TensorDictBase, now.repeat_interleave(rows, 0))
     return imagined.imagine(many, actions.repeat_interleave(rows, 0))[0][0, -1].detach()
 

@@ -20,7 +20,7 @@ from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
 from torchrl_gn.training import load_pretrained, pretrained_names
 
-ON_MODEL, ON_PHYSICS = ("gn", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
+ON_MODEL, ON_PHYSICS = ("gn", "ilqr", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
 
 
 def fill_in(cfg: DictConfig) -> None:

@@ -20,6 +20,7 @@ from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.planners.ilqg import ILQGPlanner
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
 from torchrl_gn.planners.linearize import RewardExpansion
+from torchrl_gn.planners.plant import SimulatedPlant
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import Scene, load_scene
 
@@ -322,18 +323,18 @@ def test_a_gradient_that_is_no_number_keeps_the_plan():
 def solver_of(reward) -> tuple[ILQGSolver, SceneEnv]:
     env = point_env(2.0, reward)
     expansion = RewardExpansion(reward, None, env.device)
-    return ILQGSolver(env.simulator, expansion, control_cost=0.0, central=False), env
+    return ILQGSolver(SimulatedPlant(env.simulator), expansion, control_cost=0.0), env
 
 
 def test_a_reward_that_curves_upwards_has_its_curvature_cut():
     """Else the backward pass would look for a maximum."""
     solver, env = solver_of(lambda state, action, next_state, task: -quadratic(state, action, next_state, task))
-    start = solver.simulate(physics_of(env, [0.5, -0.3, 0.2, 0.4])[0].numpy(), np.zeros((1, 5, 2)))
+    start = solver.follow(physics_of(env, [0.5, -0.3, 0.2, 0.4])[0].numpy(), np.zeros((1, 5, 2)))
     assert solver.improve(start, 3).cost < start.cost
-    hessian = solver.expand(start).hessian
+    hessian = solver.expand(start)[1].hessian
     assert np.linalg.eigvalsh(hessian).min() > -1e-9 and np.abs(hessian).max() < 1e-9
     mixed, _ = solver_of(lambda *step: step[1][..., :1].square() - 3 * step[1][..., 1:].square())
-    assert np.diag(mixed.expand(start).hessian[0])[-2:] == pytest.approx([0, 6 * 2.0**2])  # by half the range
+    assert np.diag(mixed.expand(start)[1].hessian[0])[-2:] == pytest.approx([0, 6 * 2.0**2])  # by half the range
 
 
 def test_where_every_step_is_too_long_shorter_ones_are_tried():
@@ -344,7 +345,7 @@ def test_where_every_step_is_too_long_shorter_ones_are_tried():
         return torch.exp(-(((along - 0.003) / 0.002) ** 2)) - 50 * along.abs()
 
     solver, env = solver_of(reward)
-    start = solver.simulate(physics_of(env, [0.0] * 4)[0].numpy(), np.full((1, 1, 2), 1e-6))
+    start = solver.follow(physics_of(env, [0.0] * 4)[0].numpy(), np.full((1, 1, 2), 1e-6))
     assert solver.improve(start, 1).cost == start.cost
     assert solver.improve(start, 3).cost < start.cost - 0.1
 

@@ -1,7 +1,8 @@
-"""Receding-horizon, control-limited iLQG on the true physics (paper, SM "Baseline Mujoco-based planner")."""
+"""Receding-horizon, control-limited iLQG, on the true physics or through a learned model."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
 from collections.abc import Callable
@@ -16,27 +17,39 @@ from torchrl.envs import TensorDictPrimer
 
 from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
+from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
 from torchrl_gn.planners.linearize import RewardExpansion
 from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
+from torchrl_gn.planners.plant import LearnedPlant, Plant, SimulatedPlant
 
 _INITIAL_SAMPLES = 16  # random sequences; a first plan starts from the best
 
 
 class ILQGPlanner(RecedingHorizonPlanner):
-    """Plan on the true MuJoCo physics by control-limited iLQG (Tassa, Mansard and Todorov 2014).
+    """Plan by control-limited iLQG (Tassa, Mansard and Todorov 2014).
+
+    On the true physics (a :class:`~torchrl_gn.envs.SceneEnv`), linearised by finite differences, it is the paper's
+    baseline (SM "Baseline Mujoco-based planner"). Through a learned model (a :class:`~torchrl_gn.envs.ModelEnv`),
+    linearised by its gradients, it is iLQR: a second-order method, where
+    :class:`~torchrl_gn.planners.GradientPlanner` is of first order.
 
     Every control step improves the planned actions by a few iterations, to maximise the sum of ``env.reward`` minus a
     control cost. The first action is executed; the rest warm-starts the next plan. Where episodes auto-reset, append
     :meth:`make_tensordict_primer` to the environment. Rows of a batch are planned one by one, in float64, without
     gradients. A state without any stable sequence keeps its last plan, or zero actions, with a warning.
 
-    Reads ``physics`` ``[*B, S]`` float64, and ``task`` and ``plan`` if present; writes ``action`` ``[*B, A]`` and
-    ``plan``: remaining ``actions`` ``[*B, H, A]`` float64 and ``planned`` ``[*B, 1]`` bool.
+    Reads ``physics`` ``[*B, S]`` float64 (through a model ``state`` ``[*B, N, 13]``), and ``task`` and ``plan`` if
+    present; writes ``action`` ``[*B, A]`` and ``plan``: remaining ``actions`` ``[*B, H, A]`` float64 and ``planned``
+    ``[*B, 1]`` bool.
 
     Args:
-        env: the true physics, with a differentiable reward ``(state, action, next_state, task) -> [*B, 1]``.
+        env: true physics or model, with a differentiable reward ``(state, action, next_state, task) -> [*B, 1]``. A
+            specialised model plans many times faster. Models that carry entries from step to step, or read parameters
+            of each sample, are refused.
         horizon: control steps ``H`` to plan ahead.
         warm_up: iterations of a first plan, from the best of some random sequences. Default: ten times ``iterations``.
         control_cost: quadratic cost per control and step, of a control at its bound; keep it below a step's reward.
@@ -44,7 +57,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         seed: default: drawn from torch's global generator.
 
     Raises:
-        TypeError: ``env`` is no :class:`~torchrl_gn.envs.SceneEnv`.
+        TypeError: ``env`` is neither environment, or its model is no predictor.
         ValueError: reward, actions or bounds are missing, an option is out of range, or an entry does not fit.
 
     Example:
@@ -58,7 +71,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
 
     def __init__(
         self,
-        env: SceneEnv,
+        env: SceneEnv | ModelEnv,
         horizon: int,
         iterations: int = 3,
         warm_up: int | None = None,
@@ -68,11 +81,21 @@ class ILQGPlanner(RecedingHorizonPlanner):
         seed: int | None = None,
         num_threads: int | None = None,
     ):
-        if not isinstance(env, SceneEnv):
+        if not isinstance(env, (SceneEnv, ModelEnv)):
             raise TypeError(
-                f"ILQGPlanner needs the true physics of a SceneEnv, got {type(env).__name__}; for a transformed"
-                " environment give its base_env."
+                f"ILQGPlanner needs a SceneEnv or a ModelEnv, got {type(env).__name__}; for a transformed environment"
+                " give its base_env."
             )
+        if isinstance(env, ModelEnv):
+            predictor = env.predictor
+            if not isinstance(predictor, Predictor):
+                raise TypeError(f"ILQGPlanner needs a Predictor as model, got {type(env.world_model).__name__}.")
+            if env.carried_keys or predictor.parameters_key is not None:
+                raise ValueError(
+                    f"ILQGPlanner plans through models of state and action alone; {env} also reads"
+                    f" {[*env.carried_keys, *([predictor.parameters_key] if predictor.parameters_key else [])]}: use"
+                    " GradientPlanner."
+                )
         threads = 1 if num_threads is None else num_threads
         check_plannable(env, warm_up, horizon=horizon, iterations=iterations, num_threads=threads)
         if not 0 <= control_cost < math.inf:
@@ -82,22 +105,26 @@ class ILQGPlanner(RecedingHorizonPlanner):
         self.warm_up = 10 * iterations if warm_up is None else warm_up
         self.control_cost, self.central, self.num_threads = control_cost, central, num_threads
         self._rng = numpy_generator(seed)
-        self._simulators: dict[int, Simulator] = {}
+        self._plants: dict[int, Plant] = {}
         self._warned = False
 
-    def simulator(self, variant: int = 0) -> Simulator:
-        """Simulator of one of the environment's scenes."""
-        env = self._scene_env
-        if self.num_threads is None and len(env.scenes) == 1:
-            return env.simulator
-        if variant not in self._simulators:
-            threads = env.num_threads if self.num_threads is None else self.num_threads
-            self._simulators[variant] = Simulator(env.scenes[variant], threads)
-        return self._simulators[variant]
+    def plant(self, variant: int = 0) -> Plant:
+        """What is planned on: of the true physics, one of the environment's scenes."""
+        env = self._env
+        if variant not in self._plants:
+            if isinstance(env, ModelEnv):
+                self._plants[variant] = LearnedPlant(cast(Predictor, env.predictor))
+            elif self.num_threads is None and len(env.scenes) == 1:
+                self._plants[variant] = SimulatedPlant(env.simulator, central=self.central)
+            else:
+                threads = env.num_threads if self.num_threads is None else self.num_threads
+                simulator = Simulator(env.scenes[variant], threads)
+                self._plants[variant] = SimulatedPlant(simulator, central=self.central)
+        return self._plants[variant]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Transform for the environment that resets the plan when an episode begins."""
-        return plan_primer(self._plan_shape, torch.float64, self._scene_env.device)
+        return plan_primer(self._plan_shape, torch.float64, self._env.device)
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
         actions = self.plan(tensordict)
@@ -105,39 +132,48 @@ class ILQGPlanner(RecedingHorizonPlanner):
 
     def plan(self, tensordict: TensorDictBase) -> Tensor:
         """Planned actions ``[*B, H, A]``, float64, from the states of a TensorDict ``[*B]``."""
-        env = self._scene_env
-        size = env.scene.physics_size
-        physics = cast("Tensor | None", tensordict.get("physics", None))
-        if physics is None:
-            raise KeyError("ILQGPlanner needs an entry 'physics', the full MuJoCo state, as a SceneEnv writes.")
-        if physics.shape != (*tensordict.shape, size):
-            raise ValueError(f"'physics' must be {[*tensordict.shape, size]}, got {list(physics.shape)}")
+        env = self._env
+        starts = self._starts(tensordict)
         actions, planned = read_plan(tensordict, self._plan_shape, torch.float64)
         task = cast(Any, tensordict.get("task", None))
-        states = physics.detach().reshape(-1, size).cpu().numpy()
         plans = actions.detach().reshape(-1, *self._plan_shape).cpu().numpy().copy()
         resumed = planned.reshape(-1).tolist()
         tasks = None if task is None else _flat(task, len(tensordict.shape))
-        variant = env.variant_of(tensordict)
-        variants = [0] * len(states) if variant is None else variant.flatten().tolist()
-        for row, state in enumerate(states):
-            plan = plans[row] if resumed[row] else None
-            task = None if tasks is None else tasks[row]
-            plans[row] = self._plan_row(self.simulator(variants[row]), state, plan, task)
+        variant = env.variant_of(tensordict) if isinstance(env, SceneEnv) else None
+        variants = [0] * len(starts) if variant is None else variant.flatten().tolist()
+        with frozen(env) if isinstance(env, ModelEnv) else contextlib.nullcontext():
+            for row, start in enumerate(starts):
+                plan = plans[row] if resumed[row] else None
+                task = None if tasks is None else tasks[row]
+                plans[row] = self._plan_row(self.plant(variants[row]), start, plan, task)
         return torch.from_numpy(plans).reshape(actions.shape).to(actions.device)
 
-    def _plan_row(self, simulator: Simulator, physics: np.ndarray, plan: np.ndarray | None, task: Any) -> np.ndarray:
-        env = self._scene_env
+    def _starts(self, tensordict: TensorDictBase) -> np.ndarray:
+        """The plants' states ``[prod(B), S]``."""
+        env = self._env
+        key, shape = ("physics", (env.scene.physics_size,))
+        if isinstance(env, ModelEnv):
+            key, shape = "state", (env.scene.num_nodes, env.scene.state_size)
+        found = cast("Tensor | None", tensordict.get(key, None))
+        if found is None:
+            what = "state of the bodies" if key == "state" else "full MuJoCo state, as a SceneEnv writes"
+            raise KeyError(f"ILQGPlanner needs an entry {key!r}, the {what}.")
+        if found.shape != (*tensordict.shape, *shape):
+            raise ValueError(f"{key!r} must be {[*tensordict.shape, *shape]}, got {list(found.shape)}")
+        return found.detach().double().reshape(tensordict.numel(), -1).cpu().numpy()
+
+    def _plan_row(self, plant: Plant, start: np.ndarray, plan: np.ndarray | None, task: Any) -> np.ndarray:
+        env = self._env
         reward = RewardExpansion(cast(Any, env.reward), task, env.device)
-        solver = ILQGSolver(simulator, reward, control_cost=self.control_cost, central=self.central)
+        solver = ILQGSolver(plant, reward, control_cost=self.control_cost)
         iterations = self.warm_up if plan is None else self.iterations
         rest = np.zeros((1, *self._plan_shape))
         attempts: list[Callable[[], np.ndarray]] = [] if plan is None else [lambda: plan[None]]
         attempts += [lambda: spline_controls(env.scene, _INITIAL_SAMPLES, self.horizon, self._rng), lambda: rest]
         for sequences in attempts:
-            start = solver.simulate(physics, solver.controls(sequences()))
-            if math.isfinite(start.cost):
-                return solver.actions(solver.improve(start, iterations).controls)
+            best = solver.follow(start, solver.controls(sequences()))
+            if math.isfinite(best.cost):
+                return solver.actions(solver.improve(best, iterations).controls)
         if not self._warned:
             self._warned = True
             warnings.warn(
@@ -151,16 +187,16 @@ class ILQGPlanner(RecedingHorizonPlanner):
         return solver.actions(solver.controls(rest[0])) if plan is None else plan
 
     @property
-    def _scene_env(self) -> SceneEnv:
-        return cast(SceneEnv, self.env)
+    def _env(self) -> SceneEnv | ModelEnv:
+        return cast(Any, self.env)
 
     @property
     def _plan_shape(self) -> tuple[int, int]:
-        return (self.horizon, self._scene_env.scene.num_actions)
+        return (self.horizon, self._env.scene.num_actions)
 
     def __getstate__(self) -> dict:
         # Copies and worker processes start their own threads and MuJoCo data.
-        return {**super().__getstate__(), "_simulators": {}}
+        return {**super().__getstate__(), "_plants": {}}
 
 
 def _flat(task: Any, dims: int) -> Any:

@@ -1,17 +1,14 @@
-"""Control-limited iLQG of one trajectory on the true physics."""
+"""Control-limited iLQG of one trajectory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
-from torch import Tensor
 
-from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.planners.ddp import QuadraticModel, backward_pass
-from torchrl_gn.planners.linearize import RewardExpansion, Tangent, linearize
+from torchrl_gn.planners.linearize import Linearization, RewardExpansion
+from torchrl_gn.planners.plant import Paths, Plant
 
 # Candidates of an iteration, simulated at once: every damping (as a multiple of the last successful one) and step size.
 _DAMPINGS = np.array([0.0, 0.01, 0.1, 1.0, 10.0])
@@ -24,12 +21,12 @@ _STATE_DAMPING = 0.3  # relative to the controls'
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A simulated sequence of ``H`` control steps."""
+    """A sequence of ``H`` control steps."""
 
     controls: np.ndarray  # [H, A], in units of half their range, -1 to 1
-    physics: np.ndarray  # [H + 1, S], MuJoCo states
+    path: np.ndarray  # [H + 1, S], the plant's states
     state: np.ndarray  # [H + 1, N, 13], body states
-    cost: float  # control costs minus rewards, infinite if the simulation was unstable
+    cost: float  # control costs minus rewards, infinite if it was unstable
 
 
 class ILQGSolver:
@@ -41,11 +38,9 @@ class ILQGSolver:
     ``control_cost`` is that of a control at its bound.
     """
 
-    def __init__(self, simulator: Simulator, reward: RewardExpansion, *, control_cost: float, central: bool):
-        self.simulator, self.reward = simulator, reward
-        self.control_cost, self.central = control_cost, central
-        self.scene = simulator.scene
-        self.tangent = Tangent(self.scene.model)
+    def __init__(self, plant: Plant, reward: RewardExpansion, *, control_cost: float):
+        self.plant, self.reward, self.control_cost = plant, reward, control_cost
+        self.scene = plant.scene
         self._middle = 0.5 * (self.scene.action_high + self.scene.action_low)
         self._half = 0.5 * (self.scene.action_high - self.scene.action_low)
 
@@ -59,23 +54,24 @@ class ILQGSolver:
         actions = self._middle + self._half * controls
         return np.clip(actions, self.scene.action_low, self.scene.action_high)  # rounding
 
-    def simulate(self, physics: np.ndarray, controls: np.ndarray) -> Trajectory:
+    def follow(self, start: np.ndarray, controls: np.ndarray) -> Trajectory:
         """The best of ``n`` control sequences ``[n, H, A]`` from one state ``[S]``."""
-        simulated = self.simulator.rollout(np.tile(physics, (len(controls), 1)), self.actions(controls))
-        paths, states, stable = (cast(Tensor, simulated[key]).numpy() for key in ("physics", "state", "stable"))
-        return self._best(controls, paths, states, stable)[0]
+        return self._best(controls, self.plant.rollout(start, self.actions(controls)))[0]
 
     def improve(self, trajectory: Trajectory, iterations: int) -> Trajectory:
         """Improve a stable trajectory; the cost never rises."""
         damping = 1.0
+        local: Linearization | None = None
+        model: QuadraticModel | None = None
         for _ in range(iterations):
-            model = self.expand(trajectory)
+            if local is None or model is None:
+                local, model = self.expand(trajectory)
             scale = np.sqrt(np.square(model.control_gradient()).mean())
             if not (np.isfinite(scale) and np.isfinite(model.hessian).all()) or scale == 0:
                 return trajectory  # stationary, or no finite expansion
-            candidate, factor = self._best_candidate(trajectory, model, damping, scale)
+            candidate, factor = self._best_candidate(trajectory, local, model, damping, scale)
             if candidate.cost < trajectory.cost:
-                trajectory = candidate
+                trajectory, local, model = candidate, None, None
                 damping = float(np.clip(damping * (factor or 1.0), *_DAMPING_RANGE))
             elif damping >= _DAMPING_RANGE[1]:
                 return trajectory
@@ -83,12 +79,11 @@ class ILQGSolver:
                 damping *= _FAILURE_FACTOR
         return trajectory
 
-    def expand(self, trajectory: Trajectory) -> QuadraticModel:
-        """Second-order model of the cost around a trajectory."""
-        size, steps = self.tangent.size, len(trajectory.controls)
-        num = self.scene.num_actions
+    def expand(self, trajectory: Trajectory) -> tuple[Linearization, QuadraticModel]:
+        """Linear model of the dynamics and second-order model of the cost around a trajectory."""
         actions, state = self.actions(trajectory.controls), trajectory.state
-        local = linearize(self.simulator, trajectory.physics, actions, central=self.central)
+        local = self.plant.linearize(trajectory.path, actions)
+        size, steps, num = local.bodies.shape[2], len(actions), self.scene.num_actions
         dynamics = local.dynamics.copy()
         dynamics[..., size:] *= self._half
         bodies = np.concatenate([local.bodies[:-1], np.zeros((steps, local.bodies.shape[1], num))], axis=2)
@@ -104,50 +99,34 @@ class ILQGSolver:
             gradient[:, size:] += 2 * self.control_cost * trajectory.controls
             hessian[:, range(size, size + num), range(size, size + num)] += 2 * self.control_cost
         lower, upper = -1.0 - trajectory.controls, 1.0 - trajectory.controls
-        return QuadraticModel(dynamics, gradient, hessian, lower, upper)
+        return local, QuadraticModel(dynamics, gradient, hessian, lower, upper)
 
     def _best_candidate(
-        self, trajectory: Trajectory, model: QuadraticModel, damping: float, scale: float
+        self, trajectory: Trajectory, local: Linearization, model: QuadraticModel, damping: float, scale: float
     ) -> tuple[Trajectory, float]:
         """The best trajectory of all dampings and step sizes, and its damping relative to ``damping``."""
         control_damping = scale * np.maximum(damping * _DAMPINGS, _MIN_DAMPING)
         # In the states' units, by the mean squared effect of a control on the next state.
-        effect = np.square(model.dynamics[..., self.tangent.size :]).sum(axis=1).mean()
+        effect = np.square(model.dynamics[..., local.bodies.shape[2] :]).sum(axis=1).mean()
         state_damping = _STATE_DAMPING * control_damping / max(effect, np.finfo(np.float64).tiny)
         with np.errstate(all="ignore"):  # lightly damped candidates may overflow: they lose
             changes, gains = backward_pass(model, control_damping, state_damping)
             which = np.repeat(np.arange(len(_DAMPINGS)), len(_STEP_SIZES))
             step = np.tile(_STEP_SIZES, len(_DAMPINGS))[:, None]
+            controls = np.empty((len(which), *trajectory.controls.shape))
 
-            def policy(t: int, physics: np.ndarray) -> np.ndarray:
-                deviation = self.tangent.subtract(physics, trajectory.physics[t])
-                feedback = (gains[t, which] @ deviation[..., None])[..., 0]
-                return np.clip(trajectory.controls[t] + step * changes[t, which] + feedback, -1.0, 1.0)
+            def policy(t: int, states: np.ndarray) -> np.ndarray:
+                feedback = (gains[t, which] @ local.deviation(t, states)[..., None])[..., 0]
+                controls[:, t] = np.clip(trajectory.controls[t] + step * changes[t, which] + feedback, -1.0, 1.0)
+                return self.actions(controls[:, t])
 
-            results = self._simulate_policy(trajectory.physics[0], policy, len(which), len(trajectory.controls))
-        best, index = self._best(*results)
+            paths = self.plant.follow(trajectory.path[0], len(which), len(trajectory.controls), policy)
+        best, index = self._best(controls, paths)
         return best, float(_DAMPINGS[which[index]])
 
-    def _simulate_policy(
-        self, physics: np.ndarray, policy: Callable[[int, np.ndarray], np.ndarray], count: int, steps: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Simulate ``count`` copies of a state: controls, MuJoCo states, body states, and whether stable."""
-        controls = np.empty((count, steps, self.scene.num_actions))
-        paths = np.empty((count, steps + 1, len(physics)))
-        states = np.empty((count, steps + 1, self.scene.num_nodes, 13))
-        paths[:, 0] = physics
-        for t in range(steps):
-            controls[:, t] = policy(t, paths[:, t])
-            paths[:, t + 1], states[:, t] = self.simulator.step(paths[:, t], self.actions(controls[:, t]))
-        # One more step observes the last state, and whether it is stable.
-        beyond, states[:, steps] = self.simulator.step(paths[:, steps], self.actions(controls[:, -1]))
-        stable = np.asarray(np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(beyond).all(axis=1))
-        return controls, paths, states, stable
-
-    def _best(
-        self, controls: np.ndarray, paths: np.ndarray, states: np.ndarray, stable: np.ndarray
-    ) -> tuple[Trajectory, int]:
+    def _best(self, controls: np.ndarray, followed: Paths) -> tuple[Trajectory, int]:
         """The cheapest of ``n`` trajectories and its index; unstable ones and rewards not finite cost infinity."""
+        paths, states, stable = followed
         costs = np.full(len(controls), np.inf)
         if stable.any():
             bodies, used = states[stable], controls[stable]

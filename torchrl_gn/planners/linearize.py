@@ -59,7 +59,8 @@ class Linearization:
     """Jacobians along a trajectory of ``T`` control steps, NaN where a simulation was unstable."""
 
     dynamics: np.ndarray  # [T, X, X + A], of the next state by state and action
-    bodies: np.ndarray  # [T + 1, N * 13, X], of the body states (entry `state`) by the MuJoCo state at the same time
+    bodies: np.ndarray  # [T + 1, N * 13, X], of the body states (entry `state`) by the state at the same time
+    deviation: Callable[[int, np.ndarray], np.ndarray]  # changes [*B, X] from the state of a time to others [*B, S]
 
 
 def linearize(
@@ -94,7 +95,11 @@ def linearize(
     dynamics = tangent.subtract(after_plus[:-1], after_minus[:-1]) / widths[:-1, :, None]
     minus = bodies_minus[:, : tangent.size]
     bodies = (bodies_plus[:, : tangent.size] - minus) / widths[:, : tangent.size, None]
-    return Linearization(dynamics.swapaxes(1, 2), bodies.swapaxes(1, 2))
+
+    def deviation(t: int, others: np.ndarray) -> np.ndarray:
+        return tangent.subtract(others, physics[t])
+
+    return Linearization(dynamics.swapaxes(1, 2), bodies.swapaxes(1, 2), deviation)
 
 
 def _perturb_controls(

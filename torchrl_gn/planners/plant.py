@@ -1,0 +1,142 @@
+"""What iLQG plans on: the true physics, or a learned model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.planners.linearize import Linearization, Tangent, linearize
+from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
+
+Paths = tuple[np.ndarray, np.ndarray, np.ndarray]  # states [n, H + 1, S], their bodies [n, H + 1, N, C], stable [n]
+Policy = Callable[[int, np.ndarray], np.ndarray]  # step and states [n, S] to actions [n, A]
+
+
+class Plant(Protocol):
+    """Dynamics of ``n`` copies of one state ``[S]``, in arrays of float64."""
+
+    scene: Scene
+
+    def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
+        """Follow action sequences ``[n, H, A]``."""
+        ...
+
+    def follow(self, start: np.ndarray, count: int, steps: int, policy: Policy) -> Paths:
+        """Follow a policy for ``steps``."""
+        ...
+
+    def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:
+        """Jacobians along states ``[H + 1, S]`` under ``actions`` ``[H, A]``."""
+        ...
+
+
+class SimulatedPlant:
+    """MuJoCo; states are its full physics states, changes those of :class:`~torchrl_gn.planners.linearize.Tangent`."""
+
+    def __init__(self, simulator: Simulator, *, central: bool = False) -> None:
+        self.simulator, self.central = simulator, central
+        self.scene = simulator.scene
+        self.tangent = Tangent(self.scene.model)
+
+    def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
+        simulated = self.simulator.rollout(np.tile(start, (len(actions), 1)), actions)
+        return tuple(simulated[key].numpy() for key in ("physics", "state", "stable"))  # pyright: ignore
+
+    def follow(self, start: np.ndarray, count: int, steps: int, policy: Policy) -> Paths:
+        paths = np.empty((count, steps + 1, len(start)))
+        bodies = np.empty((count, steps + 1, self.scene.num_nodes, 13))
+        paths[:, 0], actions = start, np.empty(0)
+        for t in range(steps):
+            actions = policy(t, paths[:, t])
+            paths[:, t + 1], bodies[:, t] = self.simulator.step(paths[:, t], actions)
+        # One more step observes the last state, and whether it is stable.
+        beyond, bodies[:, steps] = self.simulator.step(paths[:, steps], actions)
+        stable = np.asarray(np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(beyond).all(axis=1))
+        return paths, bodies, stable
+
+    def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:
+        return linearize(self.simulator, path, actions, central=self.central)
+
+
+class LearnedPlant:
+    """A learned model; states are its flattened body states.
+
+    Changes are those of MuJoCo's positions and velocities where joint coordinates follow from body states, which takes
+    ``2 nv`` gradients of the model a step; else of all ``N C`` channels.
+    """
+
+    def __init__(self, predictor: Predictor) -> None:
+        self.predictor, self.scene = predictor, predictor.scene
+        self._shape = self.scene.num_nodes, self.scene.state_size
+        self._coordinates: JointCoordinates | None = None
+        if isinstance(self.scene, Scene):
+            try:
+                self._coordinates, self._simulator = JointCoordinates(self.scene), Simulator(self.scene, 1)
+            except UnsupportedSceneError:
+                pass
+
+    def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
+        state = torch.from_numpy(np.tile(start, (len(actions), 1))).unflatten(-1, self._shape)
+        with torch.no_grad():
+            bodies = self.predictor.rollout(state, torch.from_numpy(actions))[0].numpy()
+        return bodies.reshape(*bodies.shape[:2], -1), bodies, np.isfinite(bodies).all(axis=(1, 2, 3))
+
+    def follow(self, start: np.ndarray, count: int, steps: int, policy: Policy) -> Paths:
+        bodies = np.empty((count, steps + 1, *self._shape))
+        bodies[:, 0] = start.reshape(self._shape)
+        paths = bodies.reshape(count, steps + 1, -1)
+        with torch.no_grad():
+            for t in range(steps):
+                actions = torch.from_numpy(policy(t, paths[:, t]))
+                bodies[:, t + 1] = self.predictor.step(torch.from_numpy(bodies[:, t].copy()), actions)[0].numpy()
+        return paths, bodies, np.isfinite(paths).all(axis=(1, 2))
+
+    def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:
+        states, steps = path.reshape(-1, *self._shape), len(actions)
+        basis = self._basis(states)
+        inverse = np.linalg.pinv(basis) if self._coordinates is not None else basis
+        size = inverse.shape[1]
+        # Row i of a step's Jacobian is the gradient of change i of the next state.
+        leaves = [torch.from_numpy(np.repeat(each, size, axis=0)) for each in (states[:-1], actions)]
+        with torch.inference_mode(False), torch.enable_grad():
+            state, action = (each.requires_grad_() for each in leaves)
+            after = self.predictor.step(state, action)[0]
+            gradient = torch.from_numpy(inverse[1:].reshape(after.shape))
+            found = torch.autograd.grad(after, (state, action), gradient.to(after.dtype), allow_unused=True)
+        of_state, of_action = (
+            np.zeros((steps, size, leaf[0].numel())) if each is None else each.double().numpy().reshape(steps, size, -1)
+            for each, leaf in zip(found, leaves, strict=True)
+        )
+
+        def deviation(t: int, paths: np.ndarray) -> np.ndarray:
+            return (paths - path[t]) @ inverse[t].T
+
+        return Linearization(np.concatenate((of_state @ basis[:-1], of_action), axis=2), basis, deviation)
+
+    def _basis(self, states: np.ndarray) -> np.ndarray:
+        """Body states ``[T, N C, X]`` by the coordinates that changes are in."""
+        count, channels = len(states), self._shape[0] * self._shape[1]
+        if self._coordinates is None:
+            return np.broadcast_to(np.eye(channels), (count, channels, channels))
+        epsilon, tangent = 1e-6, Tangent(self.scene.model)
+        position, velocity = (each.numpy() for each in self._coordinates(torch.from_numpy(states)))
+        physics = np.zeros((count, self.scene.physics_size))
+        physics[:, 1 : 1 + self.scene.model.nq] = position
+        physics[:, 1 + self.scene.model.nq :][:, : self.scene.model.nv] = velocity
+        # Activations do not show in body states.
+        size = 2 * self.scene.model.nv
+        change = np.broadcast_to(epsilon * np.eye(tangent.size)[:size], (count, size, tangent.size))
+        ends = [self._simulator.observe(tangent.add(physics[:, None], step)).numpy() for step in (change, -change)]
+        basis = (ends[0] - ends[1]) / (2 * epsilon)
+        # The model's quaternions may have the other sign.
+        where = BODY_STATE.slices["orientation"]
+        flips = np.sign((ends[0][:, 0, :, where] * states[..., where]).sum(-1, keepdims=True))
+        basis[..., where] *= flips[:, None]
+        return basis.reshape(count, size, channels).swapaxes(1, 2)
