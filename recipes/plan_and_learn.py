@@ -42,7 +42,12 @@ def planning(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
     options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
     last = index == cfg.rounds
     planners = [cfg.planner, *(cfg.baselines if last else ())]
-    options += (f"video={str(last).lower()}", f"planner={override(planners)}", "gn.iterations=3", *as_list(cfg.planning))
+    options += (
+        f"video={str(last).lower()}",
+        f"planner={override(planners)}",
+        "gn.iterations=3",
+        *as_list(cfg.planning),
+    )
     return Run(MPC, folder / f"executed{index}", options, f"planning, round {index}")
 
 
