@@ -14,7 +14,7 @@ from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
 from torchrl_gn.dynamics.executors.native.tape import Tape
 from torchrl_gn.networks.layers import LayerList
 
-_ORDER = ("kernels.h", "network.h", "tape.h", "rollout.h")
+_ORDER = ("kernels.h", "network.h", "tape.h", "call.h", "rollout.h")
 _TYPES = {"i": "int32_t", "l": "int64_t", "f": "float", "d": "double"}
 
 
