@@ -21,6 +21,7 @@ from torchrl_gn.dynamics.features.feature import graph_edges
 from torchrl_gn.dynamics.normalization import in_range, scaled, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.program import Executor, StepProgram
+from torchrl_gn.finite import is_traced
 from torchrl_gn.networks.core import UnfoldedCore, dtype_of
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
@@ -216,8 +217,8 @@ class Predictor(TensorDictModuleBase):
 
     def training_executor(self, parameters: TensorDictBase | None = None) -> EagerExecutor | NativeDelta:
         """What predicts changes by its ``delta``, differentiable in states, actions and weights."""
-        # A compiler cannot ask which features vary; C++ has no gradient in parameters of physics.
-        if torch.compiler.is_compiling() or (self.model.physics is not None and self.model.physics.trained):
+        # What is traced cannot ask which features vary; C++ has no gradient in parameters of physics.
+        if is_traced() or (self.model.physics is not None and self.model.physics.trained):
             return EagerExecutor(self.program(parameters))
         program = self.program(parameters, reduced=True)
         if self._trainer is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import threading
 import warnings
 from typing import Any
@@ -130,6 +131,12 @@ class SpecializedPredictor(Predictor):
         modules = list(self.model.modules())
         owners: list[dict[str, Any]] = [module._parameters for module in modules]
         owners += [module._buffers for module in modules]
+        weights = itertools.chain.from_iterable(owner.values() for owner in owners)
+        if any(one is not None and torch._C._functorch.is_functorch_wrapped_tensor(one) for one in weights):
+            raise TypeError(
+                "A specialised model has a snapshot of its weights, which torch.func cannot exchange: stack or"
+                " differentiate the bound model."
+            )
         watched, casts = Watched(owners), self.model.casts  # before they are read: another thread may change them
         # Tensors made in inference mode could be neither overwritten nor differentiated outside.
         with torch.inference_mode(False), torch.no_grad():
