@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics import operators
@@ -132,7 +133,7 @@ class SpecializedPredictor(Predictor):
         owners: list[dict[str, Any]] = [module._parameters for module in modules]
         owners += [module._buffers for module in modules]
         weights = itertools.chain.from_iterable(owner.values() for owner in owners)
-        if any(one is not None and torch._C._functorch.is_functorch_wrapped_tensor(one) for one in weights):
+        if any(one is not None and is_functorch_wrapped_tensor(one) for one in weights):
             raise TypeError(
                 "A specialised model has a snapshot of its weights, which torch.func cannot exchange: stack or"
                 " differentiate the bound model."
