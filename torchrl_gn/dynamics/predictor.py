@@ -77,14 +77,6 @@ class Predictor(TensorDictModuleBase):
         self.strict, self.reference = strict, reference
         self._trainer: NativeDelta | None = None
 
-        with torch.device("cpu"):  # the scene's constants have numbers, also where weights are on the meta device
-            self._read_scene(scene, parameter_names)
-        self.to(model.residual_normalizer.mean.device)
-        warn_of_unseen(self, self.scene_parameters, scene.name, stacklevel=4)
-
-    def _read_scene(self, scene: Scene, parameter_names: ParameterNames | None) -> None:
-        """Register what of the scene the step reads."""
-        model, parameters_key = self.model, self.parameters_key
         self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
         self.incidence = Incidence(graph_edges(scene, model.features), scene.num_nodes, predicted)
@@ -103,6 +95,8 @@ class Predictor(TensorDictModuleBase):
         self.parameter_reader = ParameterReader(
             model, scene, parameters_key, project=self.projection is not None, brought=parameter_names
         )
+        self.to(model.residual_normalizer.mean.device)
+        warn_of_unseen(self, self.scene_parameters, scene.name, stacklevel=4)
 
     @property
     def scene_parameters(self) -> PhysicalParameters:
@@ -169,10 +163,7 @@ class Predictor(TensorDictModuleBase):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase, *_: Tensor, **__: Tensor) -> TensorDictBase:
-        """Write the predicted next state into ``tensordict`` and return it.
-
-        Entries may come one by one, as ``torch.export`` gives them.
-        """
+        """Write the predicted next state into ``tensordict``, or return it for entries that come one by one."""
         state, action = (tensordict[key] for key in self.in_keys[:2])
         after, hidden = self.step(state, action, self.parameters_in(tensordict), self.hidden_state_in(tensordict))
         tensordict.set(self.out_keys[0], after)
