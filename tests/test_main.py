@@ -120,3 +120,12 @@ def test_it_runs_as_a_module():
     )
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert done.stderr.startswith("torchrl-gn: Unknown scene 'nothing_like_it'.")
+
+
+@pytest.mark.slow
+def test_a_reader_that_has_enough_ends_it_quietly():
+    command = [sys.executable, "-m", "torchrl_gn", "show", "pendulum"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 0

@@ -22,7 +22,7 @@ PACKAGE = Path(torchrl_gn.__file__).parent
 # A folder imports from itself and from those before it: the data flow is the reading order.
 ORDER = (
     "scenes", "data", "maths", "networks", "dynamics", "identification", "policies", "rewards",
-    "objectives", "envs", "planners", "evaluation", "training",
+    "objectives", "drawing", "envs", "planners", "evaluation", "training",
 )  # fmt: skip
 # Earlier folders that a folder does not import either.
 APART = {
@@ -33,13 +33,14 @@ APART = {
     "policies": {"data", "dynamics", "identification"},
     "rewards": {"data", "networks", "dynamics", "identification", "policies"},
     "objectives": {"data", "rewards"},
+    "drawing": {"data", "networks", "dynamics", "identification", "policies", "rewards", "objectives"},
 }
 ALLOWED = {folder: {*ORDER[:index], folder} - APART.get(folder, set()) for index, folder in enumerate(ORDER)}
 ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders, which import none of them
 ABOVE = {"__init__", "__main__", "doctor"}  # these may import all folders, and no folder imports them
 LONGEST = 300
 LATER = (ast.FunctionDef, ast.AsyncFunctionDef)  # what is imported in there is not when the package is
-WITH_PILLOW = {"drawing.py"}  # imported to draw a video, once Pillow was found
+WITH_PILLOW = {"panels.py"}  # imported to draw a video, once Pillow was found
 # The names of ``import torchrl_gn``.
 PUBLIC = {
     "data": ["collect_trajectories", "create_dataset", "load_dataset", "trajectory_buffer"],

@@ -30,6 +30,7 @@ PARTS = {
     "policies": "policies.md",
     "rewards": "envs.md#rewards",
     "objectives": "objectives.md",
+    "drawing": "evaluation.md",
     "envs": "envs.md",
     "planners": "planning.md",
     "evaluation": "evaluation.md",

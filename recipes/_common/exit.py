@@ -6,9 +6,10 @@ import functools
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import ParamSpec, TypeVar
 
+from _common.options import check_options
 from torchrl_gn.training import RunFolder
 
 P = ParamSpec("P")
@@ -16,7 +17,7 @@ R = TypeVar("R")
 
 
 def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
-    """Let a recipe's main function end cleanly.
+    """Check the options of a recipe's main function, see :func:`check_options`, and let it end cleanly.
 
     Errors that a user can fix (a bad option, file or data set, an unstable simulation) print one line to standard error
     and exit with code 1. Ctrl-C exits with 130 and SIGTERM with 143, after the recipe has saved what it has and printed
@@ -28,6 +29,9 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
         in_main = threading.current_thread() is threading.main_thread()
         before = signal.signal(signal.SIGTERM, _interrupt) if in_main else None
         try:
+            for options in args:
+                if isinstance(options, Mapping):
+                    check_options(options)
             return main(*args, **kwargs)
         except KeyboardInterrupt as interrupt:
             sys.stderr.write(f"Interrupted; {RunFolder.what_is_kept()}\n")

@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+from _common.options import unknown_options
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
-    """Let `--help` print a recipe's docstring, and its options with their comments.
+    """Let `--help` print a recipe's docstring and its options with their comments, and say what a mistyped one may be.
 
     Put it above ``@hydra.main``, whose own help has neither. Reads the options from ``config/<recipe>.yaml`` beside the
     recipe, and from the file of each group in its defaults (``config/task/swimmer6.yaml``) or on the command line.
@@ -23,9 +25,14 @@ def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
 
     @functools.wraps(main)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R | None:
-        if not {"--help", "-h"} & set(sys.argv[1:]):
-            return main(*args, **kwargs)
         recipe = Path(inspect.getfile(inspect.unwrap(main)))
+        if not {"--help", "-h"} & set(sys.argv[1:]):
+            try:
+                return main(*args, **kwargs)
+            except SystemExit as end:
+                for hint in unknown_options(sys.argv[1:], recipe) if end.code == 1 else ():
+                    sys.stderr.write(f"{hint}\n")
+                raise
         said = (sys.modules[main.__module__].__doc__ or "").strip()
         text = (recipe.parent / "config" / f"{recipe.stem}.yaml").read_text()
         sys.stdout.write("\n".join([f"{said}\n", commented_options(text), *_groups(text, recipe.parent / "config")]))

@@ -1,10 +1,28 @@
-"""Options of a recipe as plain values."""
+"""Options of a recipe as plain values, and refusals of bad ones before work begins."""
 
 from __future__ import annotations
 
-from typing import Any
+import difflib
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+from omegaconf import OmegaConf
 
 from torchrl_gn.training import plain_config
+from torchrl_gn.training.optimizers import Preset
+
+_PRESETS = list(get_args(Preset))
+# What options of these names must be, wherever they stand.
+_RULES: list[tuple[str, Callable[[Any], bool], str]] = [
+    (r"optimizer", lambda value: value in _PRESETS, f"one of {_PRESETS}"),
+    (r"(.*_)?lr|checkpoint_seconds", lambda value: 0 < value < math.inf, "a positive, finite number"),
+    (r"(.*_)?batch_size|unroll_steps|threads|patience", lambda value: value >= 1 and value == int(value), "1 or more"),
+    (r"unroll_fraction", lambda value: 0 <= value <= 1, "a share, 0 to 1"),
+    (r"noise", lambda value: 0 <= value < math.inf, "0 or a positive, finite number"),
+]
 
 
 def as_list(value: Any) -> list[Any]:
@@ -13,3 +31,49 @@ def as_list(value: Any) -> list[Any]:
         return []
     plain = plain_config({"value": value})["value"]
     return plain if isinstance(plain, list) else [plain]
+
+
+def check_options(cfg: Mapping[str, Any]) -> None:
+    """Raise ValueError, naming it, for an optimiser, rate, batch or the like that no recipe could use; null passes."""
+    for name, value in _flat(plain_config(cfg)):
+        for pattern, fits, wanted in _RULES:
+            if value is None or isinstance(value, list) or not re.fullmatch(pattern, name.split(".")[-1]):
+                continue
+            try:
+                good = not isinstance(value, bool) and fits(value)
+            except (TypeError, ValueError, OverflowError):  # no number
+                good = False
+            if not good:
+                raise ValueError(f"{name}={value} must be {wanted}.")
+
+
+def unknown_options(words: Sequence[str], recipe: Path) -> list[str]:
+    """Of words of a recipe's command line that set options it does not have, what to write instead."""
+    folder = recipe.parent / "config"
+    known = set(_keys(folder / f"{recipe.stem}.yaml", ""))
+    for file in folder.glob("*/*.yaml"):
+        whole = file.read_text().startswith("# @package _global_")
+        known |= {file.parent.name, *_keys(file, "" if whole else f"{file.parent.name}.")}
+    hints = []
+    for key in (word.split("=", 1)[0] for word in words if "=" in word and not word.startswith(("+", "~", "hydra"))):
+        if key in known:
+            continue
+        # An option of a group may stand without the group's name.
+        short = {name.split(".")[-1]: name for name in sorted(known, reverse=True)} | {name: name for name in known}
+        near = difflib.get_close_matches(key, short, 1)
+        hints.append(f"There is no option {key!r}" + (f"; did you mean {short[near[0]]!r}?" if near else "."))
+    return hints
+
+
+def _keys(file: Path, prefix: str) -> Iterator[str]:
+    for name, _ in _flat(OmegaConf.to_container(OmegaConf.load(file)), prefix, groups=True):  # pyright: ignore
+        yield name
+
+
+def _flat(values: Any, prefix: str = "", *, groups: bool = False) -> Iterator[tuple[str, Any]]:
+    """Names and values of options, with ``groups`` those of groups too."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.", groups=groups)
+        if groups or not isinstance(value, Mapping):
+            yield f"{prefix}{name}", value

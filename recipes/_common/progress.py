@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -20,6 +21,8 @@ from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.run_folder import RunFolder
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
+
+_SHORT = 1000  # steps of a training of which every loss is recorded
 
 HORIZON = max(HORIZONS)
 """Steps of the longest rollouts that recipes measure."""
@@ -68,6 +71,12 @@ def cut_short_note(trainer: Trainer, folder: Path) -> str | None:
     )
 
 
+def say_finished(checkpoint: Path, amount: str, options: str) -> None:
+    """Say that a run which is started again had finished its training."""
+    folder = checkpoint.parent.parent
+    tqdm.write(f"The training in {folder} is finished ({amount}) and is evaluated again; raise {options} to go on.")
+
+
 @contextmanager
 def saving(save: Callable[[], None], seconds: Callable[[], float], every: float) -> Iterator[Callable[[], None]]:
     """Save on Ctrl-C; yield a function that saves if ``every`` seconds of ``seconds()`` passed since it last did."""
@@ -99,13 +108,15 @@ def train_with_progress(
     """Train with a progress bar; save regularly, on Ctrl-C and, with the best weights, at the end.
 
     With several processes, only rank 0 shows, logs (with prefix ``name``) and saves, every ``checkpoint_seconds`` of
-    ``config``. Returns ``"seconds"`` and mean ``"loss"`` of every 100 steps.
+    ``config``. Returns ``"seconds"`` and mean ``"loss"`` of every 100 steps; of budgets up to 1,000 steps every loss.
     """
     prefix = f"{name}/" if name else ""
     curves: dict[str, list] = {"seconds": [], "loss": []}
     if resumed is not None:
         trainer.load_state_dict(resumed.training)
         curves = resumed.training["curves"]
+        if trainer.fraction >= 1 and trainer.workers.first:
+            say_finished(path, f"{trainer.step:,} steps, {trainer.seconds / 60:.3g} minutes", "steps= or minutes=")
     if not trainer.workers.first:
         for _ in trainer.run():
             pass
@@ -115,6 +126,7 @@ def train_with_progress(
         state = {**trainer.state_dict(), "curves": curves}
         save_checkpoint(path, trainer.model, scene=scene, config=config, training=state)
 
+    every = 1 if (trainer.budget.steps or math.inf) <= _SHORT else 100
     losses: list[float] = []
     options: dict[str, Any] = {
         "desc": f"training {name}".strip(),
@@ -129,7 +141,7 @@ def train_with_progress(
     ):
         for progress in trainer.run():
             losses.append(progress.loss)
-            if progress.step % 100 == 0:
+            if progress.step % every == 0 or progress.fraction >= 1:
                 mean = sum(losses) / len(losses)
                 losses.clear()
                 curves["seconds"].append(progress.seconds)
@@ -151,6 +163,8 @@ def learn_with_progress(
     """Train a policy with a progress bar; save every ``checkpoint_seconds`` of ``config``, on Ctrl-C and at the end."""
     if resumed is not None:
         trainer.load_state_dict(resumed.training)
+        if trainer.frames >= trainer.total:
+            say_finished(path, f"{trainer.frames:,} frames", "trainer.frames=")
 
     def save() -> None:
         save_checkpoint(path, trainer.agent, config=config, training=trainer.state_dict())

@@ -175,3 +175,24 @@ def test_actions_beyond_the_limits_do_what_those_at_the_limits_do(scenes, make_m
     assert not torch.equal(action, cut)
     for model in (bound, specialize(bound)):
         assert torch.equal(model.step(state, action)[0], model.step(state, cut)[0])
+
+
+def test_binds_on_the_meta_device(scenes, make_model):
+    expected = make_model(scenes["cheetah"]).bind(scenes["cheetah"])
+    made = [make_model(scenes["cheetah"]).to("meta").bind(scenes["cheetah"])]
+    with torch.device("meta"):
+        made.append(make_model(scenes["cheetah"], fitted=False).bind(scenes["cheetah"]))
+    for predictor in made:
+        assert all(each.is_meta for each in (*predictor.parameters(), *predictor.buffers()))
+        shapes = {name: each.shape for name, each in predictor.state_dict().items()}
+        assert shapes == {name: each.shape for name, each in expected.state_dict().items()}
+        state, action = torch.empty(3, 8, 13, device="meta"), torch.empty(3, 6, device="meta")
+        assert predictor.step(state, action)[0].shape == (3, 8, 13)
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_torch_export_takes_a_bound_model(scenes, make_model, random_states, random_actions, strict):
+    predictor = make_model(scenes["swimmer6"]).bind(scenes["swimmer6"]).requires_grad_(False)
+    inputs = random_states(predictor.scene, 3), random_actions(predictor.scene, 3)
+    exported = torch.export.export(predictor, inputs, strict=strict).module()
+    torch.testing.assert_close(exported(*inputs), predictor.step(*inputs)[0])

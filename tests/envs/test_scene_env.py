@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv, check_env_specs
+from torchrl.record import PixelRenderTransform
 
 from torchrl_gn.data import Simulator
-from torchrl_gn.envs import SceneEnv
-from torchrl_gn.rewards import make_reward
+from torchrl_gn.envs import ModelEnv, SceneEnv, batched
+from torchrl_gn.rewards import Velocity, make_reward
+from torchrl_gn.scenes import load_scene
 
 from .. import zoo
 
@@ -199,3 +203,68 @@ def test_no_gradient_passes(pendulum):
     start["action"] = torch.zeros(3, 1, requires_grad=True)
     after = env.step(start)["next"]
     assert not any(value.requires_grad for value in after.values())
+
+
+def test_a_scene_by_its_name_or_file(tmp_path):
+    assert SceneEnv("swimmer3", seed=0).rollout(2)["state"].shape == (2, 4, 13)
+    file = tmp_path / "cart.xml"
+    file.write_text(zoo.mjcf("cart"))
+    assert SceneEnv(file).scene.name == SceneEnv(str(file)).scene.name == "cart"
+
+
+def test_an_unstable_step_costs_a_learner_what_staying_would(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # MuJoCo's log file
+    for value, expected in ((-0.5, -50.0), (0.5, 0.0)):
+        env = SceneEnv(zoo.load("cart", ('gear="1"', 'gear="1e12"')), lambda s, a, n, t, v=value: v + 0 * a, seed=0)
+        for learning, reward in ((batched(env, 2), expected), (env, -1e6), (batched(env, 2).base_env, expected)):
+            start = learning.reset(batch(2))
+            start["action"] = torch.tensor([[1.0], [0.0]])
+            after = learning.step(start)["next"]
+            assert after["terminated"].flatten().tolist() == [True, False]
+            assert after["reward"].flatten().tolist() == [reward, value]
+    chosen = SceneEnv(env.scene, unstable_reward=-7.0)
+    assert batched(chosen, 2).base_env is chosen
+
+
+@pytest.mark.parametrize(
+    "done",
+    [
+        lambda state: state[..., 1, 11] > 0,
+        lambda state: state[..., 1, 11:12] > 0,
+        TensorDictModule(lambda state: state[..., 1, 11:12] > 0, in_keys=["state"], out_keys=["terminated"]),
+    ],
+)
+def test_episodes_end_where_a_function_says(pendulum, env, done):
+    start = env.reset(batch(20))
+    ends = SceneEnv(pendulum, done=done) if isinstance(env, SceneEnv) else ModelEnv(env.world_model, done=done)
+    after = ends.step(ends.rand_action(start))["next"]
+    expected = after["state"][..., 1, 11:12] > 0
+    assert torch.equal(after["terminated"], expected) and torch.equal(after["done"], expected)
+    check_env_specs(ends)
+    wrong = SceneEnv(pendulum, done=lambda state: state[..., 1, 11])
+    with pytest.raises(ValueError, match=r"done= must give 'terminated', bool \[20\] or \[20, 1\], got torch.float64"):
+        wrong.step(wrong.rand_action(wrong.reset(batch(20))))
+
+
+def test_pictures_of_states(pendulum, scene_env, model_env):
+    executed = scene_env.rollout(3)
+    pictures = scene_env.render(executed, size=64)
+    assert pictures.shape == (3, 64, 64, 3) and pictures.dtype == np.uint8
+    assert np.array_equal(pictures, model_env.render(executed.select("state"), size=64))
+    variants = SceneEnv([pendulum, load_scene("pendulum", parameters={"length": 0.3})])
+    first, second = variants.render(variants.rollout(1, tensordict=batch(2))[:, 0], size=64)
+    assert (first != second).any()
+    pixels = PixelRenderTransform(out_keys=["pixels"], pass_tensordict=True, size=64)
+    assert TransformedEnv(scene_env, pixels).rollout(2)["pixels"].shape == (2, 64, 64, 3)
+
+
+def test_a_reward_of_nan_is_named(pendulum, env):
+    def broken(state, action, next_state, task):
+        return next_state[..., 1, :1] * math.nan
+
+    good = make_reward("balance", pendulum)
+    bad = Velocity(pendulum, "pole", "x") * math.nan
+    for reward, name in ((broken, "broken"), (good + bad, "WeightedSum")):
+        made = SceneEnv(pendulum, reward) if isinstance(env, SceneEnv) else ModelEnv(env.world_model, reward)
+        with pytest.raises(ValueError, match=f"the reward .*{name}.* returned NaN"):
+            made.rollout(2)

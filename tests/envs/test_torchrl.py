@@ -14,10 +14,10 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
-from torchrl.modules import CEMPlanner, MPPIPlanner
+from torchrl.modules import CEMPlanner, MPPIPlanner, WorldModel
 from torchrl.objectives.value import TDLambdaEstimator
 
-from torchrl_gn.envs import ModelEnv, SceneEnv, batched
+from torchrl_gn.envs import ModelEnv, SceneEnv, batched, world_model_env
 from torchrl_gn.rewards import make_reward
 
 from .. import zoo
@@ -114,6 +114,22 @@ def test_a_batch_has_starts_of_its_own(env):
     for wrong in ((), (0,)):
         with pytest.raises(ValueError, match="at least 1"):
             batched(env, *wrong)
+
+
+def test_dreams_have_the_specs_of_the_scene(env, model_env):
+    model = model_env.world_model
+    step = ["state", "action", ("next", "state")]
+    world = WorldModel(
+        encoder=TensorDictModule(torch.nn.Identity(), in_keys=["state"], out_keys=["state"]),
+        dynamics=model,
+        reward_head=TensorDictModule(model_env.reward, in_keys=step, out_keys=[("next", "reward")]),
+    )
+    dreams, many = world_model_env(world, env, 2, 3), batched(env, 2, 3)
+    assert dreams.action_spec == many.action_spec and dreams.reward_spec == many.reward_spec
+    starts = many.reset().select("state")
+    dreamt = dreams.rollout(4, tensordict=starts.clone(), auto_reset=False)
+    assert dreamt["next", "reward"].shape == (2, 3, 4, 1) and dreamt["action"].shape == (2, 3, 4, 1)
+    torch.testing.assert_close(dreamt["state"][:, :, 0], starts["state"])
 
 
 def test_serial_env(pendulum):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
-from torchrl_gn.evaluation import canvas, rollout_frames, rollout_video
-from torchrl_gn.evaluation.drawing import convex_outline, nice_spacing
-from torchrl_gn.evaluation.geometry import SceneGeometry, choose_view
+from torchrl_gn.drawing import canvas
+from torchrl_gn.drawing.geometry import SceneGeometry, choose_view
+from torchrl_gn.drawing.panels import convex_outline, nice_spacing
+from torchrl_gn.evaluation import rollout_frames, rollout_video
 from torchrl_gn.evaluation.video import frame_stride
 from torchrl_gn.scenes import load_scene
 

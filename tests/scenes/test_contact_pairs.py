@@ -110,3 +110,13 @@ def test_the_paper_s_systems():
     found = {name: names(load_scene(name)) for name in ("pendulum", "cartpole", "acrobot", "swimmer6", "walker2d")}
     assert not any(found.values())  # their geoms' masks let them touch the floor alone, if anything
     assert names(load_scene("cheetah")) == {"torso - bfoot", "torso - bshin", "bthigh - bfoot", "torso - ffoot"}
+
+
+def test_print_does_not_look_for_the_pairs_of_a_large_scene():
+    balls = "".join(
+        f'<body pos="{x} 0 1"><freejoint/><geom size="0.05"/></body>' for x in range(33)
+    )  # 33 * 32 / 2 = 528 pairs
+    scene = load_scene(f"<mujoco><worldbody>{balls}</worldbody></mujoco>")
+    assert "528 pairs of geoms may collide; scene.contact_pairs finds which" in str(scene)
+    assert "contact_pairs" not in vars(scene)
+    assert len(scene.contact_pairs.nodes) > 0 and "can meet: " in str(scene)

@@ -118,13 +118,23 @@ def test_offline_wandb_run_holds_everything(tmp_path, monkeypatch, picture, vide
 
 
 def test_csv_run_holds_the_numbers(tmp_path):
-    tracker = Tracker("csv", tmp_path, name="run", config={"seed": 3})
+    def rows():
+        (path,) = tmp_path.glob("**/*.csv")
+        with path.open(newline="") as file:
+            return list(csv.reader(file))
+
+    tracker = Tracker("csv", tmp_path / "log", name="run", config={"seed": 3})
     for step, value in ((1, 0.5), (2, 0.25)):
-        tracker.log({"loss": value}, step)
+        tracker.log({"loss": value, "version/torch": "no number"}, step)
+    tracker.log_table("errors", [["a"], ["b"]])
     tracker.close()
-    (path,) = tmp_path.glob("**/loss.csv")
-    with path.open() as file:
-        assert [(int(step), float(value)) for step, value in csv.reader(file)] == [(1, 0.5), (2, 0.25)]
+    assert rows() == [["step", "loss"], ["1", "0.5"], ["2", "0.25"]]
+    tracker.log({"error": 1e-3}, 2)
+    tracker.log({"loss": 0.125}, 3)
+    assert rows() == [["step", "loss", "error"], ["1", "0.5", ""], ["2", "0.25", "0.001"], ["3", "0.125", ""]]
+    resumed = Tracker("csv", tmp_path / "log", name="run", config={"seed": 3})  # from a checkpoint of step 2
+    resumed.log({"loss": 0.1}, 3)
+    assert rows()[-2:] == [["2", "0.25", "0.001"], ["3", "0.1", ""]]
 
 
 def test_tensorboard_run_holds_everything(tmp_path, picture, video):

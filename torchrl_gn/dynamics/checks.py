@@ -64,6 +64,8 @@ def check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
 def warn_of_unseen(predictor: Predictor, values: PhysicalParameters, name: str, *, stacklevel: int) -> None:
     """Warn, or raise ValueError with ``strict``, where a scene differs in a parameter constant in training."""
     model, unseen = predictor.model, []
+    if predictor.movable.is_meta:  # there are no numbers to compare with
+        return
     for part, normalizer in model.parameter_normalizers.items() if model.parameter_source == "scene" else ():
         mean = normalizer.mean
         given = getattr(values, part).to(mean.device)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, Literal, cast, get_args
 
+import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
@@ -201,7 +202,8 @@ class ForwardModel(nn.Module):
             ValueError: if the scene, or what samples bring, lacks parameters that the model reads; or with ``strict``.
         """
         options = {"parameters_key": parameters_key, "parameter_names": parameter_names}
-        return Predictor(self, scene, strict=strict, reference=reference, **options)
+        with torch.device("cpu"):  # the scene's constants have numbers, also where weights are made on the meta device
+            return Predictor(self, scene, strict=strict, reference=reference, **options)
 
     def description(self) -> dict:
         """Plain, JSON-able values for :meth:`from_description`; ValueError if a feature is not in ``FEATURES``."""

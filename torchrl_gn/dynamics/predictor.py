@@ -21,6 +21,7 @@ from torchrl_gn.dynamics.features.feature import graph_edges
 from torchrl_gn.dynamics.normalization import in_range, scaled, static_graph
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.program import Executor, StepProgram
+from torchrl_gn.finite import is_traced
 from torchrl_gn.networks.core import UnfoldedCore, dtype_of
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
@@ -161,8 +162,8 @@ class Predictor(TensorDictModuleBase):
         return self.model.core.start(static_graph(self, self.scene_parameters)).tensordict()
 
     @dispatch()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the predicted next state into ``tensordict`` and return it."""
+    def forward(self, tensordict: TensorDictBase, *_: Tensor, **__: Tensor) -> TensorDictBase:
+        """Write the predicted next state into ``tensordict``, or return it for entries that come one by one."""
         state, action = (tensordict[key] for key in self.in_keys[:2])
         after, hidden = self.step(state, action, self.parameters_in(tensordict), self.hidden_state_in(tensordict))
         tensordict.set(self.out_keys[0], after)
@@ -216,8 +217,8 @@ class Predictor(TensorDictModuleBase):
 
     def training_executor(self, parameters: TensorDictBase | None = None) -> EagerExecutor | NativeDelta:
         """What predicts changes by its ``delta``, differentiable in states, actions and weights."""
-        # A compiler cannot ask which features vary; C++ has no gradient in parameters of physics.
-        if torch.compiler.is_compiling() or (self.model.physics is not None and self.model.physics.trained):
+        # What is traced cannot ask which features vary; C++ has no gradient in parameters of physics.
+        if is_traced() or (self.model.physics is not None and self.model.physics.trained):
             return EagerExecutor(self.program(parameters))
         program = self.program(parameters, reduced=True)
         if self._trainer is None:

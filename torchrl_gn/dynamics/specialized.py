@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import threading
 import warnings
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics import operators
@@ -130,6 +132,12 @@ class SpecializedPredictor(Predictor):
         modules = list(self.model.modules())
         owners: list[dict[str, Any]] = [module._parameters for module in modules]
         owners += [module._buffers for module in modules]
+        weights = itertools.chain.from_iterable(owner.values() for owner in owners)
+        if any(one is not None and is_functorch_wrapped_tensor(one) for one in weights):
+            raise TypeError(
+                "A specialised model has a snapshot of its weights, which torch.func cannot exchange: stack or"
+                " differentiate the bound model."
+            )
         watched, casts = Watched(owners), self.model.casts  # before they are read: another thread may change them
         # Tensors made in inference mode could be neither overwritten nor differentiated outside.
         with torch.inference_mode(False), torch.no_grad():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Any, cast
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
@@ -14,9 +15,11 @@ from torchrl.data import Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.drawing import draw_states
 from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
 from torchrl_gn.envs.specs import (
+    DoneFunction,
     RewardFunction,
     finite_reward,
     outcome,
@@ -46,6 +49,7 @@ class ModelEnv(ModelBasedEnvBase):
     Args:
         model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
+        done, unstable_reward: as of :class:`~torchrl_gn.envs.SceneEnv`.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own. A
             :class:`~torchrl_gn.scenes.KinematicTree` needs states ``[M, N, C]``, for example of a log.
         seed: default: drawn from torch's global generator.
@@ -63,8 +67,9 @@ class ModelEnv(ModelBasedEnvBase):
         model: TensorDictModuleBase,
         reward: RewardFunction | None = None,
         *,
+        done: DoneFunction | None = None,
         start_states: StartStates | None = None,
-        unstable_reward: float = -1e6,
+        unstable_reward: float | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
     ):
@@ -82,7 +87,8 @@ class ModelEnv(ModelBasedEnvBase):
         if self.history:
             self.scene = cast(Any, model.scene).present
         self.reward = reward_of(reward, self, self.scene)
-        self.unstable_reward = finite_reward(unstable_reward)
+        self.ends = done
+        self.unstable_reward, self.spares_learners = finite_reward(unstable_reward), unstable_reward is None
         self.starts = StartSampler(self.scene, start_states, seed)
         self._state_shape = self.scene.num_nodes, self.scene.state_size
         self._simulator: Simulator | None = None
@@ -204,6 +210,15 @@ class ModelEnv(ModelBasedEnvBase):
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict
+
+    def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:
+        """Pictures ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``, as of :class:`SceneEnv`.
+
+        TypeError for a robot known by its joints, which has no shapes.
+        """
+        if not isinstance(self.scene, Scene):
+            raise TypeError(f"{self} cannot be drawn: of a robot known by its joints no shapes are known")
+        return draw_states(self.scene, read(tensordict, "state", self._state_shape, self), size=size)
 
     def _set_seed(self, seed: int | None) -> None:
         self.starts.seed(seed)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.envs.specs import RewardFunction, finite_reward, outcome, read, reward_of, set_specs
+from torchrl_gn.drawing import draw_states
+from torchrl_gn.envs.specs import DoneFunction, RewardFunction, finite_reward, outcome, read, reward_of, set_specs
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.finite import require_finite
+from torchrl_gn.scenes.load import load_scene
 from torchrl_gn.scenes.scene import Scene
 
 
@@ -24,20 +28,25 @@ class SceneEnv(EnvBase):
         - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which a step starts from.
         - ``action`` ``[*B, A]``: float32 in the spec, float64 accepted. MuJoCo clamps limited controls.
         - ``variant`` ``[*B, 1]`` int64, with several scenes only: index of the sample's scene.
-        - ``done``, ``terminated`` ``[*B, 1]``: the simulation became unstable; the last good state is kept.
+        - ``done``, ``terminated`` ``[*B, 1]``: it became unstable, with the last good state kept; or ``done``.
 
     ``reset()`` draws start states for the TensorDict's batch; ``reset(tensordict, set_state=True)`` starts from its
     ``physics``. For collectors see :func:`~torchrl_gn.envs.batched`.
 
     Args:
-        scene: the scene, or variants of one. A batch cycles through them, or follows the TensorDict's ``variant``.
+        scene: the scene, what :func:`~torchrl_gn.scenes.load_scene` takes (``"pendulum"``), or variants of one. A batch
+            cycles through them, or follows the TensorDict's ``variant``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
+        done: function of the state after a step ``[*B, N, 13]`` that says where the episode ends, bool ``[*B]`` or
+            ``[*B, 1]``; or a TensorDict module, which reads the step's entries and writes ``terminated``.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own.
+        unstable_reward: of a step that became unstable. Default: -1e6, which no planner takes; under
+            :func:`~torchrl_gn.envs.batched`, where policies learn, 100 times the reward of staying in the last good
+            state if that is negative, else 0.
         device: of the TensorDicts; the simulation runs on the CPU.
 
     Example:
-        >>> from torchrl_gn.scenes import load_scene
-        >>> start = (env := SceneEnv(load_scene("pendulum"), seed=0)).reset(TensorDict(batch_size=[5]))
+        >>> start = (env := SceneEnv("pendulum", seed=0)).reset(TensorDict(batch_size=[5]))
         >>> env.rollout(20, tensordict=start, auto_reset=False)["next", "reward"].shape
         torch.Size([5, 20, 1])
     """
@@ -49,23 +58,26 @@ class SceneEnv(EnvBase):
 
     def __init__(
         self,
-        scene: Scene | Sequence[Scene],
+        scene: Scene | str | os.PathLike | Sequence[Scene],
         reward: RewardFunction | None = None,
         *,
+        done: DoneFunction | None = None,
         start_states: StartStates | None = None,
         num_threads: int | None = None,
-        unstable_reward: float = -1e6,
+        unstable_reward: float | None = None,
         seed: int | None = None,
         device: torch.device | str = "cpu",
     ):
         super().__init__(device=device)
-        self.scenes = (scene,) if isinstance(scene, Scene) else tuple(scene)
+        given = (scene,) if isinstance(scene, (Scene, str, os.PathLike)) else scene
+        self.scenes = tuple(each if isinstance(each, Scene) else load_scene(each) for each in given)
         if not self.scenes:
             raise ValueError("SceneEnv needs at least one scene.")
         self.scene = self.scenes[0]
         self.reward = reward_of(reward, self, self.scene)
         self.num_threads = num_threads
-        self.unstable_reward = finite_reward(unstable_reward)
+        self.ends = done
+        self.unstable_reward, self.spares_learners = finite_reward(unstable_reward), unstable_reward is None
         self.starts = StartSampler(self.scene, start_states, seed)
         self._simulator: Simulator | None = None
         set_specs(self, self.scene, physics=True, variants=len(self.scenes))
@@ -120,6 +132,17 @@ class SceneEnv(EnvBase):
         if variant is not None:
             entries["variant"] = variant.to(self.device, copy=True)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
+
+    def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:
+        """Pictures ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``; needs Pillow, and no display."""
+        state = read(tensordict, "state", (self.scene.num_nodes, 13), self)
+        if (variant := self.variant_of(tensordict)) is None:
+            return draw_states(self.scene, state, size=size)
+        pictures = np.empty((*tensordict.shape, size, size, 3), dtype=np.uint8)
+        for index in variant.unique().tolist():
+            of_it = (variant == index).squeeze(-1)
+            pictures[of_it.numpy()] = draw_states(self.scenes[index], state.cpu()[of_it], size=size)
+        return pictures
 
     def _set_seed(self, seed: int | None) -> None:
         self.starts.seed(seed)

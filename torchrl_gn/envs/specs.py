@@ -10,14 +10,22 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_gn.finite import is_traced
 from torchrl_gn.rewards.bodies import Bodies
+from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.rewards.weighted_sum import terms_of
 from torchrl_gn.scenes.scene import Scene
 
 RewardFunction = Callable[..., Tensor]
+DoneFunction = Callable[..., Any]
+_UNSTABLE = -1e6  # below all others, so that no planner takes an unstable step
+_DIVERGED = 1e10  # a state with larger numbers has diverged
+_STAYING = 100  # steps in the last good state that an unstable step costs a learner
 
 
 def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -> None:
@@ -70,8 +78,10 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
     return copy.deepcopy(reward).to(env.device)
 
 
-def finite_reward(value: float) -> float:
-    """The reward of an unstable step; ValueError if it is not finite."""
+def finite_reward(value: float | None) -> float:
+    """The reward of an unstable step, by default a planner's; ValueError if it is not finite."""
+    if value is None:
+        return _UNSTABLE
     if not math.isfinite(value):
         raise ValueError(f"unstable_reward must be finite, got {value}; give a large negative number")
     return float(value)
@@ -80,21 +90,53 @@ def finite_reward(value: float) -> float:
 def step_reward(
     reward: RewardFunction | None, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None
 ) -> Tensor:
-    """A step's reward ``[*B, 1]`` in float32, zero without a function; ValueError for another shape."""
+    """A step's reward ``[*B, 1]`` in float32, zero without a function; ValueError for another shape, or NaN."""
     shape = (*next_state.shape[:-2], 1)
     if reward is None:
         return next_state.new_zeros(shape, dtype=torch.float32)
     value = reward(state, action, next_state, task)
     if value.shape != shape:
         raise ValueError(f"the reward must be {list(shape)}, {reward} returned {list(value.shape)}")
+    # A GPU would have to be waited for.
+    if value.device.type == "cpu" and not is_traced() and bool(value.isnan().any()):
+        _refuse_nan(reward, value, state, action, next_state, task)
     return value.to(torch.float32)
+
+
+def _refuse_nan(reward: Any, value: Tensor, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> None:
+    """Raise ValueError, naming the reward or the term of it, if it is NaN at states that have not diverged."""
+    sane = [(each.abs() < _DIVERGED).flatten(-2).all(-1) for each in (state, next_state, action.unsqueeze(-1))]
+    if not bool((value.squeeze(-1).isnan() & torch.stack(sane).all(0)).any()):
+        return
+    terms = [term for _, term in terms_of(reward)] if isinstance(reward, Reward) else [reward]
+    guilty = next((term for term in terms if bool(term(state, action, next_state, task).isnan().any())), reward)
+    name = repr(guilty) if isinstance(guilty, nn.Module) else getattr(guilty, "__qualname__", repr(guilty))
+    raise ValueError(f"the reward {name} returned NaN for a finite state and action")
 
 
 def outcome(
     env: Any, tensordict: TensorDictBase, state: Tensor, action: Tensor, next_state: Tensor, stable: Tensor
 ) -> dict[str, Tensor]:
-    """Entries that a step writes; where it is not ``stable`` ``[*B, 1]``, the last state and ``unstable_reward``."""
+    """Entries that a step writes; where it is not ``stable`` ``[*B, 1]``, the last state and ``unstable_reward``.
+
+    Where that is None, what staying in the last state would cost.
+    """
     next_state = torch.where(stable.unsqueeze(-1), next_state, state)
     reward = step_reward(env.reward, state, action, next_state, tensordict.get("task", None))
-    reward = torch.where(stable, reward, env.unstable_reward)
-    return {"state": next_state, "reward": reward, "done": ~stable, "terminated": ~stable}
+    unstable = (_STAYING * reward).clamp(max=0) if env.unstable_reward is None else env.unstable_reward
+    entries = {"state": next_state, "reward": torch.where(stable, reward, unstable)}
+    terminated = ~stable if env.ends is None else ~stable | _ended(env, tensordict, entries)
+    return {**entries, "done": terminated, "terminated": terminated.clone()}
+
+
+def _ended(env: Any, tensordict: TensorDictBase, entries: dict[str, Tensor]) -> Tensor:
+    """Whether an environment's ``done`` function ends the episode, ``[*B, 1]``; ValueError for another result."""
+    if isinstance(env.ends, TensorDictModuleBase):
+        ended = env.ends(tensordict.exclude("next").update(entries)).get("terminated", None)
+    else:
+        ended = env.ends(entries["state"])
+    shape = (*tensordict.shape, 1)
+    if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape not in (shape, tensordict.shape):
+        given = f"{ended.dtype} {list(ended.shape)}" if isinstance(ended, Tensor) else repr(ended)
+        raise ValueError(f"done= must give 'terminated', bool {list(tensordict.shape)} or {list(shape)}, got {given}")
+    return ended.reshape(shape)

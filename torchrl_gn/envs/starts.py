@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from functools import partial
 from typing import cast
@@ -93,6 +94,8 @@ def _reset_each(env: EnvBase, size: torch.Size, _: TensorDictBase | None, reset:
 def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
     """Fix the number of environments ``batch_size`` of a stateless one, each with its own start state.
 
+    They are for learning: an unstable step has the default reward for that, see :class:`~torchrl_gn.envs.SceneEnv`.
+
     Example:
         >>> from torchrl_gn.envs import SceneEnv
         >>> from torchrl_gn.scenes import load_scene
@@ -102,4 +105,7 @@ def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
     size = torch.Size(batch_size)
     if not size or min(size) < 1:
         raise ValueError(f"batch_size must be numbers of at least 1, got {list(size)}")
+    if vars(env).get("spares_learners", False):
+        env = copy.copy(env)  # the given one may plan
+        env.unstable_reward = None  # pyright: ignore[reportAttributeAccessIssue]
     return TransformedEnv(env, BatchSizeTransform(batch_size=size, reset_func=partial(_reset_each, env, size)))

@@ -1,5 +1,6 @@
 """Errors as the paper defines them, rollouts, figures and videos."""
 
+from torchrl_gn.drawing.geometry import kinetic_energy as kinetic_energy
 from torchrl_gn.evaluation.baselines import baseline_errors as baseline_errors
 from torchrl_gn.evaluation.error_table import ErrorTable as ErrorTable
 from torchrl_gn.evaluation.error_table import PredictionError as PredictionError
@@ -13,7 +14,6 @@ from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog
 from torchrl_gn.evaluation.figures import plot_planning_curves as plot_planning_curves
 from torchrl_gn.evaluation.figures import plot_rewards as plot_rewards
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve
-from torchrl_gn.evaluation.geometry import kinetic_energy as kinetic_energy
 from torchrl_gn.evaluation.motion_figures import plot_body_trajectory as plot_body_trajectory
 from torchrl_gn.evaluation.motion_figures import plot_joints as plot_joints
 from torchrl_gn.evaluation.motion_figures import plot_motions as plot_motions

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from torch import Tensor
 
-from torchrl_gn.evaluation.canvas import INK, MUTED, SERIES, TRUTH, clean, legend_below, new_figure, save, series_color
+from torchrl_gn.drawing.canvas import INK, MUTED, SERIES, TRUTH, clean, legend_below, new_figure, save, series_color
 from torchrl_gn.evaluation.error_table import ErrorTable
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.evaluation.canvas import AXES, INK, MUTED, PREDICTION, TRUTH, clean, legend_below, new_figure, save
+from torchrl_gn.drawing.canvas import AXES, INK, MUTED, PREDICTION, TRUTH, clean, legend_below, new_figure, save
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes import KinematicTree, Scene

@@ -14,7 +14,8 @@ import numpy as np
 from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.evaluation.canvas import GRID, INK, PREDICTION, TRUTH
+from torchrl_gn.drawing import scene_drawing
+from torchrl_gn.drawing.canvas import GRID, INK, PREDICTION, TRUTH
 from torchrl_gn.scenes import Scene
 
 if TYPE_CHECKING:
@@ -80,13 +81,9 @@ def rollout_frames(
         raise ValueError("The true states contain values that are not finite.")
     if every < 1 or size < 32 or size % 2:
         raise ValueError(f"every must be at least 1 and size an even number from 32, got {every} and {size}.")
-    try:
-        from torchrl_gn.evaluation.drawing import SceneDrawing
-    except ImportError:
-        raise ImportError('Pictures and videos need Pillow: pip install "torchrl_gn[figures]".') from None
+    drawing = scene_drawing(scene, sequences[0][::every], size)
 
     def frames() -> Iterator[Image.Image]:
-        drawing = SceneDrawing(scene, sequences[0][::every], size)
         motions = [drawing.truth, *(drawing.motion(states[::every]) for states in sequences[1:])]
         for step in range(len(drawing.truth.valid)):
             row = zip(motions, (TRUTH, PREDICTION), (False, True), strict=False)

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 from torch.nn import functional as F
 
+from torchrl_gn.finite import is_traced
+
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "silu": nn.SiLU, "gelu": nn.GELU, "tanh": nn.Tanh}
 _FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {"silu": F.silu, "gelu": F.gelu, "tanh": torch.tanh}
 
@@ -45,9 +47,7 @@ def linear(pairs, table=None, matrix=None, items=None, activation: str | None = 
 
 def needs_plain_operations() -> bool:
     """Whether a compiler, a transform of ``torch.func`` or forward-mode differentiation must see every operation."""
-    return (
-        torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
-    )
+    return is_traced() or forward_ad._current_level >= 0
 
 
 def product(matrix: Tensor, items: Tensor) -> Tensor:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.finite import require_finite
+from torchrl_gn.finite import is_traced, require_finite
 from torchrl_gn.policies import ObservationModel, ObservationNetwork
 
 
@@ -31,10 +30,10 @@ def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[Nes
 def require_fitted(loss: Any, *networks: nn.Module, remedy: str, also: Callable[[], None] | None = None) -> None:
     """Raise RuntimeError, with a ``remedy``, if normalisers of the loss's networks have seen no data.
 
-    Reading statistics waits for the device, so a loss checks until it passes once, and never while being compiled:
-    compile it after its first call. ``also`` is a second check, which raises its own error.
+    Reading statistics waits for the device, so a loss checks until it passes once, and never while being compiled or
+    in a transform of ``torch.func``: call it once before. ``also`` is a second check, which raises its own error.
     """
-    if getattr(loss, "_fitted", False) or torch.compiler.is_compiling():
+    if getattr(loss, "_fitted", False) or is_traced():
         return
     for part in (part for network in networks for part in network.modules()):
         if isinstance(part, (ForwardModel, ObservationModel, ObservationNetwork)) and not part.fitted:

@@ -60,10 +60,10 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
     :class:`~torchrl_gn.scenes.contact_points.ContactPoints` has. The same scene always gives the same pairs.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
-    node_of_geom = np.searchsorted(scene.body, weld_roots(model))[model.geom_bodyid]
+    node_of_geom = _node_of_geom(scene)
     mujoco.mj_kinematics(model, data)
     boxes = [rounded_box(model, data, geom, int(scene.body[node])) for geom, node in enumerate(node_of_geom)]
-    possible = _colliding(scene, node_of_geom)
+    possible = possible_contacts(scene)
     ignored = {geom for pair in possible for geom in pair if boxes[geom] is None}
     pairs = np.array([pair for pair in possible if not ignored & set(pair)], dtype=np.int64).reshape(-1, 2)
     found: dict[tuple[int, int], list[Candidate]] = {}
@@ -124,8 +124,13 @@ def _known(box: RoundedBox | None) -> RoundedBox:
     return box
 
 
-def _colliding(scene: Scene, node_of_geom: np.ndarray) -> list[tuple[int, int]]:
+def _node_of_geom(scene: Scene) -> np.ndarray:
+    return np.searchsorted(scene.body, weld_roots(scene.model))[scene.model.geom_bodyid]
+
+
+def possible_contacts(scene: Scene) -> list[tuple[int, int]]:
     """Pairs of geoms on different nodes that MuJoCo lets collide, without those that contact points show."""
+    node_of_geom = _node_of_geom(scene)
     pairs = ((first, second) for second, first in np.argwhere(np.tril(colliding_geoms(scene.model))).tolist())
     return [pair for pair in pairs if node_of_geom[pair[0]] != node_of_geom[pair[1]] and not _shown(scene, *pair)]
 

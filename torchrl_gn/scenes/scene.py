@@ -9,11 +9,13 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.contact_pairs import ContactPairs, find_contact_pairs
+from torchrl_gn.scenes.contact_pairs import ContactPairs, find_contact_pairs, possible_contacts
 from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.fingerprint import physics
 from torchrl_gn.scenes.topology import EdgePair, JointAnchors, named
 from torchrl_gn.scenes.yaw_frame import YawFrame
+
+_MANY_CONTACTS = 500  # pairs of geoms from which on contact pairs take about a second to find
 
 
 class SceneError(ValueError):
@@ -192,7 +194,9 @@ class Scene:
         return [f"  {what}: {', '.join(names)}" for what, names in notes.items() if names]
 
     def _contacts(self) -> list[str]:
-        """What can meet, for printing."""
+        """What can meet, for printing; of a large scene only if it is known, as finding it takes seconds."""
+        if "contact_pairs" not in vars(self) and (count := len(possible_contacts(self))) > _MANY_CONTACTS:
+            return [f"  {count:,} pairs of geoms may collide; scene.contact_pairs finds which nodes can meet"]
         pairs, names, lines = self.contact_pairs, self.node_names, []
         if len(pairs.nodes):
             more = f", and {pairs.left_out} less frequent pairs that are left out" * (pairs.left_out > 0)

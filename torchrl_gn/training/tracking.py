@@ -1,4 +1,4 @@
-"""Logging through TorchRL's loggers."""
+"""Logging to one wide csv file, or through TorchRL's loggers."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
+from torchrl_gn.training.csv_log import CsvLog
 from torchrl_gn.training.run_folder import plain_config
 
 LoggerKind = Literal["none", "csv", "tensorboard", "wandb"]
@@ -19,7 +20,8 @@ class Tracker:
     """Log numbers, figures, videos and configuration of a run; ImportError if wandb or tensorboard is not installed.
 
     Args:
-        kind: wandb runs offline without an account (API key or login), and ``wandb sync`` uploads later.
+        kind: wandb runs offline without an account (API key or login), and ``wandb sync`` uploads later; csv writes
+            ``numbers.csv``, with a row for each step and a column for each name.
         folder: the logger's folder, inside the run folder.
     """
 
@@ -28,7 +30,9 @@ class Tracker:
             raise ValueError(f"logger={kind!r} is not known; use one of {list(get_args(LoggerKind))}.")
         self.kind, self._run = kind, folder.parent
         self._logger: Any = None
-        if kind == "none":
+        self._csv: CsvLog | None = None
+        if kind in ("none", "csv"):
+            self._csv = CsvLog(folder / "numbers.csv") if kind == "csv" else None
             return
         from torchrl.record.loggers import get_logger
 
@@ -48,19 +52,18 @@ class Tracker:
         self._logger = get_logger(kind, logger_name=str(folder), experiment_name=name, **options)
         if kind == "wandb":
             self._logger.experiment.config.update({"versions": versions})
-        elif kind == "tensorboard":
+        else:
             text = json.dumps({**config, "versions": versions}, indent=2)
             self._logger.experiment.add_text("config", f"```json\n{text}\n```")
-        else:
-            self._logger.log_hparams({**config, "versions": versions})
 
     def log(self, numbers: Mapping[str, float], step: int) -> None:
         """Log numbers at a step; skip other entries."""
-        if self._logger is None:
-            return
-        for name, value in numbers.items():
-            if isinstance(value, (int, float)):
-                self._logger.log_scalar(name, float(value), step=step)
+        numbers = {name: float(value) for name, value in numbers.items() if isinstance(value, (int, float))}
+        if self._csv is not None and numbers:
+            self._csv.log(numbers, step)
+        elif self._logger is not None:
+            for name, value in numbers.items():
+                self._logger.log_scalar(name, value, step=step)
 
     def log_files(self, paths: Sequence[Path]) -> None:
         """Log files: wandb takes figures, videos and checkpoints (as artifacts), tensorboard figures and GIFs."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from torchrl_gn.evaluation.canvas import GRID, INK, MUTED, PAPER, TRUTH
-from torchrl_gn.evaluation.geometry import SceneGeometry, View, choose_view, follow
+from torchrl_gn.drawing.canvas import GRID, INK, MUTED, PAPER, TRUTH
+from torchrl_gn.drawing.geometry import SceneGeometry, View, choose_view, follow
 from torchrl_gn.scenes import Scene
 
 _OUTLINE = np.linspace(0, 2 * np.pi, 56, endpoint=False)

@@ -1,0 +1,35 @@
+"""TorchRL's environment of a world model, with the specs of a scene."""
+
+from __future__ import annotations
+
+from tensordict.utils import NestedKey
+from torchrl.data import Composite
+from torchrl.envs import EnvBase
+from torchrl.envs.model_based import WorldModelEnv
+from torchrl.modules import WorldModel
+
+from torchrl_gn.envs.starts import batched
+
+
+def world_model_env(
+    world_model: WorldModel,
+    env: EnvBase,
+    *batch_size: int,
+    latent_key: NestedKey = "state",
+    observation_spec: Composite | None = None,
+) -> WorldModelEnv:
+    """TorchRL's ``WorldModelEnv`` of ``batch_size`` dreams, with the specs of a :class:`SceneEnv` or :class:`ModelEnv`.
+
+    TorchRL 0.14 alone gives action and reward the shape of the batch, in place of one for each of it.
+
+    Args:
+        latent_key: the state that the world model steps.
+        observation_spec: of the dreams; default: that of ``env`` at ``latent_key``.
+    """
+    many = batched(env, *batch_size)
+    if observation_spec is None:
+        observation_spec = Composite({latent_key: many.observation_spec[latent_key]}, shape=many.batch_size)
+    shared = {"latent_key": latent_key, "observation_spec": observation_spec}
+    dreams = WorldModelEnv(world_model, env, batch_size=many.batch_size, **shared)
+    dreams.action_spec, dreams.reward_spec = many.action_spec.clone(), many.reward_spec.clone()
+    return dreams
