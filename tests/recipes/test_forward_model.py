@@ -79,6 +79,16 @@ def test_a_run_that_its_minutes_cut_short_says_so_and_how_to_go_on(tmp_path, cal
     assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == done + 3
 
 
+def test_a_short_run_keeps_every_loss_and_says_when_it_is_finished(tmp_path, call):
+    options = (*SMALL, f"run_dir={tmp_path}", "steps=5")
+    code, output, errors = call(*options, recipe="forward_model")
+    assert code == 0 and "is finished" not in output + errors, errors
+    assert len(load_pretrained(tmp_path).training["curves"]["loss"]) == 5
+    code, output, errors = call(*options, recipe="forward_model")
+    assert code == 0, errors
+    assert f"The training in {tmp_path} is finished (5 steps" in output + errors
+
+
 def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_path, call):
     options = (*SMALL, "parametrized=true", "steps=5", f"run_dir={tmp_path}")
     code, output, errors = call(*options, recipe="forward_model")
