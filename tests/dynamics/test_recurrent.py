@@ -150,6 +150,7 @@ def test_truncated_gradients_stop_at_the_hidden_state(bound, trajectories):
     for step in range(5):
         delta, hidden_state = eager.delta(program, state[:, step], action[:, step], hidden_state)
         errors.append(loss.component_errors(delta, bound.layout.delta(state[:, step], target[:, step])))
+        assert hidden_state is not None
         hidden_state = hidden_state.detach()
     (torch.stack(errors).mean(0).sum() / 4).backward()
     torch.testing.assert_close(bound.model.core.nodes.weight_hh.grad, found[1][1])
