@@ -102,6 +102,14 @@ def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
     return found
 
 
+def rollout_horizons(cfg: DictConfig) -> set[int]:
+    """Steps of the rollouts that are compared; ValueError if trajectories end within the burn-in."""
+    longest = cfg.length - cfg.burn_in
+    if longest < 1:
+        raise ValueError(f"length={cfg.length} leaves no step behind burn_in={cfg.burn_in} to predict.")
+    return {steps for steps in cfg.horizons if steps <= longest} | {longest}
+
+
 def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data: dict[str, TensorDictBase]) -> Trainer:
     """Wire data, loss and optimiser together."""
     bound, recurrent = model.bind(cast(Any, tree)), model.core.recurrent
@@ -109,6 +117,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
         bound,
         noise=cfg.noise,
         teacher_forced_steps=cfg.burn_in if recurrent else 1,
+        bptt_steps=cfg.bptt_steps,
         generator=torch.Generator().manual_seed(cfg.seed),
     )
     # Teacher-forced over the burn-in, then fed its own predictions.
@@ -121,9 +130,9 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
         )
 
     def validate() -> float:
-        horizons = (cfg.validation_steps,)
-        table = evaluate_errors(bound, data["validation"], horizons=horizons, one_step=False, burn_in=cfg.burn_in)
-        return table[f"rollout_error_{cfg.validation_steps}"].total
+        options: dict[str, Any] = {"horizons": rollout_horizons(cfg), "burn_in": cfg.burn_in}
+        table = evaluate_errors(bound, data["validation"], one_step=False, **options)
+        return torch.tensor([error.total for error in table.errors.values()]).log().mean().exp().item()
 
     return Trainer(
         loss,
@@ -167,12 +176,7 @@ def train(
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)
-    horizon = cfg.length - cfg.burn_in
-    if not 0 < cfg.validation_steps <= horizon:
-        raise ValueError(
-            f"length={cfg.length} leaves {horizon} steps behind burn_in={cfg.burn_in}, too few for"
-            f" validation_steps={cfg.validation_steps}."
-        )
+    horizons = rollout_horizons(cfg)
     log, tree = read(cfg)
     print(tree)
     data = split(cfg, log)
@@ -180,7 +184,6 @@ def main(cfg: DictConfig) -> None:
         tree, data["train"] = mirrored(tree, data["train"])
     run = RunFolder(cfg.run_dir, "real_robot")
     physics = load_physics(cfg.physics, cfg.physics_options, tree)
-    horizons = {steps for steps in cfg.horizons if steps <= horizon} | {horizon}
     measured: dict[str, Any] = {"burn_in": cfg.burn_in, "horizons": horizons}
     tables = baseline_errors(tree, data["test"], physics, **measured)
     residual = {name for name, options in cfg.models.items() if options.get("physics", False)}
@@ -194,7 +197,9 @@ def main(cfg: DictConfig) -> None:
     tracker = open_log(cfg, run, label=f"real_robot-{tree.name}")
     if physics is not None and physics.trained and cfg.physics_fit:
         if not residual & resumed.keys():  # their checkpoint has the fitted parameters
-            fit_physics(physics, tree, data["train"], steps=cfg.physics_fit, window=min(20, horizon), seed=cfg.seed)
+            fit_physics(
+                physics, tree, data["train"], steps=cfg.physics_fit, window=min(20, max(horizons)), seed=cfg.seed
+            )
         tables["fitted physics"] = baseline_errors(tree, data["test"], physics.requires_grad_(False), **measured)[
             "physics"
         ]

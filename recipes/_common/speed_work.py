@@ -25,9 +25,9 @@ def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
     return leaf.grad
 
 
-def pull_once(model: Predictor, leaves: Sequence[Tensor], gradient: Tensor) -> tuple[Tensor, ...]:
+def pull_once(model: Predictor, state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, ...]:
     """Gradients in state and action for that in the next state."""
-    return torch.autograd.grad(model.step(*leaves)[0], leaves, gradient)
+    return torch.autograd.grad(model.step(state, action)[0], (state, action), gradient)
 
 
 def make_works(
@@ -81,11 +81,11 @@ def make_works(
 
     def step_gradient(batch: int) -> Work:
         state, actions = first(batch)
-        leaves = [tensor.clone().requires_grad_() for tensor in (state, actions[:, 0])]
+        leaf, action = (tensor.clone().requires_grad_() for tensor in (state, actions[:, 0]))
         gradient = 2 * state * (torch.arange(state.shape[-1]) >= 7)
 
         def run(way: Way) -> tuple[Tensor, ...]:
-            return pull_once(way.model, leaves, gradient)
+            return pull_once(way.model, leaf, action, gradient)
 
         def compared(gradients: Sequence[Tensor]) -> Tensor:
             return torch.cat([each.flatten() for each in gradients])

@@ -131,6 +131,31 @@ def test_teacher_forcing_feeds_true_states_first(bound, trajectories, forced):
         ForwardModelLoss(bound, teacher_forced_steps=0)
 
 
+def test_truncated_gradients_stop_at_the_hidden_state(bound, trajectories):
+    """Of one step the gradient reaches no weight of the hidden state before it."""
+    batch = trajectory_buffer(trajectories, batch_size=4, window=5, seed=0).sample()
+    found = {}
+    for steps in (None, 5, 1):
+        loss = ForwardModelLoss(bound, teacher_forced_steps=5, bptt_steps=steps)
+        loss.fit_scales(trajectory_buffer(trajectories, batch_size=50, seed=0).sample())
+        bound.zero_grad()
+        out = loss(batch)["loss_forward_model"]
+        out.backward()
+        found[steps] = out.item(), bound.model.core.nodes.weight_hh.grad.clone()
+    assert found[None][0] == found[1][0]
+    assert torch.equal(found[None][1], found[5][1]) and not torch.allclose(found[None][1], found[1][1])
+    state, action, target = batch["state"], batch["action"], batch["next", "state"]
+    hidden_state, errors, program = None, [], bound.program()
+    bound.zero_grad()
+    for step in range(5):
+        delta, hidden_state = eager.delta(program, state[:, step], action[:, step], hidden_state)
+        errors.append(loss.component_errors(delta, bound.layout.delta(state[:, step], target[:, step])))
+        assert hidden_state is not None
+        hidden_state = hidden_state.detach()
+    (torch.stack(errors).mean(0).sum() / 4).backward()
+    torch.testing.assert_close(bound.model.core.nodes.weight_hh.grad, found[1][1])
+
+
 @pytest.mark.slow
 def test_it_learns_what_a_state_does_not_say():
     """A pendulum whose motor acts a step late: only what remembers the action can know."""

@@ -212,6 +212,29 @@ def test_gradients_flow_through_the_whole_window(make_loss, windows):
         torch.testing.assert_close((ahead - behind) / (2 * step), slope, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_truncated_gradients_are_those_of_pieces_of_the_window(make_loss, windows, steps):
+    whole, truncated = make_loss(), make_loss(bptt_steps=steps)
+    batch = windows["swimmer6"][:5, :3].clone()
+    value = truncated(batch)["loss_forward_model"]
+    torch.testing.assert_close(value, whole(batch)["loss_forward_model"], rtol=1e-12, atol=0)
+    value.backward()
+    current = batch["state"][:, 0]
+    for start in range(0, 3, steps):  # pieces that start at the window's own predictions, each by itself
+        piece = batch[:, start : start + steps].clone()
+        piece["state"][:, 0] = current
+        (whole(piece)["loss_forward_model"] * piece.shape[1] / 3).backward()
+        for step in range(piece.shape[1]):
+            current = whole.model.step(current, piece["action"][:, step])[0].detach()
+    for ours, theirs in zip(truncated.parameters(), whole.parameters(), strict=True):
+        torch.testing.assert_close(ours.grad, theirs.grad, rtol=1e-9, atol=1e-12)
+
+
+def test_truncation_needs_a_step(make_loss):
+    with pytest.raises(ValueError, match="bptt_steps=0"):
+        make_loss(bptt_steps=0)
+
+
 def test_backward_reaches_every_weight_of_the_core(make_loss, windows):
     loss = make_loss()
     loss(windows["swimmer6"].reshape(-1))["loss_forward_model"].backward()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDictBase
 
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import specialize
@@ -27,8 +29,8 @@ def path_of(scene: Scene, steps: int) -> tuple[np.ndarray, np.ndarray, Simulator
     simulator = Simulator(scene, 1)
     rng = np.random.default_rng(0)
     actions = rng.uniform(scene.action_low, scene.action_high, (steps, scene.num_actions))
-    physics = simulator.rollout(sample_start_states(scene, 1, 3), actions[None])["physics"][0].numpy()
-    return physics, actions, simulator
+    simulated = simulator.rollout(sample_start_states(scene, 1, 3), actions[None])
+    return cast(torch.Tensor, simulated["physics"])[0].numpy(), actions, simulator
 
 
 @pytest.mark.parametrize("name", ["pendulum", "swimmer6", "cheetah"])
@@ -89,7 +91,7 @@ def test_more_iterations_find_better_plans(name, task):
     model = load_pretrained(name).model
     env = ModelEnv(specialize(model.bind(scene)), reward)
     start = SceneEnv(scene, reward, seed=1).reset().exclude("physics")
-    start = torch.stack([start, start.clone()])
+    start = cast(TensorDictBase, torch.stack([start, start.clone()]))
     returns = []
     for iterations in (0, 1, 5):
         planner = ILQGPlanner(env, 10, 1, warm_up=iterations, seed=0)

@@ -20,7 +20,7 @@ SMALL = (
     "length=12",
     "history=0",
     "burn_in=4",
-    "validation_steps=6",
+    "bptt_steps=2",
     "unroll_steps=3",
     "batch_size=16",
     "sequence_batch_size=4",
@@ -111,6 +111,13 @@ def test_shares_that_leave_nothing_are_refused(recipe):
         cfg = OmegaConf.create({**SPLIT, "share": share})
         with pytest.raises(ValueError, match="1 episodes cannot be split by share="):
             recipe.split(cfg, log)
+
+
+def test_horizons_end_with_the_trajectories(recipe):
+    options = OmegaConf.create({"length": 40, "burn_in": 20, "horizons": [1, 10, 50]})
+    assert recipe.rollout_horizons(options) == {1, 10, 20}
+    with pytest.raises(ValueError, match="length=40 leaves no step behind burn_in=40"):
+        recipe.rollout_horizons(OmegaConf.merge(options, {"burn_in": 40}))
 
 
 COASTING = """

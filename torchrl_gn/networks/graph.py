@@ -47,6 +47,10 @@ class Graph:
         zeros = [part.new_zeros(*part.shape[:-1], n) for part, n in zip(self.features, counts, strict=True)]
         return Graph(*zeros, edge_index=self.edge_index)
 
+    def detach(self) -> Graph:
+        """The same graph without gradient."""
+        return Graph(*(part.detach() for part in self.features), edge_index=self.edge_index)
+
 
 def graph_concat(first: Graph, second: Graph) -> Graph:
     """Concatenate the features of two graphs of one topology, whose batches broadcast. Paper: "graph-concatenation"."""

@@ -32,13 +32,15 @@ class ForwardModelLoss(LossModule):
     Each component's error is divided by the variance of its change in this scene; the loss is the mean over components.
     Orientations: :math:`1 - (q_e \cdot q_p)^2` of the *change* quaternions (as printed, it is not zero if equal).
 
-    Differentiated: the model's weights, through the whole window.
+    Differentiated: the model's weights, through the whole window or ``bptt_steps`` of it.
 
     Args:
         noise: standard deviation of the input noise, in standard deviations of each movable state channel (radians for
             orientations).
         generator: source of the noise. Default: torch's global generator, with which a run cannot resume bit for bit.
         teacher_forced_steps: steps at the start of a window that are fed the true state, with noise.
+        bptt_steps: steps between which states and hidden states are detached (truncated backpropagation through time);
+            the errors are those of the whole window. Default: never.
         channel_weights: ``[N, 12]`` (or broadcast) factors of each channel's squared error, for example of less than 1
             where measurement noise makes up most of a step's change. Default: all 1.
 
@@ -72,6 +74,7 @@ class ForwardModelLoss(LossModule):
         noise: float = 0.0,
         generator: torch.Generator | None = None,
         teacher_forced_steps: int = 1,
+        bptt_steps: int | None = None,
         channel_weights: Tensor | None = None,
     ) -> None:
         super().__init__()
@@ -83,8 +86,10 @@ class ForwardModelLoss(LossModule):
             raise ValueError(
                 f"teacher_forced_steps={teacher_forced_steps} must be at least 1: the first state is a true one."
             )
+        if bptt_steps is not None and bptt_steps < 1:
+            raise ValueError(f"bptt_steps={bptt_steps} must be at least 1, or None for the whole window.")
         self.model, self.noise, self.generator = model, noise, generator
-        self.teacher_forced_steps = teacher_forced_steps
+        self.teacher_forced_steps, self.bptt_steps = teacher_forced_steps, bptt_steps
         scale = torch.zeros(model.layout.delta_size, dtype=torch.float64, device=model.movable.device)
         self.register_buffer("noise_scale", scale)
         if channel_weights is not None:
@@ -179,6 +184,8 @@ class ForwardModelLoss(LossModule):
             if step + 1 < steps:
                 teacher_forced = step + 1 < self.teacher_forced_steps
                 current = self.perturb(state[:, step + 1]) if teacher_forced else layout.apply(current, delta)
+                if self.bptt_steps is not None and (step + 1) % self.bptt_steps == 0:
+                    current, hidden = current.detach(), None if hidden is None else hidden.detach()
         errors, scale = errors / steps, self._scale(self.noise_scale)
         movable = torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
         loss = errors.sum() / movable.sum().clamp(min=1)

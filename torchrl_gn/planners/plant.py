@@ -86,7 +86,7 @@ class LearnedPlant:
         state = torch.from_numpy(np.tile(start, (len(actions), 1))).unflatten(-1, self._shape)
         with torch.no_grad():
             bodies = self.predictor.rollout(state, torch.from_numpy(actions))[0].numpy()
-        return bodies.reshape(*bodies.shape[:2], -1), bodies, np.isfinite(bodies).all(axis=(1, 2, 3))
+        return bodies.reshape(*bodies.shape[:2], -1), bodies, np.asarray(np.isfinite(bodies).all(axis=(1, 2, 3)))
 
     def follow(self, start: np.ndarray, count: int, steps: int, policy: Policy) -> Paths:
         bodies = np.empty((count, steps + 1, *self._shape))
@@ -96,7 +96,7 @@ class LearnedPlant:
             for t in range(steps):
                 actions = torch.from_numpy(policy(t, paths[:, t]))
                 bodies[:, t + 1] = self.predictor.step(torch.from_numpy(bodies[:, t].copy()), actions)[0].numpy()
-        return paths, bodies, np.isfinite(paths).all(axis=(1, 2))
+        return paths, bodies, np.asarray(np.isfinite(paths).all(axis=(1, 2)))
 
     def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:
         states, steps = path.reshape(-1, *self._shape), len(actions)
