@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from omegaconf import DictConfig
+
 from torchrl_gn.training import plain_config
 
 
@@ -13,3 +15,9 @@ def as_list(value: Any) -> list[Any]:
         return []
     plain = plain_config({"value": value})["value"]
     return plain if isinstance(plain, list) else [plain]
+
+
+def scene_options(cfg: DictConfig) -> dict[str, Any]:
+    """Options of ``load_scene`` that a recipe has."""
+    plain = plain_config(cfg)
+    return {key: plain[key] for key in ("timestep", "action_bounds", "wide_starts")}
