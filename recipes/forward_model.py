@@ -30,7 +30,7 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
-from _common import as_list, clean_exit, finish_run, resumed_checkpoint, with_help
+from _common import as_list, clean_exit, finish_run, resumed_checkpoint, scene_options, with_help
 from _common.known_physics import load_physics
 from _common.models import build_model
 from _common.progress import cut_short_note, train_with_progress
@@ -67,9 +67,9 @@ MAY_CHANGE = (
 )
 
 
-def load_scenes(names: str | ListConfig, timestep: float | None) -> list[Scene]:
+def load_scenes(cfg: DictConfig, names: str | ListConfig) -> list[Scene]:
     """Scenes of one name or several."""
-    return [load_scene(name, timestep=timestep) for name in as_list(names)]
+    return [load_scene(name, **scene_options(cfg)) for name in as_list(names)]
 
 
 def make_model(cfg: DictConfig, scenes: list[Scene], physics: Physics | None) -> ForwardModel:
@@ -151,7 +151,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     """Collect, train, evaluate; the first of the workers alone evaluates and writes."""
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
-    scenes, unseen = load_scenes(cfg.system, cfg.timestep), load_scenes(cfg.zero_shot, cfg.timestep)
+    scenes, unseen = load_scenes(cfg, cfg.system), load_scenes(cfg, cfg.zero_shot)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)  # refuse a bad budget before anything is written
     if cfg.physics is not None and len(scenes) > 1:
         raise ValueError("physics= are of one system; name one.")

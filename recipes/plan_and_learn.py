@@ -23,16 +23,21 @@ import hydra
 from omegaconf import DictConfig
 from safetensors.torch import load_file
 
-from _common import as_list, clean_exit, open_log, with_help
+from _common import as_list, clean_exit, open_log, scene_options, with_help
 from _common.sweeps import FORWARD_MODEL, MPC, Run, override, refuse_changes, report_sweep, run_all
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, load_pretrained, pretrained_names
 
 
+def system_options(cfg: DictConfig) -> list[str]:
+    """Options of the system, as both recipes take them."""
+    return [f"{key}={override(value)}" for key, value in {"system": cfg.system, **scene_options(cfg)}.items()]
+
+
 def task_options(cfg: DictConfig) -> list[str]:
     """Options of the system and its task, as recipes/mpc.py takes them."""
-    options = [f"system={override(cfg.system)}", f"timestep={override(cfg.timestep)}"]
+    options = system_options(cfg)
     return options + [f"{key}={override(cfg[key])}" for key in ("reward", "horizon") if cfg[key] is not None]
 
 
@@ -54,7 +59,7 @@ def planning(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
 def learning(cfg: DictConfig, folder: Path, index: int, model: str | None, executed: list[Run]) -> Run:
     """A training that goes on from a model, with episodes as half of its data; without a model, from random data."""
     data = folder / "data" if cfg.data_dir is None else cfg.data_dir
-    options = (f"system={override(cfg.system)}", f"timestep={override(cfg.timestep)}", f"data.folder={data}")
+    options = (*system_options(cfg), f"data.folder={data}")
     options += ("steps=null", f"clock={cfg.clock}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
     if model is None:
         options += (f"minutes={cfg.first_minutes}",)
@@ -88,7 +93,7 @@ def main(cfg: DictConfig) -> None:
     model = cfg.checkpoint or (cfg.system if cfg.system in pretrained_names() else None)
     if model is not None:
         load_pretrained(model)  # refused before anything is written
-    scene = load_scene(cfg.system, timestep=cfg.timestep)
+    scene = load_scene(cfg.system, **scene_options(cfg))
     learned, executed = make_runs(cfg, folder.path.resolve(), model)  # named in the options, which may not change
     refuse_changes([run for run in (*learned, *executed) if run is not None])
     tracker = open_log(cfg, folder)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from torchrl_gn.training import plain_config
 from torchrl_gn.training.optimizers import Preset
@@ -77,3 +77,9 @@ def _flat(values: Any, prefix: str = "", *, groups: bool = False) -> Iterator[tu
             yield from _flat(value, f"{prefix}{name}.", groups=groups)
         if groups or not isinstance(value, Mapping):
             yield f"{prefix}{name}", value
+
+
+def scene_options(cfg: DictConfig) -> dict[str, Any]:
+    """Options of ``load_scene`` that a recipe has."""
+    plain = plain_config(cfg)
+    return {key: plain[key] for key in ("timestep", "action_bounds", "wide_starts")}

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from _common import scene_options
 from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states, spline_controls
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
@@ -55,7 +56,7 @@ def fill_in(cfg: DictConfig) -> None:
 
 def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
     """Load the standard scene, and with ``variants=true`` a random variant for every episode."""
-    scene = load_scene(cfg.system, timestep=cfg.timestep)
+    scene = load_scene(cfg.system, **scene_options(cfg))
     if not cfg.variants:
         return scene, [scene]
     rng = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(2,)))

@@ -46,13 +46,15 @@ def dataset_with_progress(
     """Create, complete or open the data set ``<name>`` (``<name>_variants``) in ``folder``, with a progress bar.
 
     ``data`` holds the numbers of ``train``, ``validation`` and ``test`` trajectories, ``length`` in control steps,
-    ``seed`` and optionally ``ray``, the address of a Ray cluster to simulate on, and ``bounds`` of the bodies.
+    ``seed`` and optionally ``ray``, the address of a Ray cluster to simulate on, ``target_speed`` of position servos
+    and ``bounds`` of the bodies.
     """
     if data["length"] < HORIZON:
         raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
     name = scene.name if variants is None else f"{scene.name}_variants"
     options: dict[str, Any] = {split: data[split] for split in ("train", "validation", "test")}
     options |= {"steps": data["length"], "seed": data["seed"], "variants": variants, "bounds": data.get("bounds")}
+    options["target_speed"] = data.get("target_speed", 1.0)
     joined = RayCluster(data["ray"]) if data.get("ray") is not None else nullcontext()
     with collecting(f"data of {scene.name}") as show, joined as cluster:
         if cluster is not None:  # it simulates one chunk per core

@@ -66,6 +66,19 @@ def test_position_targets_hold_the_start_and_move_slowly(drawn) -> None:
     assert (reach.max(0) > 0.5 * np.array([5.8, 2])).all() and (reach.min(0) < 0.1 * np.array([5.8, 2])).all()
 
 
+def test_the_speed_of_position_targets_is_a_factor(drawn) -> None:
+    simulator, physics, controls = drawn
+    other = random_controls(simulator, physics, 200, 0, target_speed=0.5)
+    slow, full = (abs(np.diff(each[..., :2], axis=1)).max((0, 1)) for each in (other, controls))
+    assert (slow <= 0.5001 * full).all() and (slow > 0.3 * full).all()
+    np.testing.assert_array_equal(other[..., 2:], controls[..., 2:])
+    free = random_controls(simulator, physics, 200, 0, target_speed=None)
+    assert (abs(np.diff(free[..., :2], axis=1)).max((0, 1)) > 3 * full).all()
+    for bad in (0, -1, np.inf, np.nan):
+        with pytest.raises(ValueError, match="target_speed must be above 0 and finite"):
+            random_controls(simulator, physics, 2, 0, target_speed=bad)
+
+
 def test_servos_follow_without_flinging_the_arm(drawn) -> None:
     simulator, physics, controls = drawn
     physics, controls = physics[:40], controls[:40, :60]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchrl_gn.data import StartPoseWarning, sample_start_states
-from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.scenes import Scene, load_scene, scene_from_description
 
 ROBOT = """
 <mujoco model="robot">
@@ -76,10 +76,23 @@ def test_starts_do_not_collide_and_stand_on_the_ground() -> None:
 @pytest.mark.parametrize(("old", "new", "knee"), [("home", "stand", -0.8), ("home", "end", -1.6), ("<key", "<!--", 0)])
 def test_reference_pose_is_a_keyframe(old: str, new: str, knee: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """``stand`` comes after ``home``, then the first."""
-    monkeypatch.setattr("torchrl_gn.data.start_poses._WIDE_SHARE", 0.0)
     monkeypatch.setattr("torchrl_gn.data.start_poses._NEAR", 1e-9)
     text = ROBOT.replace(old, new) if new != "<!--" else ROBOT[: ROBOT.index("<keyframe>")] + "</mujoco>"
-    assert _qpos(load_scene(text), 3)[:, 15] == pytest.approx(knee, abs=1e-6)
+    assert _qpos(load_scene(text, wide_starts=0), 3)[:, 15] == pytest.approx(knee, abs=1e-6)
+
+
+def test_the_share_of_wide_starts_is_part_of_the_description() -> None:
+    reference = _qpos(load_scene(ROBOT, wide_starts=0), 1)
+    far = []
+    for share in (0, 0.5, 1):
+        scene = load_scene(ROBOT, wide_starts=share)
+        assert scene_from_description(scene.description()).wide_starts == scene.wide_starts == share
+        far.append(float(np.abs(_qpos(scene) - reference)[:, 14:].mean()))
+    assert far[0] < far[1] < far[2]
+    with pytest.raises(ValueError, match="wide_starts must be a share"):
+        load_scene(ROBOT, wide_starts=2)
+    with pytest.raises(ValueError, match="start states of its own"):
+        load_scene("cheetah", wide_starts=0)
 
 
 def test_a_base_in_the_ground_is_lifted_until_it_touches() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from _common.options import as_list, check_options, unknown_options
+from _common.options import as_list, check_options, scene_options, unknown_options
 
 omegaconf = pytest.importorskip("omegaconf")
 
@@ -51,3 +51,10 @@ def test_mistyped_options_suggest_the_nearest():
     assert hints("qqqq=1") == ["There is no option 'qqqq'."]
     known = ["steps=3", "model={hidden: 3}", "model.features.contacts=false", "preset=paper", "+robot=hopper", "--x"]
     assert hints(*known, "hydra.verbose=true") == []
+
+
+@pytest.mark.parametrize("recipe", ["forward_model", "mpc", "plan_and_learn"])
+def test_options_of_a_scene(compose, recipe):
+    assert scene_options(compose(recipe)) == {"timestep": None, "action_bounds": None, "wide_starts": 0.5}
+    given = compose(recipe, "action_bounds={free: [-1, 2]}", "wide_starts=0", "timestep=0.02")
+    assert scene_options(given) == {"timestep": 0.02, "action_bounds": {"free": [-1, 2]}, "wide_starts": 0}

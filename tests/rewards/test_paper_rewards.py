@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_gn.maths import BODY_STATE
 from torchrl_gn.rewards import (
     AngularSpeed,
     Balance,
     Position,
+    Upright,
     Velocity,
     VerticalDistance,
     available_rewards,
@@ -221,6 +223,30 @@ def test_axes_and_powers(steps, axis, component):
         np.testing.assert_allclose(speed.squeeze(-1), truth.linear[:, component] ** power, rtol=1e-7, atol=1e-15)
     spin = AngularSpeed(moving.scene, "jaco_hand/hand")(None, None, moving.next_state)
     np.testing.assert_allclose(spin.squeeze(-1), (truth.angular**2).sum(-1), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("axis", "component"), [("x", 0), ("y", 1), ("z", 2)])
+def test_velocity_along_an_own_axis_and_towards_a_goal(steps, axis, component):
+    moving = steps("jaco")
+    scene, truth = moving.scene, moving.truth("jaco_hand/hand")
+    along = np.einsum("mij,mi->mj", truth.rotation, truth.linear)[:, component]
+    own = Velocity(scene, "jaco_hand/hand", axis, own=True)(None, None, moving.next_state)
+    np.testing.assert_allclose(own.squeeze(-1), along, rtol=1e-7, atol=1e-12)
+    for power in (1, 2):
+        reward = Velocity(scene, "jaco_hand/hand", axis, own=True, goal=0.3, power=power)
+        kept = reward(None, None, moving.next_state).squeeze(-1)
+        np.testing.assert_allclose(kept, -(abs(along - 0.3) ** power), rtol=1e-7, atol=1e-12)
+    with pytest.raises(ValueError, match="goal must be a finite velocity"):
+        Velocity(scene, "jaco_hand/hand", axis, goal=np.nan)
+
+
+def test_upright_leaves_the_heading_open(steps):
+    moving = steps("jaco")
+    truth = moving.truth("jaco_hand/hand")
+    upright = Upright(moving.scene, "jaco_hand/hand")
+    np.testing.assert_allclose(upright(None, None, moving.next_state).squeeze(-1), truth.rotation[:, 2, 2], rtol=1e-9)
+    turned = BODY_STATE.rotate(moving.next_state, torch.tensor([0.6, 0.0, 0.0, 0.8], dtype=torch.float64))
+    torch.testing.assert_close(upright(None, None, turned), upright(None, None, moving.next_state))
 
 
 @pytest.mark.parametrize("system", ["pendulum", "cartpole", "swimmer4", "cheetah", "jaco"])

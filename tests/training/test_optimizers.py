@@ -98,6 +98,18 @@ def test_gradients_are_clipped_together(size):
     torch.testing.assert_close(clipped, exact * min(1, 1 / norm), rtol=1e-5, atol=0)
 
 
+def test_a_gradient_whose_squares_overflow_is_clipped():
+    module = network()
+    give_gradients(module)
+    direction = torch.cat([parameter.grad.flatten() for parameter in module.parameters()])
+    for parameter in module.parameters():
+        parameter.grad.mul_(1e25)
+    norm = make_optimizer(module, "adam").step(0, 0.0)
+    assert norm == pytest.approx(1e25 * direction.norm().item(), rel=1e-5)
+    clipped = torch.cat([parameter.grad.flatten() for parameter in module.parameters()])
+    torch.testing.assert_close(clipped, direction / direction.norm(), rtol=1e-5, atol=0)
+
+
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 @pytest.mark.parametrize("preset", ["paper", "adam", "muon"])
 def test_a_gradient_that_is_not_finite_changes_nothing(preset, bad):

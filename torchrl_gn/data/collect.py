@@ -38,6 +38,7 @@ def collect_trajectories(
     *,
     split: int = 0,
     knot_interval: float = 10.0,
+    target_speed: float | None = 1.0,
     policy: Policy | None = None,
     bounds: Mapping[str, float] | None = None,
     redrawn: dict[str, int] | None = None,
@@ -51,7 +52,7 @@ def collect_trajectories(
     Args:
         scene: the scene, or variants of one, which the sequences take in turn.
         split: index of an independent split; data sets use 0, 1, 2.
-        knot_interval: as of :func:`~torchrl_gn.data.random_controls`, which acts without a policy.
+        knot_interval, target_speed: as of :func:`~torchrl_gn.data.random_controls`, which acts without a policy.
         policy: TorchRL policy, or a function of a TensorDict ``[n]`` of ``state``, ``physics``, ``is_init`` and, of
             variants, ``variant`` that writes ``action`` ``[n, A]`` or returns it; ``n`` is at most 250. States have the
             dtype and device of its parameters. It explores (``ExplorationType.RANDOM``) and is seeded by ``seed``.
@@ -75,7 +76,8 @@ def collect_trajectories(
     simulator = simulator or Simulator(scene)
     if simulator.scenes != ((scene,) if isinstance(scene, Scene) else tuple(scene)):
         raise ValueError(f"simulator is of another {simulator.scene.name!r} than the scene; give both the same.")
-    chunks, options = [], {"knot_interval": knot_interval, "policy": policy, "bounds": bounds}
+    chunks, controls = [], {"knot_interval": knot_interval, "target_speed": target_speed}
+    options = {**controls, "policy": policy, "bounds": bounds}
     redrawn = {} if redrawn is None else redrawn
     redrawn.update(unstable=0, outside=0)
     for first in range(0, num, CHUNK):
@@ -107,6 +109,7 @@ def collect_chunk(
     key: tuple[int, ...],
     *,
     knot_interval: float,
+    target_speed: float | None,
     policy: Policy | None = None,
     bounds: Mapping[str, float] | None = None,
 ) -> tuple[TensorDict, dict[str, int]]:
@@ -118,7 +121,8 @@ def collect_chunk(
         own = variant[pending.numpy()]
         start, bad_starts = draw_start_states(simulator, own, rng)
         if policy is None:
-            action = random_controls(simulator, start, steps, rng, knot_interval=knot_interval, variant=own)
+            controls = {"knot_interval": knot_interval, "target_speed": target_speed}
+            action = random_controls(simulator, start, steps, rng, variant=own, **controls)
             drawn = simulator.rollout(start, action, own)
             drawn["action"] = torch.from_numpy(action)
         else:

@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from torchrl_gn.data.collect import CHUNK, check_bounds, collect_chunk, variant_parameters
 from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
+from torchrl_gn.data.random_controls import check_target_speed
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.physical_parameters import ParameterNames, take_columns
@@ -61,6 +62,7 @@ def create_dataset(
     *,
     variants: int | None = None,
     knot_interval: float = 10.0,
+    target_speed: float | None = 1.0,
     bounds: Mapping[str, float] | None = None,
     num_threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -73,7 +75,7 @@ def create_dataset(
     Args:
         variants: number of random variants that the sequences of each split take in turn, no split another's.
             Default: all are of the scene itself. The paper does not give it.
-        knot_interval, bounds: as of :func:`~torchrl_gn.data.collect_trajectories`.
+        knot_interval, target_speed, bounds: as of :func:`~torchrl_gn.data.collect_trajectories`.
         progress: called with sequences done and wanted, after every chunk.
         map_chunks: works like ``map``, such as ``imap`` of a pool or of a :class:`~torchrl_gn.training.RayCluster`.
 
@@ -89,6 +91,7 @@ def create_dataset(
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     check_knot_interval(knot_interval)
+    check_target_speed(target_speed)
     check_bounds(bounds)
     ranges = {} if variants is None else parameter_ranges(_system(scene))
     files = DatasetFiles(Path(path))
@@ -105,6 +108,10 @@ def create_dataset(
     }
     if "system" not in scene.origin:
         request["draws"] = _DRAWS
+    if scene.wide_starts != 0.5:
+        request["wide_starts"] = scene.wide_starts
+    if target_speed != 1:
+        request["target_speed"] = target_speed
     if bounds:
         request["bounds"] = {name: float(value) for name, value in bounds.items()}
     with files.lock():
@@ -197,8 +204,8 @@ def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple)
         distinct, variant = np.unique(parameters, axis=0, return_inverse=True)
         scenes, variant = _variants(scene, distinct), variant.reshape(-1)  # some versions of NumPy keep the axis
     options = {name: request[name] for name in ("steps", "seed", "knot_interval")}
-    bounds = request.get("bounds")
-    rows, rejected = collect_chunk(Simulator(scenes, num_threads), variant, key=key, bounds=bounds, **options)
+    options |= {"bounds": request.get("bounds"), "target_speed": request.get("target_speed", 1.0)}
+    rows, rejected = collect_chunk(Simulator(scenes, num_threads), variant, key=key, **options)
     if parameters is not None:
         rows["parameters"] = variant_parameters(scenes, variant)
         rows["variant_parameters"] = torch.from_numpy(parameters)

@@ -26,6 +26,7 @@ def random_controls(
     rng: int | np.random.Generator,
     *,
     knot_interval: float = 10.0,
+    target_speed: float | None = 1.0,
     variant: np.ndarray | None = None,
 ) -> np.ndarray:
     """Draw smooth action sequences ``[n, T, A]`` from states ``[n, S]``, float64, in the actuators' units.
@@ -35,7 +36,8 @@ def random_controls(
     - motors, and all that is neither of the following: these splines, scaled in each sequence by a factor in [0.2, 1]
       towards the controls of the reference keyframe, or towards 0;
     - position servos: targets from the one that holds the given state, on splines within a random part of the bounds
-      around it; in a second they move at most 0.2 to 1 times the bounds' width, pi rad or 1 m of their joint;
+      around it; in a second they move at most 0.2 to 1 times the bounds' width, pi rad or 1 m of their joint,
+      times ``target_speed``; with None as motors, as a planner may choose them;
     - velocity servos: splines whose knots alternate in sign, 1 to 4 ``knot_interval`` apart, scaled in each sequence
       by a factor in [0.2, 1]; as motors if the bounds do not include both directions.
 
@@ -44,10 +46,12 @@ def random_controls(
         variant: ``[n]``, scene of each sequence; default: the scenes in turn.
 
     Raises:
+        ValueError: ``knot_interval`` or ``target_speed`` is not above 0 and finite.
         SceneError: an action has no bounds.
     """
     scene, n = simulator.scene, len(physics)
     rng = np.random.default_rng(rng)
+    check_target_speed(target_speed)
     if "system" in scene.origin or not (n and steps and scene.num_actions):
         return spline_controls(scene, n, steps, rng, knot_interval=knot_interval)
     check_knot_interval(knot_interval)
@@ -62,12 +66,18 @@ def random_controls(
     if reversing.any():
         ends = low[reversing], high[reversing]
         controls[..., reversing] = scale * _velocity_targets(*ends, n, steps, knot_interval, rng)
-    if (servos := kinds == "position").any():
+    if target_speed is not None and (servos := kinds == "position").any():
         variant = np.arange(n) % len(simulator.scenes) if variant is None else variant
         start = _holding_targets(simulator, physics, variant, np.flatnonzero(servos))
-        fastest = (scale[:, 0] * _fastest_targets(model) * scene.timestep)[:, servos]
+        fastest = (target_speed * scale[:, 0] * _fastest_targets(model) * scene.timestep)[:, servos]
         controls[..., servos] = _position_targets(start, low[servos], high[servos], fastest, steps, knot_interval, rng)
     return controls
+
+
+def check_target_speed(target_speed: float | None) -> None:
+    """Raise ValueError if the factor is not above 0 and finite."""
+    if target_speed is not None and not 0 < target_speed < math.inf:
+        raise ValueError(f"target_speed must be above 0 and finite, got {target_speed}")
 
 
 def _velocity_targets(

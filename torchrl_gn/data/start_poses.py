@@ -12,7 +12,6 @@ from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import named, weld_roots
 
-_WIDE_SHARE = 0.5  # share of the starts that may be anywhere within the joint limits
 _NEAR = 0.3  # largest perturbation of the others, as a share of that
 _TILT = 0.5  # rad, of the base of a robot
 _DEPTH = 1e-3  # metres that two geoms may overlap, more than in the reference pose
@@ -32,8 +31,9 @@ class StartPoses:
     """Draw collision-free states at rest of one model.
 
     The reference pose is the keyframe ``home``, else ``stand``, else the first, else ``qpos0``; a joint beyond its
-    limits moves to the nearest, or to their middle if it is far beyond. Half of the draws perturb it widely: joints
-    uniform within their limits, unlimited hinges and balls in every direction. The others stay within 30 % of that.
+    limits moves to the nearest, or to their middle if it is far beyond. Half of the draws (``Scene.wide_starts``)
+    perturb it widely: joints uniform within their limits, unlimited hinges and balls in every direction. The others
+    stay within 30 % of that.
 
     - Free bodies turn about the vertical and shift by up to their size; bases of robots tilt by up to 0.5 rad. Without
       gravity, or where they can touch nothing fixed, they stay in place in any orientation.
@@ -64,7 +64,7 @@ class StartPoses:
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """States ``[n, S]``, float64."""
         states = np.tile(self._rest, (n, 1))
-        wide = rng.random(n) < _WIDE_SHARE
+        wide = rng.random(n) < self.scene.wide_starts
         spread = np.where(wide, 1.0, _NEAR * rng.random(n))
         pending = np.arange(n)
         for attempt in range(_REDRAWS + _SHRINKS):

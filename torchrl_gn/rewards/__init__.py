@@ -14,6 +14,7 @@ from torchrl_gn.rewards.tasks import Balance as Balance
 from torchrl_gn.rewards.tasks import Effort as Effort
 from torchrl_gn.rewards.tasks import Position as Position
 from torchrl_gn.rewards.tasks import Reach as Reach
+from torchrl_gn.rewards.tasks import Upright as Upright
 from torchrl_gn.rewards.tasks import Velocity as Velocity
 from torchrl_gn.rewards.tasks import VerticalDistance as VerticalDistance
 from torchrl_gn.rewards.tasks import available_rewards as available_rewards

@@ -53,6 +53,21 @@ class Balance(Reward):
         return -angle.sum(-1, keepdim=True)
 
 
+class Upright(Reward):
+    """Cosine of the angle between a body's z axis and the vertical after the step: 1 upright, -1 upside down.
+
+    Unlike :class:`Balance` it leaves the heading open.
+    """
+
+    def __init__(self, scene: Scene, body: str):
+        super().__init__()
+        self.bodies = Bodies(scene, [body])
+        self.shown = {"scene": scene.name, "body": body}
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return quaternion.to_matrix(self.bodies.orientation(next_state))[..., 8]
+
+
 class Reach(Reward):
     r"""Progress of a body towards a target in the horizontal plane, metres.
 
@@ -91,21 +106,35 @@ class Reach(Reward):
 
 
 class Velocity(Reward):
-    """Velocity of a body's frame along a world axis after the step, m/s, to a power of at least 1.
+    """Velocity of a body's frame along an axis after the step, m/s, to a power of at least 1.
 
     Paper, SM "Planning configuration": Cheetah and Walker2d "forward", Cheetah "vertical speed" (``power=2``).
+
+    Args:
+        own: along the axis of the body's frame instead of the world's, so that every heading is as good.
+        goal: velocity to keep, m/s: the reward is then the negative distance from it, to the ``power``.
     """
 
-    def __init__(self, scene: Scene, body: str, axis: Axis, *, power: int = 1):
+    def __init__(
+        self, scene: Scene, body: str, axis: Axis, *, power: int = 1, own: bool = False, goal: float | None = None
+    ):
         super().__init__()
         if isinstance(power, bool) or not isinstance(power, int) or power < 1:
             raise ValueError(f"power must be a whole number from 1, got {power!r}")
-        self.bodies, self.axis, self.power = Bodies(scene, [body]), axis, power
-        self.shown = {"scene": scene.name, "body": body, "axis": axis, "power": power}
+        if goal is not None and not math.isfinite(goal):
+            raise ValueError(f"goal must be a finite velocity, got {goal!r}")
+        self.bodies, self.axis, self.power, self.own, self.goal = Bodies(scene, [body]), axis, power, own, goal
+        self.shown = {"scene": scene.name, "body": body, "axis": axis, "power": power, "own": own, "goal": goal}
         self.component = _component(axis)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        return self.bodies.linear_velocity(next_state)[..., self.component] ** self.power
+        velocity = self.bodies.linear_velocity(next_state)
+        if self.own:
+            axis = quaternion.to_matrix(self.bodies.orientation(next_state))[..., self.component :: 3]
+            along = (axis * velocity).sum(-1)
+        else:
+            along = velocity[..., self.component]
+        return along**self.power if self.goal is None else -((along - self.goal).abs() ** self.power)
 
 
 class Position(Reward):
@@ -194,7 +223,18 @@ _REWARDS: dict[tuple[str, str], Callable[[Scene], Reward]] = {
 
 REWARD_TYPES: dict[str, type[Reward]] = {
     kind.__name__: kind
-    for kind in (AngularSpeed, Balance, Distance, Effort, ImitatePose, Position, Reach, Velocity, VerticalDistance)
+    for kind in (
+        AngularSpeed,
+        Balance,
+        Distance,
+        Effort,
+        ImitatePose,
+        Position,
+        Reach,
+        Upright,
+        Velocity,
+        VerticalDistance,
+    )
 }
 """Rewards by the names that options have for them."""
 

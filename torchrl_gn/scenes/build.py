@@ -31,6 +31,7 @@ def build_scene(
     name: str,
     timestep: float | None = None,
     settle_steps: int = 0,
+    wide_starts: float = 0.5,
     action_bounds: ActionBounds | None = None,
     origin: dict | None = None,
 ) -> Scene:
@@ -78,6 +79,7 @@ def build_scene(
         substeps=substeps,
         attachments=_attachments(model, graph),
         settle_steps=settle_steps,
+        wide_starts=wide_starts,
         origin=origin or {},
     )
 

@@ -30,6 +30,7 @@ def load_scene(
     name: str | None = None,
     parameters: Mapping[str, float] | None = None,
     action_bounds: ActionBounds | None = None,
+    wide_starts: float = 0.5,
 ) -> Scene:
     """Load a scene.
 
@@ -44,6 +45,8 @@ def load_scene(
             others are the standard system's.
         action_bounds: of an MJCF model, ``{actuator: (low, high)}``, or one pair for all that have no bounds of their
             own (``ctrlrange``, a motor's ``forcerange``, the range of a position servo's joint).
+        wide_starts: of an MJCF model, the share of :class:`~torchrl_gn.data.StartPoses` anywhere within the joint
+            limits; the others stay near the reference pose.
 
     Raises:
         ValueError: if the name or a parameter is unknown; FileNotFoundError if the file does not exist.
@@ -53,11 +56,16 @@ def load_scene(
     is_system = isinstance(source, str) and not _is_mjcf(source) and find_system(source) is not None
     if action_bounds is not None and (is_system or parameters is not None):
         raise ValueError(f"{source!r} has bounds of its own; action_bounds go with MJCF models.")
+    if wide_starts != 0.5 and (is_system or parameters is not None):
+        raise ValueError(f"{source!r} has start states of its own; wide_starts goes with MJCF models.")
+    if not 0 <= wide_starts <= 1:
+        raise ValueError(f"wide_starts must be a share, 0 to 1, got {wide_starts!r}")
+    chosen: dict[str, Any] = {"action_bounds": action_bounds, "wide_starts": wide_starts}
     if parameters is not None:
         return make_variant(source, parameters, timestep=timestep, name=name)
     if isinstance(source, mujoco.MjSpec):
         spec: Any = source
-        return build_scene(spec, name=name or spec.modelname, timestep=timestep, action_bounds=action_bounds)
+        return build_scene(spec, name=name or spec.modelname, timestep=timestep, **chosen)
     if isinstance(source, mujoco.MjModel):
         raise TypeError("load_scene needs MJCF, not a compiled MjModel; give its file, text or MjSpec.")
     if not isinstance(source, (str, os.PathLike)):
@@ -74,7 +82,9 @@ def load_scene(
     own_name = spec.modelname if isinstance(source, str) and _is_mjcf(source) else Path(source).stem
     if action_bounds is not None:
         origin["action_bounds"] = plain_bounds(action_bounds)
-    return build_scene(spec, name=name or own_name, timestep=timestep, action_bounds=action_bounds, origin=origin)
+    if wide_starts != 0.5:
+        origin["wide_starts"] = float(wide_starts)
+    return build_scene(spec, name=name or own_name, timestep=timestep, origin=origin, **chosen)
 
 
 def scene_from_description(description: dict) -> Scene:
@@ -89,13 +99,14 @@ def scene_from_description(description: dict) -> Scene:
     if system and "parameters" in description:
         scene = make_variant(system.name, description["parameters"], timestep=timestep, name=name)
     else:
-        keys = ("system", "mjcf", "assets", "action_bounds")
+        keys = ("system", "mjcf", "assets", "action_bounds", "wide_starts")
         scene = build_scene(
             system.build() if system else _rebuild_mjcf(description),
             name=name,
             timestep=timestep,
             settle_steps=description["settle_steps"],
             action_bounds=description.get("action_bounds"),
+            wide_starts=description.get("wide_starts", 0.5),
             origin={key: description[key] for key in keys if key in description},
         )
     if scene.fingerprint() != description["fingerprint"]:

@@ -82,6 +82,7 @@ class Scene:
     substeps: int  # physics steps in one control step
     attachments: dict[str, Attachment] = field(default_factory=dict)  # named bodies that are not the root of a node
     settle_steps: int = 0  # physics steps without control after a reset
+    wide_starts: float = 0.5  # share of the start poses of a model from MJCF that are anywhere within the joint limits
     origin: dict = field(default_factory=dict, repr=False)  # source of the model, part of description()
 
     @property

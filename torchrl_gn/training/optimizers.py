@@ -77,10 +77,16 @@ class ScheduledOptimizer:
 
 def clip_gradients(parameters: Iterable[torch.Tensor], max_norm: float, when: str) -> float:
     """Clip the joint gradient; return its norm before. Raise FloatingPointError, naming ``when``, if not finite."""
-    norm = float(nn.utils.clip_grad_norm_(parameters, max_norm))
-    if not math.isfinite(norm):
+    parameters = list(parameters)
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norm = nn.utils.get_total_norm(gradients)
+    if not norm.isfinite():
+        # Squares overflow float32 from 1.8e19 on, where the gradient itself may be finite.
+        norm = nn.utils.get_total_norm([gradient.double() for gradient in gradients])
+    if not norm.isfinite():
         raise FloatingPointError(f"The gradient is not finite at {when}; lower the learning rate.")
-    return norm
+    nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
+    return float(norm)
 
 
 def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | None = None) -> ScheduledOptimizer:
