@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states, start_poses
+from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes import SYSTEMS, Scene, load_scene
 
@@ -55,14 +55,8 @@ def test_limited_and_rotational_joints(name: str) -> None:
             assert (values == scene.model.qpos0[joint]).all()
 
 
-@pytest.fixture
-def wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No start near the reference pose."""
-    monkeypatch.setattr(start_poses, "_WIDE_SHARE", 1.0)
-
-
-def test_rotations_are_uniform(wide: None) -> None:
-    qpos, _ = _qpos_qvel(zoo.load("limited_joints"), 4000)
+def test_rotations_are_uniform() -> None:
+    qpos, _ = _qpos_qvel(dataclasses.replace(zoo.load("limited_joints"), wide_starts=1.0), 4000)
     ball, limited, place, free, slide = np.split(qpos, [4, 8, 11, 15], axis=1)
     np.testing.assert_array_equal(place, np.tile([0.0, 0.0, 7.0], (4000, 1)))
     for quat in (ball, limited, free):
@@ -101,12 +95,13 @@ def test_repeatable_and_different(name: str) -> None:
     assert sample_start_states(scene, 0, 1).shape == (0, scene.physics_size)
 
 
-def test_unstable_starts_are_drawn_again_and_counted(wide: None) -> None:
-    scene = dataclasses.replace(repelled_hinge(1.5), settle_steps=1)
+def test_unstable_starts_are_drawn_again_and_counted() -> None:
+    wide = {"settle_steps": 1, "wide_starts": 1.0}
+    scene = dataclasses.replace(repelled_hinge(1.5), **wide)
     states, rejected = draw_start_states(Simulator(scene), np.zeros(200, dtype=int), 0)
     assert (np.abs(states[:, 1]) < 1.501).all() and 150 < rejected < 300
     with pytest.raises(UnstableSimulationError, match="'repelled'.*1 physics steps"):
-        sample_start_states(dataclasses.replace(repelled_hinge(0.01), settle_steps=1), 50, 0)
+        sample_start_states(dataclasses.replace(repelled_hinge(0.01), **wide), 50, 0)
 
 
 def test_the_arm_never_starts_inside_itself():

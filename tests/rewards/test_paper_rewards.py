@@ -240,7 +240,7 @@ def test_velocity_along_an_own_axis_and_towards_a_goal(steps, axis, component):
         Velocity(scene, "jaco_hand/hand", axis, goal=np.nan)
 
 
-def test_upright_leaves_the_heading_open(steps):
+def test_upright_leaves_the_yaw_open(steps):
     moving = steps("jaco")
     truth = moving.truth("jaco_hand/hand")
     upright = Upright(moving.scene, "jaco_hand/hand")

@@ -56,7 +56,7 @@ class Balance(Reward):
 class Upright(Reward):
     """Cosine of the angle between a body's z axis and the vertical after the step: 1 upright, -1 upside down.
 
-    Unlike :class:`Balance` it leaves the heading open.
+    Unlike :class:`Balance` it leaves the yaw open.
     """
 
     def __init__(self, scene: Scene, body: str):
@@ -111,7 +111,7 @@ class Velocity(Reward):
     Paper, SM "Planning configuration": Cheetah and Walker2d "forward", Cheetah "vertical speed" (``power=2``).
 
     Args:
-        own: along the axis of the body's frame instead of the world's, so that every heading is as good.
+        own: along the axis of the body's frame instead of the world's, so that every yaw is as good.
         goal: velocity to keep, m/s: the reward is then the negative distance from it, to the ``power``.
     """
 
