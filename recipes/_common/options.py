@@ -18,10 +18,10 @@ _PRESETS = list(get_args(Preset))
 # What options of these names must be, wherever they stand.
 _RULES: list[tuple[str, Callable[[Any], bool], str]] = [
     (r"optimizer", lambda value: value in _PRESETS, f"one of {_PRESETS}"),
-    (r"(.*_)?lr|checkpoint_seconds", lambda value: 0 < value < math.inf, "a positive, finite number"),
+    (r"(.*_)?lr", lambda value: 0 < value < math.inf, "a positive, finite number"),
     (r"(.*_)?batch_size|unroll_steps|threads|patience", lambda value: value >= 1 and value == int(value), "1 or more"),
     (r"unroll_fraction", lambda value: 0 <= value <= 1, "a share, 0 to 1"),
-    (r"noise", lambda value: 0 <= value < math.inf, "0 or a positive, finite number"),
+    (r"noise|checkpoint_seconds", lambda value: 0 <= value < math.inf, "0 or a positive, finite number"),
 ]
 
 
