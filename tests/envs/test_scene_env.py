@@ -247,6 +247,7 @@ def test_episodes_end_where_a_function_says(pendulum, env, done):
 
 
 def test_pictures_of_states(pendulum, scene_env, model_env):
+    pytest.importorskip("PIL")
     executed = scene_env.rollout(3)
     pictures = scene_env.render(executed, size=64)
     assert pictures.shape == (3, 64, 64, 3) and pictures.dtype == np.uint8
