@@ -68,14 +68,14 @@ class Episodes:
 
 def planned_state(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase) -> Tensor:
     """Last state ``[N, 13]`` of the first episode's plan, predicted by the model or, without one, simulated."""
-    left = cast(Tensor, now["plan", "actions"])
-    left = left if left.ndim == 3 else left[:, 0]  # of candidates the best
+    plans = cast(Tensor, now["plan", "actions"])
+    left = plans if plans.ndim == 3 else plans[:, 0]  # of candidates the best
     actions = torch.cat((now["action"].unsqueeze(1), left[:, :-1]), dim=1)
     if imagined is None:
         ahead = env.simulator.rollout(now["physics"][:1], actions[:1])
         return ahead["state"][0, -1].where(ahead["stable"][0], torch.nan)
     # As many rows as the planner has: a compiled model is compiled for every number of them.
-    rows = cast(Tensor, now["plan", "actions"]).shape[1] if now["plan", "actions"].ndim == 4 else 1
+    rows = 1 if plans.ndim == 3 else plans.shape[1]
     many = cast(TensorDictBase, now.repeat_interleave(rows, 0))
     return imagined.imagine(many, actions.repeat_interleave(rows, 0))[0][0, -1].detach()
 

@@ -54,12 +54,12 @@ def unknown_options(words: Sequence[str], recipe: Path) -> list[str]:
     for file in folder.glob("*/*.yaml"):
         whole = file.read_text().startswith("# @package _global_")
         known |= {file.parent.name, *_keys(file, "" if whole else f"{file.parent.name}.")}
+    # An option of a group may stand without the group's name.
+    short = {name.split(".")[-1]: name for name in sorted(known, reverse=True)} | {name: name for name in known}
     hints = []
     for key in (word.split("=", 1)[0] for word in words if "=" in word and not word.startswith(("+", "~", "hydra"))):
         if key in known:
             continue
-        # An option of a group may stand without the group's name.
-        short = {name.split(".")[-1]: name for name in sorted(known, reverse=True)} | {name: name for name in known}
         near = difflib.get_close_matches(key, short, 1)
         hints.append(f"There is no option {key!r}" + (f"; did you mean {short[near[0]]!r}?" if near else "."))
     return hints

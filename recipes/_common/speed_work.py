@@ -46,7 +46,6 @@ def make_works(
 
     def step(batch: int) -> Work:
         state, actions = first(batch)
-
         action = actions[:, 0].contiguous()
 
         def run(way: Way) -> Tensor:

@@ -90,10 +90,9 @@ class ILQGPlanner(RecedingHorizonPlanner):
             predictor = env.predictor
             if not isinstance(predictor, Predictor):
                 raise TypeError(f"ILQGPlanner needs a Predictor as model, got {type(env.world_model).__name__}.")
-            if env.carried_keys or predictor.parameters_key is not None:
+            if further := [*env.carried_keys, *filter(None, [predictor.parameters_key])]:
                 raise ValueError(
-                    f"ILQGPlanner plans through models of state and action alone; {env} also reads"
-                    f" {[*env.carried_keys, *([predictor.parameters_key] if predictor.parameters_key else [])]}: use"
+                    f"ILQGPlanner plans through models of state and action alone; {env} also reads {further}: use"
                     " GradientPlanner."
                 )
         threads = 1 if num_threads is None else num_threads

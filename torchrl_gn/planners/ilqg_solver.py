@@ -61,17 +61,16 @@ class ILQGSolver:
     def improve(self, trajectory: Trajectory, iterations: int) -> Trajectory:
         """Improve a stable trajectory; the cost never rises."""
         damping = 1.0
-        local: Linearization | None = None
-        model: QuadraticModel | None = None
+        expanded: tuple[Linearization, QuadraticModel] | None = None  # around the trajectory
         for _ in range(iterations):
-            if local is None or model is None:
-                local, model = self.expand(trajectory)
+            expanded = expanded or self.expand(trajectory)
+            local, model = expanded
             scale = np.sqrt(np.square(model.control_gradient()).mean())
             if not (np.isfinite(scale) and np.isfinite(model.hessian).all()) or scale == 0:
                 return trajectory  # stationary, or no finite expansion
             candidate, factor = self._best_candidate(trajectory, local, model, damping, scale)
             if candidate.cost < trajectory.cost:
-                trajectory, local, model = candidate, None, None
+                trajectory, expanded = candidate, None
                 damping = float(np.clip(damping * (factor or 1.0), *_DAMPING_RANGE))
             elif damping >= _DAMPING_RANGE[1]:
                 return trajectory
@@ -107,7 +106,7 @@ class ILQGSolver:
         """The best trajectory of all dampings and step sizes, and its damping relative to ``damping``."""
         control_damping = scale * np.maximum(damping * _DAMPINGS, _MIN_DAMPING)
         # In the states' units, by the mean squared effect of a control on the next state.
-        effect = np.square(model.dynamics[..., local.bodies.shape[2] :]).sum(axis=1).mean()
+        effect = np.square(model.dynamics[..., model.dynamics.shape[1] :]).sum(axis=1).mean()
         state_damping = _STATE_DAMPING * control_damping / max(effect, np.finfo(np.float64).tiny)
         with np.errstate(all="ignore"):  # lightly damped candidates may overflow: they lose
             changes, gains = backward_pass(model, control_damping, state_damping)

@@ -43,7 +43,6 @@ class SimulatedPlant:
     def __init__(self, simulator: Simulator, *, central: bool = False) -> None:
         self.simulator, self.central = simulator, central
         self.scene = simulator.scene
-        self.tangent = Tangent(self.scene.model)
 
     def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
         simulated = self.simulator.rollout(np.tile(start, (len(actions), 1)), actions)
@@ -109,11 +108,8 @@ class LearnedPlant:
             state, action = (each.requires_grad_() for each in leaves)
             after = self.predictor.step(state, action)[0]
             gradient = torch.from_numpy(inverse[1:].reshape(after.shape))
-            found = torch.autograd.grad(after, (state, action), gradient.to(after.dtype), allow_unused=True)
-        of_state, of_action = (
-            np.zeros((steps, size, leaf[0].numel())) if each is None else each.double().numpy().reshape(steps, size, -1)
-            for each, leaf in zip(found, leaves, strict=True)
-        )
+            found = torch.autograd.grad(after, (state, action), gradient.to(after.dtype), materialize_grads=True)
+        of_state, of_action = (each.double().numpy().reshape(steps, size, -1) for each in found)
 
         def deviation(t: int, paths: np.ndarray) -> np.ndarray:
             return (paths - path[t]) @ inverse[t].T
