@@ -1,4 +1,4 @@
-"""Muon: momentum with orthogonalised matrix updates, in float32 and one batch per shape."""
+"""Muon: momentum with orthogonalised matrix updates, in float32."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from torchrl_gn.dynamics.executors.native import NoCompilerError, muon_update
 
 # Odd quintics (linear, cubic, quintic), each optimal after the one before for singular values in [0.002, 1] (N. Amsel
 # et al., "The Polar Express", 2025). Four of them reach [0.68, 1.32], like five of Muon's usual equal ones.
@@ -25,7 +27,8 @@ class Muon(torch.optim.Optimizer):
 
     The update is the nearest semi-orthogonal matrix to the Nesterov momentum, times ``lr * sqrt(max(1, rows /
     columns))``: that of ``torch.optim.Muon`` without weight decay, but in the parameter's float32 or float64 (float32
-    for 16-bit ones) instead of bfloat16. ``params`` are matrices, or parameter groups of them.
+    for 16-bit ones) instead of bfloat16. ``params`` are matrices, or parameter groups of them. In C++ on a processor
+    with a compiler, on the threads of torch; each matrix is updated by one.
     """
 
     def __init__(self, params: Iterable[Any], lr: float = 1e-2, *, momentum: float = 0.95) -> None:
@@ -49,18 +52,26 @@ class Muon(torch.optim.Optimizer):
             parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
             if not parameters:
                 continue
-            gradients = [parameter.grad for parameter in parameters]
             for parameter in parameters:
                 if not self.state[parameter]:
                     self.state[parameter]["momentum_buffer"] = torch.zeros_like(parameter)
             moments = [self.state[parameter]["momentum_buffer"] for parameter in parameters]
-            torch._foreach_lerp_(moments, gradients, 1 - group["momentum"])  # pyright: ignore
-            nesterov = torch._foreach_lerp(gradients, moments, group["momentum"])  # pyright: ignore
-            updates = _orthogonalize_all(nesterov)
-            for parameter, update in zip(parameters, updates, strict=True):
-                rows, columns = parameter.shape
-                parameter.sub_(update, alpha=group["lr"] * math.sqrt(max(1, rows / columns)))
+            try:
+                rest = muon_update(parameters, moments, group["momentum"], group["lr"], _POLYNOMIALS)
+            except NoCompilerError:
+                rest = list(range(len(parameters)))
+            if rest:
+                self._update([parameters[i] for i in rest], [moments[i] for i in rest], group)
         return loss
+
+    def _update(self, parameters: Sequence[Tensor], moments: Sequence[Tensor], group: dict[str, Any]) -> None:
+        """Update matrices by torch operations."""
+        gradients = [parameter.grad for parameter in parameters]
+        torch._foreach_lerp_(moments, gradients, 1 - group["momentum"])  # pyright: ignore
+        nesterov = torch._foreach_lerp(gradients, moments, group["momentum"])  # pyright: ignore
+        for parameter, update in zip(parameters, _orthogonalize_all(nesterov), strict=True):
+            rows, columns = parameter.shape
+            parameter.sub_(update, alpha=group["lr"] * math.sqrt(max(1, rows / columns)))
 
 
 def orthogonalize(matrices: Tensor) -> Tensor:

@@ -75,6 +75,7 @@ def load_library() -> ctypes.CDLL:
         "gn_stored": (_I, [_P, _I, _P]),
         "gn_rollout": (_I, [_P, _I, _P, _P]),
         "gn_rollout_adjoint": (None, [_P, _I, _P, _P]),
+        "gn_muon": (None, [_I, _P, _I, _P, _I]),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)

@@ -1,4 +1,5 @@
 // The C interface of the native executor, which library.py calls.
+#include "muon.h"
 #include "rollout.h"
 
 #define GN_API __attribute__((visibility("default")))
@@ -44,5 +45,11 @@ GN_API int64_t gn_rollout(const void* network, int64_t kind, const gn::Maths* ma
 
 GN_API void gn_rollout_adjoint(const void* network, int64_t kind, const gn::Maths* maths, const gn::Call* call) {
   gn::with_network(network, kind, [&](const auto& known) { gn::run(*maths, known, *call, true); });
+}
+
+// Updates matrices of float32 (kind 0) or float64 (1), each by one thread.
+GN_API void gn_muon(int64_t kind, const gn::MuonMatrix* matrices, int64_t count, const gn::MuonOptions* options,
+                    int64_t threads) {
+  (kind == 1 ? gn::muon<double> : gn::muon<float>)(matrices, count, *options, threads);
 }
 }

@@ -15,6 +15,7 @@ from torchrl_gn.dynamics.executors.native.tape import Tape
 from torchrl_gn.networks.layers import LayerList
 
 _ORDER = ("kernels.h", "network.h", "tape.h", "call.h", "rollout.h")
+_TRAINING = {"muon.h"}  # no prediction needs it
 _TYPES = {"i": "int32_t", "l": "int64_t", "f": "float", "d": "double"}
 
 
@@ -84,7 +85,7 @@ def source(about: Description, layers: LayerList, maths: StateMaths, rest: np.nd
 
 def _engine() -> tuple[str, str]:
     """Standard headers, and the executor's code without its C interface."""
-    files = {path.name: path.read_text() for path in SOURCES if path.suffix == ".h"}
+    files = {path.name: path.read_text() for path in SOURCES if path.suffix == ".h" and path.name not in _TRAINING}
     if files.keys() != set(_ORDER):
         raise RuntimeError(f"The native executor has the files {sorted(files)}, not {sorted(_ORDER)}.")
     text = "\n".join(files[name] for name in _ORDER)
