@@ -11,10 +11,12 @@ import torch
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.planners.linearize import Linearization, Tangent, linearize
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
+_COMPONENTS = ("position", "orientation", "linear_velocity", "angular_velocity")
 Paths = tuple[np.ndarray, np.ndarray, np.ndarray]  # states [n, H + 1, S], their bodies [n, H + 1, N, C], stable [n]
 Policy = Callable[[int, np.ndarray], np.ndarray]  # step and states [n, S] to actions [n, A]
 
@@ -121,18 +123,24 @@ class LearnedPlant:
         count, channels = len(states), self._shape[0] * self._shape[1]
         if self._coordinates is None:
             return np.broadcast_to(np.eye(channels), (count, channels, channels))
-        epsilon, tangent = 1e-6, Tangent(self.scene.model)
+        model, epsilon = self.scene.model, 1e-6
+        nv, tangent = model.nv, Tangent(model)
         position, velocity = (each.numpy() for each in self._coordinates(torch.from_numpy(states)))
         physics = np.zeros((count, self.scene.physics_size))
-        physics[:, 1 : 1 + self.scene.model.nq] = position
-        physics[:, 1 + self.scene.model.nq :][:, : self.scene.model.nv] = velocity
+        physics[:, 1 : 1 + model.nq] = position
+        physics[:, 1 + model.nq :][:, :nv] = velocity
         # Activations do not show in body states.
-        size = 2 * self.scene.model.nv
-        change = np.broadcast_to(epsilon * np.eye(tangent.size)[:size], (count, size, tangent.size))
-        ends = [self._simulator.observe(tangent.add(physics[:, None], step)).numpy() for step in (change, -change)]
-        basis = (ends[0] - ends[1]) / (2 * epsilon)
+        change = np.broadcast_to(epsilon * np.eye(tangent.size)[:nv], (count, nv, tangent.size))
+        above, below = (self._simulator.observe(tangent.add(physics[:, None], step)) for step in (change, -change))
+        by_position, here = (above - below) / (2 * epsilon), (above + below) / 2
+        # Bodies move by velocities as by changes of position.
+        place, turn, linear, angular = (BODY_STATE.slices[name] for name in _COMPONENTS)
+        by_velocity = torch.zeros_like(by_position)
+        by_velocity[..., linear] = by_position[..., place]
+        rate = quaternion.product(by_position[..., turn], quaternion.conjugate(here[..., turn]))
+        by_velocity[..., angular] = 2 * rate[..., 1:]
+        basis = torch.cat((by_position, by_velocity), dim=1).numpy()
         # The model's quaternions may have the other sign.
-        where = BODY_STATE.slices["orientation"]
-        flips = np.sign((ends[0][:, 0, :, where] * states[..., where]).sum(-1, keepdims=True))
-        basis[..., where] *= flips[:, None]
-        return basis.reshape(count, size, channels).swapaxes(1, 2)
+        flips = np.sign((here.numpy()[:, 0, :, turn] * states[..., turn]).sum(-1, keepdims=True))
+        basis[..., turn] *= flips[:, None]
+        return basis.reshape(count, 2 * nv, channels).swapaxes(1, 2)
