@@ -27,6 +27,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.processor import threads_for_native
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import ScheduledOptimizer, make_optimizer
 
@@ -54,7 +55,7 @@ def measure(cfg: DictConfig) -> dict[str, dict[str, float]]:
     optimizers = {name: optimizer_of(model.core, name) for name, model in models.items()}
     buffer = trajectory_buffer(trajectories, batch_size=cfg.batch_size, seed=cfg.seed)
     seconds: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    with fast_matmul():
+    with fast_matmul(), threads_for_native():
         for step in trange(cfg.steps + cfg.warm_up, desc="training", leave=False):
             for name, loss in losses.items():
                 times = [time.perf_counter()]

@@ -150,7 +150,8 @@ def evaluate(
 def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     """Collect, train, evaluate; the first of the workers alone evaluates and writes."""
     torch.manual_seed(cfg.seed)
-    torch.set_num_threads(cfg.threads)
+    if cfg.threads is not None or cfg.clock == "processor":  # that clock adds up the time of all threads
+        torch.set_num_threads(cfg.threads or 1)
     scenes, unseen = load_scenes(cfg, cfg.system), load_scenes(cfg, cfg.zero_shot)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)  # refuse a bad budget before anything is written
     if cfg.physics is not None and len(scenes) > 1:

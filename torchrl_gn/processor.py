@@ -8,7 +8,9 @@ import hashlib
 import json
 import os
 import platform
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -21,6 +23,33 @@ _ROWS, _SIZE = 1400, 128  # a layer of 200 Swimmer6 states
 _FLOP = 2 * _ROWS * _SIZE**2
 _ROUNDS = 7
 _LIMITS = ("ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA", "MKL_ENABLE_INSTRUCTIONS")
+
+
+_native = threading.local()
+
+
+def native_threads() -> int:
+    """Threads of C++ code: as many as torch's, also inside of :func:`threads_for_native`."""
+    return getattr(_native, "count", None) or torch.get_num_threads()
+
+
+@contextlib.contextmanager
+def threads_for_native() -> Iterator[None]:
+    """Leave torch's threads to C++ code until the block ends; torch's own operations run on one.
+
+    For small operations between calls of C++ code: torch's other threads, waiting for the next one, would take the
+    processor from it.
+    """
+    before, count = getattr(_native, "count", None), torch.get_num_threads()
+    _native.count = native_threads()
+    if count > 1:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _native.count = before
+        if count > 1:
+            torch.set_num_threads(count)
 
 
 class SlowDtypeWarning(UserWarning):

@@ -9,8 +9,9 @@ import time
 import pytest
 import torch
 
+from torchrl_gn.dynamics.executors.native.build import find_compiler
 from torchrl_gn.maths import fast_matmul
-from torchrl_gn.processor import onednn_precision
+from torchrl_gn.processor import native_threads, onednn_precision
 from torchrl_gn.training import Budget, Trainer, Workers, load_pretrained, save_checkpoint
 
 
@@ -265,6 +266,28 @@ def test_callers_see_their_own_precision_between_steps(make_trainer):
     before = torch.backends.mkldnn.matmul.fp32_precision
     for _ in make_trainer(Budget(steps=2)).run():
         assert torch.backends.mkldnn.matmul.fp32_precision == before
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
+def test_cpp_has_all_threads_of_a_step_and_torch_one(make_trainer):
+    threads, seen, trained = torch.get_num_threads(), [], []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            trainer = make_trainer(Budget(steps=4))
+
+            def look(*_):
+                seen.append((torch.get_num_threads(), native_threads()))
+
+            trainer.loss.register_forward_pre_hook(look)
+            for _ in trainer.run():
+                assert torch.get_num_threads() == count
+            trained.append(weights(trainer))
+    finally:
+        torch.set_num_threads(threads)
+    # The first step finds out.
+    assert seen == [(1, 1)] * 4 + [(2, 2)] + [(1, 2)] * 3
+    torch.testing.assert_close(*trained, rtol=1e-4, atol=1e-5)
 
 
 def test_workers_that_go_on_draw_noise_of_their_own(make_trainer):

@@ -75,7 +75,7 @@ class Predictor(TensorDictModuleBase):
         check_scene(model, scene, varies=parameters_key is not None)
         self.model, self.scene, self.layout = model, scene, model.layout
         self.strict, self.reference = strict, reference
-        self._trainer: NativeDelta | None = None
+        self.trainer: NativeDelta | None = None  # last training_executor() in C++
 
         self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
@@ -221,11 +221,11 @@ class Predictor(TensorDictModuleBase):
         if is_traced() or (self.model.physics is not None and self.model.physics.trained):
             return EagerExecutor(self.program(parameters))
         program = self.program(parameters, reduced=True)
-        if self._trainer is None:
-            self._trainer = NativeDelta(program)
+        if self.trainer is None:
+            self.trainer = NativeDelta(program)
         else:
-            self._trainer.update(program)
-        return self._trainer
+            self.trainer.update(program)
+        return self.trainer
 
     def step(
         self,
@@ -292,7 +292,7 @@ class Predictor(TensorDictModuleBase):
         return Graph(nodes, edges, globals_, self.incidence.edge_index)
 
     def __getstate__(self) -> dict:
-        return {**super().__getstate__(), "_trainer": None}  # a copy packs for itself
+        return {**super().__getstate__(), "trainer": None}  # a copy packs for itself
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"

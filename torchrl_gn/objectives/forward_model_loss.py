@@ -104,6 +104,11 @@ class ForwardModelLoss(LossModule):
         """The model to train."""
         return self.model.model
 
+    @property
+    def native(self) -> bool:
+        """Whether the last loss was computed in C++."""
+        return (trainer := self.model.trainer) is not None and trainer.reason is None
+
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         pass
 

@@ -52,6 +52,11 @@ class SeveralScenesLoss(LossModule):
         return self.of_scenes[0].trained
 
     @property
+    def native(self) -> bool:
+        """Whether the last losses of all scenes were computed in C++."""
+        return all(loss.native for loss in self.of_scenes)
+
+    @property
     def in_keys(self) -> list:
         return list(dict.fromkeys(key for loss in self.of_scenes for key in loss.in_keys))
 

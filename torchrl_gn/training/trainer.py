@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,7 @@ from torchrl.data import ReplayBuffer
 
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss, SeveralScenesLoss
+from torchrl_gn.processor import threads_for_native
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 from torchrl_gn.training.workers import Workers
@@ -93,7 +95,8 @@ class Trainer:
         """
         module, fraction = self.workers.wrap(self.loss), self.workers.agree(lambda: self.fraction)
         while fraction < 1 and (self.patience is None or self.since_best < self.patience):
-            with fast_matmul():
+            native = getattr(self.loss, "native", False)
+            with fast_matmul(), threads_for_native() if native else nullcontext():
                 loss = self._update(module, fraction)
             fraction = self.workers.agree(lambda: self.fraction)
             validation = self._validation(fraction)

@@ -15,6 +15,7 @@ from torchrl_gn.dynamics.executors.native import build
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
 from torchrl_gn.dynamics.executors.native.tape import Tape
 from torchrl_gn.networks.layers import LayerList
+from torchrl_gn.processor import native_threads
 
 TILE = 24  # samples that stay in a processor's cache from layer to layer
 DTYPES = {torch.float32: 0, torch.float64: 1}  # as the C++ code tells them apart
@@ -185,7 +186,7 @@ def forward_call(
     another ``shape``.
     """
     *batch, nodes, channels = state.shape
-    size, threads = nodes * channels, torch.get_num_threads()
+    size, threads = nodes * channels, native_threads()
     count, steps = state.numel() // size, actions.shape[-2] if many else 1
     if shape is None and many:
         shape = (*batch, steps + 1, nodes, channels)

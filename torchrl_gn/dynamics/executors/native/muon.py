@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics.executors.native import library
+from torchrl_gn.processor import native_threads
 
 
 class _Matrix(ctypes.Structure):
@@ -64,7 +65,7 @@ def muon_update(
         if matrices:
             array = (_Matrix * len(matrices))(*matrices)
             code = library.load_library()
-            code.gn_muon(kind, array, len(matrices), ctypes.byref(options), torch.get_num_threads())
+            code.gn_muon(kind, array, len(matrices), ctypes.byref(options), native_threads())
             torch.autograd.graph.increment_version(changed)
     return rest
 
