@@ -10,7 +10,8 @@ time. Run time is wall time per simulated second of one trajectory, on `threads`
 all methods in turn. A method is on the Pareto front of a batch size if no other is both faster and more accurate.
 
 Writes config.yaml, metrics.json, the figure work_precision.png and the trained models to its run folder; the same
-run_dir goes on where it was interrupted. Results, and when a learned model is the right choice: docs/performance.md.
+run_dir goes on where it was interrupted. Results: docs/results/run-time-against-error.md; when a learned model is the
+right choice: docs/speed.md.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 
 Runs the same episodes with more and more iterations a control step, with every model (of several hidden sizes, say) and
 every baseline planner: each a run of recipes/mpc.py, one after the other. Finished runs are kept; the same run_dir goes
-on. No figure of the paper. Results: docs/results.md.
+on. No figure of the paper. Results: docs/results/planning-time.md.
 
 Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
 folder.

@@ -5,7 +5,7 @@
 Times training steps of one process, of two and so on, in turn, for every batch size; torchrun and
 DistributedDataParallel split the batch. Prints milliseconds a step, the speed-up, and the time of every part of a step:
 what the processes split, and what each of them repeats (the optimiser). No figure of the paper. Results:
-docs/scaling.md.
+docs/results/scaling.md.
 
 Writes config.yaml and metrics.json to its run folder.
 """

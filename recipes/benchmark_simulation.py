@@ -6,7 +6,7 @@ Times random controls on the same system, in turn and several times: the batched
 with one state and with many, and TorchRL's `DMControlEnv` with the scene's own control step (the same work) and with
 the suite's (Swimmer: 30 ms against 20 ms, so less Python per physics step). Rates are simulated seconds per second.
 `DMControlEnv` also computes observations and the suite's reward, `Simulator` and `SceneEnv` all body states; nothing is
-rendered. No figure of the paper. Takes about half a minute. Results: docs/results.md.
+rendered. No figure of the paper. Takes about half a minute. Results: docs/results/simulation-throughput.md.
 
 Writes config.yaml and metrics.json to its run folder.
 """

@@ -20,7 +20,7 @@ the true physics in C, on one thread. A baseline has no row where it has no such
 of its weights read once at the bandwidth of reading as many bytes again and again. FLOPs and weights are those of the
 specialised network. `curves=true` draws the time of a step over links, batch sizes and hidden sizes, and of a rollout's
 gradient over its length. No figure of the paper. Takes about ten minutes, half of it compiling. Results:
-docs/performance.md.
+docs/results/speed.md.
 
 Writes config.yaml, metrics.json and with curves the figure speed.png to its run folder.
 """

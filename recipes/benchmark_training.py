@@ -4,7 +4,7 @@
 
 Trains one forward model of default size for each optimiser, a step each in turn, and prints the median time of every
 part. `torch_muon` is `torch.optim.Muon`, which multiplies in bfloat16: slow on processors without instructions for it.
-No figure of the paper. Takes a minute (several, on those). Results: docs/performance.md.
+No figure of the paper. Takes a minute (several, on those). Results: docs/results/training-speed.md.
 
 Writes config.yaml and metrics.json to its run folder.
 """

@@ -12,7 +12,8 @@ Experiments (recipes/config/experiment):
 Every variant is a run of recipes/forward_model.py with the overrides of the experiment, on the same data: one for each
 of `systems`, or, with `train_on`, one for all that it lists. Finished runs are kept and interrupted ones go on with the
 same run_dir; runs that fail are listed and the others go on. Tables show means over seeds and, with several, the
-half-range; the last column is the geometric mean over systems, relative to the first variant. Results: docs/results.md.
+half-range; the last column is the geometric mean over systems, relative to the first variant. Results:
+docs/results/README.md.
 
 Writes config.yaml, metrics.json, the tables as table.md, bars of the errors as errors.png, and each run with its log to
 its run folder.

@@ -8,7 +8,7 @@ data from DDPG agent trajectories". The true swimmer swims by a learned policy (
 targets), or by variations of a gait: waves of control along the body, found by the cross-entropy method. Graph networks
 and an MLP are trained for equal time on random trajectories, and on a mixture with as many swimming ones. They are
 compared on trajectories of their training, of new random control, and of swimming. Finished runs are kept; the same
-run_dir goes on. Results: docs/results.md.
+run_dir goes on. Results: docs/results/data-shift.md.
 
 Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, a video of the swimmer as
 swimming.gif, and each run with its log to its run folder.

@@ -4,7 +4,7 @@
 
 The paper's agent (SM "DDPG"), with the environments, networks, replay buffer and updates of recipes/svg.py, so that
 only the losses differ. Curves over several seeds: recipes/learning_curves.py. The same `run_dir` goes on with a stopped
-run. Results: docs/results.md.
+run. Results: docs/results/svg.md.
 
 Writes config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
 recipes/config/ddpg.yaml.

@@ -12,7 +12,7 @@ Ctrl-C saves everything; the same `run_dir` goes on.
 Writes config.yaml, metrics.json, the checkpoint, and figures to its run folder: errors as bars (errors.png), error
 against the number of observed steps (steps.png), and predictions of three systems identified with and without control
 (control.png). metrics.json also has how well a linear map reads each parameter from the inferred graph. All options:
-recipes/config/inference_model.yaml. Results: docs/results.md.
+recipes/config/inference_model.yaml. Results: docs/results/identification.md.
 """
 
 from __future__ import annotations

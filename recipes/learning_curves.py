@@ -4,7 +4,7 @@
 
 Reproduces the paper's Figure "Learning curves for Swimmer6 SVG agents": the median return over seeds with quartiles, of
 every agent that recipes/config/learning_curves.yaml names. Each is a run of recipes/svg.py or recipes/ddpg.py. Finished
-runs are kept and interrupted ones go on with the same run_dir. Results: docs/results.md.
+runs are kept and interrupted ones go on with the same run_dir. Results: docs/results/svg.md.
 
 Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
 folder.

@@ -11,7 +11,7 @@ system:
 3. Compare it with the graph network over all seeds, with the same normalisers, features, state update, data and
    training time.
 
-Finished runs are kept; the same run_dir goes on. Results: docs/results.md.
+Finished runs are kept; the same run_dir goes on. Results: docs/results/gn-against-mlp.md.
 
 Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, and each run with its log to
 its run folder.

@@ -26,7 +26,7 @@ mppi start each plan without one, and ilqr refuses it.
 
 Writes config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
 a video of the first episode (<planner>.gif); for gn, ilqr and ilqg also with the states planned a horizon before, if
-the episode is longer than that. All options: recipes/config/mpc.yaml. Results: docs/results.md.
+the episode is longer than that. All options: recipes/config/mpc.yaml. Results: docs/results/planning.md.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ A planner drives a system into states that random control never reaches; there t
 runs planned episodes (recipes/mpc.py), trains the model further with them as half of its data (recipes/forward_model.py
 start_from=... data.extra=...), and plans again; every round from new starts. Finished rounds are kept; the same run_dir
 goes on, with more rounds too. Without a model of the system it first trains one on random controls. `+robot=NAME` is a
-real robot with its task, one of recipes/config/robot. No figure of the paper. Results: docs/results.md.
+real robot with its task, one of recipes/config/robot. No figure of the paper. Results:
+docs/results/learning-from-planning.md.
 
 Writes config.yaml, metrics.json, the table as table.md, rewards over time as rewards.png, and each round's episodes
 (executed<round>) and model (learned<round>, with its error table) to its run folder. All options:

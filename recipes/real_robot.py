@@ -11,7 +11,7 @@ it simulates one: the JACO arm, with lagging motors, play, and noisy, coarse enc
 `run_dir` goes on.
 
 Writes config.yaml, metrics.json, a checkpoint of each model, and figures of joint angles (joints.png) and errors
-(errors.png) to its run folder. All options: recipes/config/real_robot.yaml. Results: docs/results.md.
+(errors.png) to its run folder. All options: recipes/config/real_robot.yaml. Results: docs/results/real-arm.md.
 """
 
 from __future__ import annotations

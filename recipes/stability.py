@@ -6,7 +6,7 @@
 `checkpoint` is a run folder or the name of a model of the package; without one the recipe trains a model first. Every
 check gives one figure for each dtype of the network (states are float64) and has a limit for each. If a figure is over
 its limit, the recipe ends with exit code 1 (limits=false: with 0). No figure of the paper. Takes about three minutes.
-Results: docs/performance.md.
+Results: docs/results/stability.md.
 
 Writes config.yaml, metrics.json and, if it trains one, the model to its run folder.
 """

@@ -5,7 +5,7 @@
 Reproduces the agents of the paper's Figure "Learning curves for Swimmer6 SVG agents": SVG(1) differentiates through a
 graph network that predicts observations, SVG(0) (`horizon=0`) through the value alone. Policy, value and model start
 from fresh weights and learn from the same replay buffer. Curves over several seeds, all agents in one figure:
-recipes/learning_curves.py. The same `run_dir` goes on with a stopped run. Results: docs/results.md.
+recipes/learning_curves.py. The same `run_dir` goes on with a stopped run. Results: docs/results/svg.md.
 
 Writes config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
 recipes/config/svg.yaml.

@@ -35,7 +35,7 @@ def as_list(value: Any) -> list[Any]:
 
 def check_options(cfg: Mapping[str, Any]) -> None:
     """Raise ValueError, naming it, for an optimiser, rate, batch or the like that no recipe could use; null passes."""
-    for name, value in _flat(plain_config(cfg)):
+    for name, value in flat(plain_config(cfg)):
         for pattern, fits, wanted in _RULES:
             if value is None or isinstance(value, list) or not re.fullmatch(pattern, name.split(".")[-1]):
                 continue
@@ -66,15 +66,15 @@ def unknown_options(words: Sequence[str], recipe: Path) -> list[str]:
 
 
 def _keys(file: Path, prefix: str) -> Iterator[str]:
-    for name, _ in _flat(OmegaConf.to_container(OmegaConf.load(file)), prefix, groups=True):  # pyright: ignore
+    for name, _ in flat(OmegaConf.to_container(OmegaConf.load(file)), prefix, groups=True):  # pyright: ignore
         yield name
 
 
-def _flat(values: Any, prefix: str = "", *, groups: bool = False) -> Iterator[tuple[str, Any]]:
+def flat(values: Any, prefix: str = "", *, groups: bool = False) -> Iterator[tuple[str, Any]]:
     """Names and values of options, with ``groups`` those of groups too."""
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.", groups=groups)
+            yield from flat(value, f"{prefix}{name}.", groups=groups)
         if groups or not isinstance(value, Mapping):
             yield f"{prefix}{name}", value
 

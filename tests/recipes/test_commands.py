@@ -65,7 +65,7 @@ def check_options(recipe: str, options: list[str]) -> None:
 def test_every_recipe_helps_and_logs(recipe):
     source, options = (ROOT / "recipes" / name for name in (f"{recipe}.py", f"config/{recipe}.yaml"))
     assert "@with_help\n@hydra.main(" in source.read_text()
-    if recipe == "publish":  # it makes a file of a model, and has no run
+    if recipe in ("publish", "report"):  # they make a file of a model and pages, and have no run
         return
     assert "\nlogger: none" in options.read_text()
     assert re.search(r"(finish_run|report_sweep|report_learning)\(.* tracker,", source.read_text())

@@ -1,0 +1,137 @@
+"""Pages of the report, made of its data: an index, a page a claim and what was tried and dropped."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from _common.report_data import DROPPED, INDEX, read, read_claims, read_run
+
+VERDICTS = ("holds", "in part", "does not hold")
+MOST_COLUMNS, LONGEST_CELL, MOST_SENTENCES = 8, 40, 5
+_MADE = "<!-- Made by recipes/report.py from {file}; change that. -->\n"
+
+
+def make_pages(data: Path) -> dict[str, str]:
+    """Return every page's text by its file's name.
+
+    Raises:
+        ValueError: naming the claim, if its data break a rule of the report: an unknown verdict, a table of more than
+            eight columns or rows of other lengths, a cell of more than 40 characters, more than five sentences, a
+            quoted run or number that is not there.
+    """
+    pages, rows = {}, []
+    for name, claim in read_claims(data).items():
+        try:
+            pages[f"{name}.md"] = _claim_page(name, claim, data)
+            rows.append(_index_row(name, claim, data))
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"{name}.json: {error}") from error
+    return {
+        **pages,
+        "README.md": _index_page(read(data, INDEX), rows),
+        f"{DROPPED}.md": _dropped_page(read(data, DROPPED)),
+    }
+
+
+def _index_page(index: Mapping[str, Any], rows: Sequence[Sequence[str]]) -> str:
+    parts = [
+        f"# {index['title']}",
+        *index["intro"],
+        f"Machine: {index['machine']} Versions: {index['versions']}",
+        _table(["claim", "verdict", "headline figure", "page"], rows),
+        *index["notes"],
+        _MADE.format(file="data/*.json"),
+    ]
+    return "\n\n".join(parts)
+
+
+def _index_row(name: str, claim: Mapping[str, Any], data: Path) -> list[str]:
+    short = claim["short"] if claim["of"] == "paper" else f"*{claim['short']}*"
+    return [short, claim["verdict"], _filled(claim["headline"], claim, data), f"[{claim['title']}]({name}.md)"]
+
+
+def _claim_page(name: str, claim: Mapping[str, Any], data: Path) -> str:
+    if claim["verdict"] not in VERDICTS:
+        raise ValueError(f"verdict={claim['verdict']!r} must be one of {VERDICTS}.")
+    if len(claim["text"]) > MOST_SENTENCES:
+        raise ValueError(f"{len(claim['text'])} sentences of text; {MOST_SENTENCES} at most.")
+    qualified = f" {claim['qualified']}." if "qualified" in claim else ""
+    parts = [f"# {claim['title']}", claim["claim"], f"**Verdict: {claim['verdict']}.**{qualified}"]
+    for figure in claim.get("figures", ()):
+        parts.append(f"![{figure['caption']}](../images/{figure['file']})")
+    for table in claim["tables"]:
+        rows = [[_shown(cell, data) for cell in row] for row in table["rows"]]
+        parts += [_filled(table["title"], claim, data), _table(table["columns"], rows)]
+    if "command" in claim:
+        parts.append("```sh\n" + "\n".join(claim["command"]) + "\n```")
+    facts = {key: claim[key] for key in ("seeds", "time", "machine") if key in claim}
+    said = [f"{key.capitalize()}: {value}." for key, value in facts.items()]
+    other = "Versions" if "machine" in claim else "Machine and versions"
+    parts.append(" ".join([*said, f"{other}: [index](README.md).", f"Source: {_source(claim)}."]))
+    parts.append("\n".join(f"- {_filled(sentence, claim, data)}" for sentence in claim["text"]))
+    return "\n\n".join([*parts, _MADE.format(file=f"data/{name}.json")])
+
+
+def _dropped_page(dropped: Mapping[str, Any]) -> str:
+    parts = [f"# {dropped['title']}", dropped["intro"]]
+    for table in dropped["tables"]:
+        parts += [f"## {table['title']}", _table(table["columns"], table["rows"])]
+    return "\n\n".join([*parts, _MADE.format(file=f"data/{DROPPED}.json")])
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; raises ValueError if it has too many columns, a row of another length or a long cell."""
+    if len(columns) > MOST_COLUMNS:
+        raise ValueError(f"a table has {len(columns)} columns, {columns}; {MOST_COLUMNS} at most.")
+    for row in [columns, *rows]:
+        if len(row) != len(columns):
+            raise ValueError(f"the row {row} has {len(row)} cells for {len(columns)} columns.")
+        for cell in row:
+            if len(re.sub(r"\]\([^)]*\)|[*`\[]", "", cell)) > LONGEST_CELL:
+                raise ValueError(f"the cell {cell!r} has more than {LONGEST_CELL} characters.")
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _shown(cell: Any, data: Path) -> str:
+    """A cell's text: of a string itself, of ``{"metric", "of", "format"}`` a run's number, of a list its parts."""
+    if isinstance(cell, list):
+        return " / ".join(_shown(each, data) for each in cell)
+    return _number(cell, data) if isinstance(cell, Mapping) else str(cell)
+
+
+def _number(cell: Mapping[str, Any], data: Path) -> str:
+    """A number of a run, times ``times`` and over the metric ``over`` of the same run; "diverges" if not finite."""
+    metrics = read_run(data, cell["of"])["metrics"]
+    value = metrics[cell["metric"]]
+    if value is None:
+        return "diverges"
+    value *= cell.get("times", 1) / (metrics[cell["over"]] if "over" in cell else 1)
+    text = re.sub(r"e([+-])0*(\d)", lambda match: f"e{match[1].strip('+')}{match[2]}", format(value, cell["format"]))
+    return f"**{text}**" if cell.get("bold") else text
+
+
+def _filled(text: str, claim: Mapping[str, Any], data: Path) -> str:
+    """Text with each ``{name}`` of the claim's ``values`` in place of its number."""
+    values = claim.get("values", {})
+    return re.sub(r"\{(\w+)\}", lambda match: _shown(values[match[1]], data), text)
+
+
+def _source(claim: Mapping[str, Any]) -> str:
+    """Where the numbers are from: the runs that the claim quotes, and what was transcribed."""
+    files = list(dict.fromkeys(_quoted([claim["tables"], claim.get("values", {})])))
+    runs = [f"[{file.split('.')[1]}](data/{file})" for file in files]
+    transcribed = {table["date"] for table in claim["tables"] if table.get("source") == "transcribed"}
+    return ", ".join(runs + [f"transcribed, {' and '.join(sorted(transcribed))}"] * bool(transcribed))
+
+
+def _quoted(cells: Any) -> Iterator[str]:
+    """Files of the runs that cells quote."""
+    if isinstance(cells, Mapping) and "metric" in cells:
+        yield cells["of"]
+    elif isinstance(cells, (Mapping, list)):
+        for each in cells.values() if isinstance(cells, Mapping) else cells:
+            yield from _quoted(each)

@@ -1,0 +1,59 @@
+"""Write the report of results, docs/results, from its data, docs/results/data.
+
+    python recipes/report.py
+    python recipes/report.py check=true
+    python recipes/report.py add=runs/benchmark/<time> to=run-time-against-error [as=jaco]
+
+Every claim has a JSON file: what is claimed, the verdict, tables, commands, seeds, machine and text. A cell of a table
+is a string; a number of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, that may
+be multiplied ("times": 1000) and divided ("over": another metric); or a list of cells, shown with slashes between. Text
+quotes numbers that the claim's "values" name, as {NAME}. `check=true` writes nothing and fails if a page differs from
+what its data give.
+
+`add=` puts the metrics of a finished run, with its command, date, processor and versions, beside the claim `to` as
+CLAIM.NAME.metrics.json, named `as` (default: the run folder's name), and prints the names of its metrics. No figure of
+the paper. Takes seconds. All options: recipes/config/report.yaml.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from _common import clean_exit, with_help
+from _common.report_data import add_run, read_run, recipe_of
+from _common.report_pages import make_pages
+
+REPORT = Path(__file__).parents[1] / "docs" / "results"
+
+
+@with_help
+@hydra.main(version_base=None, config_path="config", config_name="report")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    report = Path(cfg.folder) if cfg.folder else REPORT
+    data = report / "data"
+    if cfg.add:
+        if not cfg.to:
+            raise ValueError("Say which claim quotes the run: to=forward-predictions, say.")
+        run = Path(cfg.add)
+        defaults = OmegaConf.to_container(hydra.compose(recipe_of(run)), resolve=True)
+        file = add_run(data, run, cfg.to, defaults, cfg["as"])  # pyright: ignore
+        print("\n".join(read_run(data, file.name)["metrics"]))
+        print(file)
+        return
+    pages = make_pages(data)
+    there = {file.name: file.read_text() for file in report.glob("*.md")}
+    changed = sorted(name for name in pages.keys() | there.keys() if pages.get(name) != there.get(name))
+    if cfg.check and changed:
+        raise ValueError(f"{changed} of {report} differ from the data; run python recipes/report.py and commit them.")
+    for name in changed:
+        file = report / name
+        file.write_text(pages[name]) if name in pages else file.unlink()
+        print(file)
+
+
+if __name__ == "__main__":
+    main()
