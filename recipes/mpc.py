@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import time
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import torch
@@ -60,7 +60,7 @@ from _common.planning_task import (
 from torchrl_gn.data import spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.rewards import FreezeGoal
 from torchrl_gn.scenes import Scene
@@ -127,7 +127,7 @@ def execute(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEn
                 started = time.perf_counter()
                 now = policy(episodes.now.copy())
                 seconds = time.perf_counter() - started
-                if name in ("gn", "ilqr", "ilqg"):
+                if name in ("gn", "ilqr", "ilqg") and not cfg.delay:
                     episodes.records["planned"].append(planned_state(env, None if name == "ilqg" else imagined, now))
                 stepped = env.step(now)
                 episodes.now = stepped.exclude("next", "action", "done", "terminated")
@@ -153,6 +153,7 @@ def execute(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEn
 @clean_exit
 def main(cfg: DictConfig) -> None:
     fill_in(cfg)
+    check_count("delay", cfg.delay, 0)
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
     scene, scenes = make_scenes(cfg)
@@ -183,6 +184,8 @@ def main(cfg: DictConfig) -> None:
         if not torch.allclose(episodes.records["state"][0], start["state"]):
             raise ValueError(f"{episodes.path} began in other states than the other planners do; name a new run_dir.")
         planner = make_planner(name, cfg, env, imagined, len(episodes))
+        if cfg.delay and not isinstance(planner, RandomControl):
+            planner = PlanAhead(cast(Any, planner), cfg.delay)
         policy = planner if target is None else TensorDictSequential([FreezeGoal(reward), planner])
         execute(cfg, name, policy, env, imagined, episodes)
         of = summarize(episodes, target if reward.target_shape == (3,) else None)

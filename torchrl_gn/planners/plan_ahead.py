@@ -1,0 +1,191 @@
+"""Plan while acting: plans for a later step are made while the actions before it are executed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Compose, TensorDictPrimer
+from torchrl.modules.planners.common import MPCPlannerBase
+
+from torchrl_gn.envs.model_env import ModelEnv
+from torchrl_gn.planners.plan import check_count
+
+KEY = "ahead"
+
+
+class PlanAhead(TensorDictModuleBase):
+    """Plan for the state ``delay`` control steps ahead, as a planner must that thinks while the robot moves.
+
+    The next ``delay`` actions are committed. Every control step executes the first of them, predicts the state after
+    all of them, and plans from there; the plan's first action is committed next. So a plan may take ``delay`` control
+    steps, and the delay costs what the model mispredicts in that time. The first plans of an episode are made before it
+    begins to move.
+
+    Planning is simulated with its delay, in turn with the environment, for any batch. With ``background``, it runs in a
+    thread beside the caller: the same actions, at the control rate as long as a plan takes no longer than a step of the
+    caller's loop. Then all episodes of a batch begin together, and :attr:`late` counts the steps that had to wait.
+
+    Reads what the planner reads, and ``ahead`` if present; writes ``action``, what the planner writes, and ``ahead``:
+    committed ``actions`` ``[*B, delay, A]`` and ``planned`` ``[*B, 1]`` bool. Where episodes auto-reset, append
+    :meth:`make_tensordict_primer` to the environment.
+
+    Args:
+        planner: a planner of this library, or TorchRL's CEM or MPPI; its ``env`` predicts.
+        delay: control steps that a plan may take, at least 1.
+        background: plan in a thread.
+
+    Raises:
+        TypeError: ``planner`` is no planner.
+        ValueError: ``delay`` is below 1; or, when planning in the background, episodes of a batch begin apart.
+
+    Example:
+        >>> from torchrl_gn.envs import SceneEnv
+        >>> from torchrl_gn.planners import ILQGPlanner, PlanAhead
+        >>> from torchrl_gn.rewards import make_reward
+        >>> from torchrl_gn.scenes import load_scene
+        >>> scene = load_scene("pendulum")
+        >>> env = SceneEnv(scene, make_reward("balance", scene), seed=0)
+        >>> planner = PlanAhead(ILQGPlanner(env, horizon=10, iterations=1), delay=2)
+        >>> env.rollout(3, planner)["action"].shape
+        torch.Size([3, 1])
+    """
+
+    def __init__(self, planner: MPCPlannerBase, delay: int = 1, *, background: bool = False) -> None:
+        super().__init__()
+        if not isinstance(planner, MPCPlannerBase):
+            raise TypeError(f"PlanAhead needs a planner with an environment, got {type(planner).__name__}.")
+        check_count("delay", delay, 1)
+        self.planner, self.delay, self.background = planner, delay, background
+        self.in_keys, self.out_keys = planner.in_keys, [*planner.out_keys, KEY]
+        self.late = 0
+        self._thread: ThreadPoolExecutor | None = None
+        self._coming: list[Future] = []  # plans in the order of the steps that they are for
+
+    def make_tensordict_primer(self) -> Compose:
+        """Transform for the real environment that begins anew with every episode."""
+        own = getattr(self.planner, "make_tensordict_primer", None)
+        spec = cast(TensorSpec, self.planner.action_spec)
+        shape = torch.Size((self.delay, *spec.shape[-1:]))
+        entries = {
+            "actions": Unbounded(shape=shape, dtype=spec.dtype, device=spec.device),
+            "planned": Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=spec.device),
+        }
+        primer = TensorDictPrimer({KEY: Composite(entries)}, default_value=0.0, expand_specs=True)
+        return Compose(*([] if own is None else [own()]), primer)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action that was committed for now, and commit another."""
+        ahead = cast("TensorDictBase | None", tensordict.get(KEY, None))
+        planned = torch.zeros(tensordict.shape, dtype=torch.bool)
+        if ahead is not None:
+            planned = cast(Tensor, ahead["planned"]).squeeze(-1).cpu()
+        if self.background:
+            written = self._in_background(tensordict, planned)
+        elif planned.all() or not planned.any():
+            written = self._plan(tensordict, bool(planned.any()))
+        else:
+            flat, rows = tensordict.reshape(-1), [planned.reshape(-1), ~planned.reshape(-1)]
+            parts = [self._plan(cast(TensorDictBase, flat[at]), bool(planned.reshape(-1)[at].all())) for at in rows]
+            order = torch.cat([at.nonzero().flatten() for at in rows]).argsort()
+            written = cast(TensorDictBase, torch.cat(parts)[order]).reshape(tensordict.shape)
+        tensordict.update(written)
+        if isinstance(env := self.planner.env, ModelEnv) and env.carried_keys:
+            with torch.no_grad():
+                for key, value in env.carried(tensordict).items():
+                    tensordict.set(("next", key), value)
+        return tensordict
+
+    def _plan(self, tensordict: TensorDictBase, resumed: bool) -> TensorDictBase:
+        """What to write for episodes that all go on, or all begin."""
+        if resumed:
+            committed = cast(Tensor, tensordict[KEY, "actions"])
+            future = self._after(tensordict, committed)
+        else:
+            committed, future = self._begin(tensordict)
+        future = self.planner(future)
+        return self._entries(future, torch.cat((committed, future["action"].unsqueeze(-2)), dim=-2))
+
+    def _entries(self, future: TensorDictBase, actions: Tensor) -> TensorDictBase:
+        """Entries to write: the first of ``actions``, the planner's own and the rest of the actions."""
+        planned = torch.ones(*future.shape, 1, dtype=torch.bool, device=actions.device)
+        ahead = TensorDict({"actions": actions[..., 1:, :], "planned": planned}, batch_size=future.shape)
+        entries: dict[Any, Any] = {key: future[key] for key in ("plan",) if key in future.keys()}
+        return TensorDict({**entries, "action": actions[..., 0, :], KEY: ahead}, batch_size=future.shape)
+
+    def _begin(self, tensordict: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        """The first actions ``[*B, delay, A]``, and the state after them."""
+        actions, future = [], tensordict
+        for _ in range(self.delay):
+            action = self.planner(future.copy())
+            actions.append(action["action"])
+            future = self._step(action)
+        return torch.stack(actions, dim=-2), future
+
+    def _after(self, tensordict: TensorDictBase, actions: Tensor) -> TensorDictBase:
+        """The predicted state after ``actions``, with the planner's entries as they are."""
+        future = tensordict.copy()
+        for action in actions.unbind(-2):
+            future = self._step(future.set("action", action))
+        return future
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with torch.no_grad():
+            after = cast(Any, self.planner.env).step(tensordict.exclude("next", KEY))["next"]
+        return tensordict.exclude("next", "action", KEY).update(after.exclude("reward", "done", "terminated"))
+
+    def _in_background(self, tensordict: TensorDictBase, planned: Tensor) -> TensorDictBase:
+        if planned.any() and not planned.all():
+            raise ValueError("PlanAhead(background=True) needs episodes that begin together; use background=False.")
+        if not (planned.any() and self._coming):
+            self.wait()
+            self._coming.clear()
+            committed, future = self._begin(tensordict)
+            for action in committed.unbind(-2):
+                done: Future = Future()
+                done.set_result((action, future))
+                self._coming.append(done)
+            now = self._coming.pop(0).result()[0]
+            self._submit(lambda: future, [])
+        else:
+            first = self._coming.pop(0)
+            self.late += not first.done()
+            now = first.result()[0]
+            known, before = tensordict.copy(), [*self._coming]
+
+            def ahead() -> TensorDictBase:
+                # In the thread, where the plans before this one are finished.
+                actions = torch.stack([now, *(each.result()[0] for each in before)], dim=-2)
+                plan = before[-1].result()[1] if before else first.result()[1]
+                return self._after(known.update(plan.select("plan", strict=False)), actions)
+
+            self._submit(ahead, before)
+        ones = torch.ones(*tensordict.shape, 1, dtype=torch.bool, device=now.device)
+        rest = now.new_zeros(*now.shape[:-1], self.delay, now.shape[-1])  # the thread knows them
+        entry = TensorDict({"actions": rest, "planned": ones}, batch_size=tensordict.shape)
+        return TensorDict({"action": now, KEY: entry}, batch_size=tensordict.shape)
+
+    def _submit(self, ahead: Callable[[], TensorDictBase], before: list[Future]) -> None:
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="PlanAhead")
+
+        def job() -> tuple[Tensor, TensorDictBase]:
+            with torch.no_grad():
+                future = self.planner(ahead())
+            return future["action"], future
+
+        self._coming.append(self._thread.submit(job))
+
+    def wait(self) -> None:
+        """Wait for plans in the background to end; raise what one raised."""
+        for each in self._coming:
+            each.result()
+
+    def __getstate__(self) -> dict:
+        return {**super().__getstate__(), "_thread": None, "_coming": []}
