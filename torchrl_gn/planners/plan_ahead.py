@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, cast
@@ -15,6 +16,7 @@ from torchrl.envs import Compose, TensorDictPrimer
 from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.envs.model_env import ModelEnv
+from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.plan import check_count
 
 KEY = "ahead"
@@ -30,7 +32,8 @@ class PlanAhead(TensorDictModuleBase):
 
     Planning is simulated with its delay, in turn with the environment, for any batch. With ``background``, it runs in a
     thread beside the caller: the same actions, at the control rate as long as a plan takes no longer than a step of the
-    caller's loop. Then all episodes of a batch begin together, and :attr:`late` counts the steps that had to wait.
+    caller's loop. Then all episodes of a batch begin together, and :attr:`late` counts the steps that had to wait. A
+    planner on a :class:`~torchrl_gn.envs.SceneEnv` is copied for it.
 
     Reads what the planner reads, and ``ahead`` if present; writes ``action``, what the planner writes, and ``ahead``:
     committed ``actions`` ``[*B, delay, A]`` and ``planned`` ``[*B, 1]`` bool. Where episodes auto-reset, append
@@ -62,6 +65,8 @@ class PlanAhead(TensorDictModuleBase):
         if not isinstance(planner, MPCPlannerBase):
             raise TypeError(f"PlanAhead needs a planner with an environment, got {type(planner).__name__}.")
         check_count("delay", delay, 1)
+        if background and isinstance(planner.env, SceneEnv):
+            planner = copy.deepcopy(planner)  # the caller may step the same simulator meanwhile
         self.planner, self.delay, self.background = planner, delay, background
         self.in_keys, self.out_keys = planner.in_keys, [*planner.out_keys, KEY]
         self.late = 0
