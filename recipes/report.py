@@ -5,10 +5,10 @@
     python recipes/report.py add=runs/benchmark/<time> to=run-time-against-error [as=jaco]
 
 Every claim has a JSON file: what is claimed, the verdict, tables, commands, seeds, machine and text. A cell of a table
-is a string; a number of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, that may
-be multiplied ("times": 1000) and divided ("over": another metric); or a list of cells, shown with slashes between. Text
-quotes numbers that the claim's "values" name, as {NAME}. `check=true` writes nothing and fails if a page differs from
-what its data give.
+is a string; a number of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, or the
+sum of a list of them, that may be multiplied ("times": 1000) and divided ("over": another metric); or a list of cells,
+shown with slashes between. Text quotes numbers that the claim's "values" name, as {NAME}. `check=true` writes nothing
+and fails if a page differs from what its data give.
 
 `add=` puts the metrics of a finished run, with its command, date, processor and versions, beside the claim `to` as
 CLAIM.NAME.metrics.json, named `as` (default: the run folder's name), and prints the names of its metrics. No figure of

@@ -287,7 +287,7 @@ def test_package_is_typed():
     assert (PACKAGE / "py.typed").exists()
 
 
-# Words that the field does not use, and the field's own (docs/concepts.md has the glossary).
+# Words that the field does not use, and the field's own (docs/glossary.md).
 RETIRED = {
     r"linking|mechanism": "constraint projection, joint anchors",
     r"pins?|pinned|pin[_ ]finder": "joint anchor, anchor estimation",

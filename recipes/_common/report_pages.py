@@ -104,11 +104,12 @@ def _shown(cell: Any, data: Path) -> str:
 
 
 def _number(cell: Mapping[str, Any], data: Path) -> str:
-    """A number of a run, times ``times`` and over the metric ``over`` of the same run; "diverges" if not finite."""
+    """A run's metric, or the sum of several, times ``times`` and over its metric ``over``; "diverges" if not finite."""
     metrics = read_run(data, cell["of"])["metrics"]
-    value = metrics[cell["metric"]]
-    if value is None:
+    names = [cell["metric"]] if isinstance(cell["metric"], str) else cell["metric"]
+    if any(metrics[name] is None for name in names):
         return "diverges"
+    value = sum(metrics[name] for name in names)
     value *= cell.get("times", 1) / (metrics[cell["over"]] if "over" in cell else 1)
     text = re.sub(r"e([+-])0*(\d)", lambda match: f"e{match[1].strip('+')}{match[2]}", format(value, cell["format"]))
     return f"**{text}**" if cell.get("bold") else text
