@@ -49,7 +49,7 @@ PUBLIC = {
     "evaluation": ["evaluate_errors", "rollout_video"],
     "identification": ["IdentifyingModel"],
     "objectives": ["ForwardModelLoss", "IdentificationLoss", "SVGLoss"],
-    "planners": ["GradientPlanner", "ILQGPlanner"],
+    "planners": ["GradientPlanner", "ILQGPlanner", "PlanAhead"],
     "rewards": ["make_reward"],
     "scenes": ["load_scene"],
     "training": ["fit", "load_pretrained", "pretrained_names", "save_checkpoint"],

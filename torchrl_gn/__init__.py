@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from torchrl_gn.objectives import SVGLoss as SVGLoss
     from torchrl_gn.planners import GradientPlanner as GradientPlanner
     from torchrl_gn.planners import ILQGPlanner as ILQGPlanner
+    from torchrl_gn.planners import PlanAhead as PlanAhead
     from torchrl_gn.rewards import make_reward as make_reward
     from torchrl_gn.scenes import load_scene as load_scene
     from torchrl_gn.training import fit as fit
@@ -49,7 +50,7 @@ _FOLDERS = {
     "evaluation": ("evaluate_errors", "rollout_video"),
     "identification": ("IdentifyingModel",),
     "objectives": ("ForwardModelLoss", "IdentificationLoss", "SVGLoss"),
-    "planners": ("GradientPlanner", "ILQGPlanner"),
+    "planners": ("GradientPlanner", "ILQGPlanner", "PlanAhead"),
     "rewards": ("make_reward",),
     "scenes": ("load_scene",),
     "training": ("fit", "load_pretrained", "pretrained_names", "save_checkpoint"),
