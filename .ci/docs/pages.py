@@ -73,7 +73,8 @@ def summary(package: griffe.Object | griffe.Alias, part: str, name: str) -> str:
     if docstring is None:
         LOG.warning(f"torchrl_gn.{part}.{name} has no description.")
         return ""
-    return ROLE.sub(r"\1", docstring.value.split("\n\n")[0].replace("\n", " ")).replace("``", "`").replace("|", r"\|")
+    line = docstring.value.split("\n\n")[0].replace("\n", " ").replace(":math:", "")
+    return ROLE.sub(r"\1", line).replace("``", "`").replace("|", r"\|")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
