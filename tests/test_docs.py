@@ -52,6 +52,9 @@ def test_links_lead_somewhere(page):
     text = FENCE.sub("", page.read_text())
     for link in re.findall(r"\]\(([^)]+)\)", text):
         if "://" in link or link.startswith("mailto:"):
+            assert re.fullmatch(r"https?://[\w-]+(\.[\w-]+)+(/\S*)?|mailto:\S+@\S+", link), (
+                f"{name(page)} links to {link}"
+            )
             continue
         target, _, anchor = link.partition("#")
         file = page.parent / target if target else page

@@ -1,6 +1,7 @@
-"""Hooks of the documentation site: pages of the reference, and links to files that are no pages.
+"""Hooks of the documentation site: pages of the reference, code of the examples, and links to files that are no pages.
 
-What the reference lacks is a warning, which fails a strict build.
+The reference has a page for every public name, and for every part a page that lists them. What it lacks is a warning,
+which fails a strict build.
 
 A link from ``docs`` to another file of the repository works on a code host. In the site it leads to the code host if
 ``repo_url`` names one, and is the file's name otherwise.
@@ -14,6 +15,7 @@ import posixpath
 import re
 from pathlib import Path
 
+import griffe
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -40,6 +42,10 @@ PARTS = {
 
 LOG = logging.getLogger("mkdocs.hooks.pages")
 LINK = re.compile(r"\[([^\]]+)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
+CODE = re.compile(r"^\[`(\w+\.py)`\]\(\1\)$", re.MULTILINE)
+ROLE = re.compile(r":\w+:`(?:[^`<]+<)?~?(?:[\w.]*\.)?(\w+)>?`")
+BOOST = {"glossary.md": 4, "guides": 2, "reference": 0.2}
+"""Weights of pages in a search, by file or folder."""
 
 
 def exported(part: str) -> list[str]:
@@ -61,24 +67,42 @@ def hidden(part: str, name: str) -> str | None:
     return f"{name}.{name}" if name in defined else name
 
 
+def summary(package: griffe.Object | griffe.Alias, part: str, name: str) -> str:
+    """First line of a description, without markup."""
+    docstring = package[f"{part}.{hidden(part, name) or name}"].docstring
+    if docstring is None:
+        LOG.warning(f"torchrl_gn.{part}.{name} has no description.")
+        return ""
+    line = docstring.value.split("\n\n")[0].replace("\n", " ").replace(":math:", "")
+    return ROLE.sub(r"\1", line).replace("``", "`").replace("|", r"\|")
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add a page of the reference for every part."""
+    """Add the pages of the reference, and the site's own style and script."""
+    package = griffe.load("torchrl_gn", search_paths=[PACKAGE.parent])
     for part, page in PARTS.items():
-        names = [name for name in exported(part) if not hidden(part, name)]
-        text = f"# torchrl_gn.{part}\n\n[What it is and how to use it](../{page}).\n\n"
-        text += f"::: torchrl_gn.{part}\n    options: {{members: {names}}}\n"
+        rows = []
         for name in exported(part):
-            if path := hidden(part, name):
-                text += f"\n::: torchrl_gn.{part}.{path}\n"
-                text += (
-                    "    options: {show_root_heading: true, show_root_toc_entry: true, show_root_full_path: false}\n"
-                )
-        files.append(File.generated(config, f"reference/{part}.md", content=text))
+            path = hidden(part, name) or name
+            text = f"---\ntitle: {name}\n---\n\n[torchrl_gn.{part}](../{part}.md)\n\n::: torchrl_gn.{part}.{path}\n"
+            text += "    options: {show_root_heading: true, show_root_full_path: false, heading_level: 1}\n"
+            files.append(File.generated(config, f"reference/{part}/{name}.md", content=text))
+            rows.append(f"| [`{name}`]({part}/{name}.md) | {summary(package, part, name)} |\n")
+        text = f"# torchrl_gn.{part}\n\n[What it is and how to use it](../{page}).\n\n| name | what |\n|---|---|\n"
+        files.append(File.generated(config, f"reference/{part}.md", content=text + "".join(rows)))
+    for file in sorted((Path(__file__).parent / "assets").iterdir()):
+        files.append(File.generated(config, f"assets/{file.name}", abs_src_path=str(file)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links out of ``docs`` into links to the code host, or names of files."""
+    """Weigh the page in a search, show the code of examples, turn links out of ``docs`` into links to the code host."""
+    for place, boost in BOOST.items():
+        if page.file.src_uri.split("/")[0] == place:
+            page.meta.setdefault("search", {"boost": boost})
+    if page.file.src_uri == "examples/README.md":
+        code = (PACKAGE.parent / "docs" / "examples").joinpath
+        markdown = CODE.sub(lambda link: f"{link[0]}\n\n```python\n{code(link[1]).read_text()}```", markdown)
     folder = posixpath.join("docs", posixpath.dirname(page.file.src_uri))
 
     def replaced(match: re.Match[str]) -> str:
@@ -93,12 +117,13 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Look whether a page of the reference shows every public name, and no markup that is not Markdown."""
-    folder, _, part = page.file.src_uri.removesuffix(".md").rpartition("/")
-    if folder == "reference":
-        for name in exported(part):
-            if f'id="torchrl_gn.{part}.{hidden(part, name) or name}"' not in html:
-                LOG.warning(f"{page.file.src_uri} does not show torchrl_gn.{part}.{name}.")
+    """Look whether a page of the reference shows its name, and no markup that is not Markdown."""
+    parents = page.file.src_uri.removesuffix(".md").split("/")
+    if parents[0] == "reference":
+        if len(parents) == 3:
+            path = f"torchrl_gn.{parents[1]}.{hidden(*parents[1:]) or parents[2]}"
+            if f'id="{path}"' not in html:
+                LOG.warning(f"{page.file.src_uri} does not show {path}.")
         for role in re.findall(r":(?:func|class|meth|attr|data|mod|math):|\.\. \w+::", html):
             LOG.warning(f"{page.file.src_uri} shows {role!r}.")
     return html
