@@ -220,11 +220,12 @@ def test_parameters_of_physics_train_with_the_network_or_before():
 def test_corrections_under_other_commands_are_penalised(window):
     data = simulated(Pendulum(11.0))
     model, plain = residual_model(Pendulum(), data)
-    bound = model.bind(TREE)
-    loss = ForwardModelLoss(bound, residual_weight=2.0, residual_noise=0.1, generator=torch.Generator().manual_seed(3))
+    bound, generator = model.bind(TREE), torch.Generator().manual_seed(3)
+    loss = ForwardModelLoss(bound, residual_weight=2.0, residual_noise=0.1, generator=generator)
     loss.load_training_state({**plain.training_state(), "generator": None})
     batch = trajectory_buffer(data, batch_size=64, window=window, seed=0).sample()
-    value, generator = loss(batch)["loss_forward_model"], loss.generator.manual_seed(3)
+    value = loss(batch)["loss_forward_model"]
+    generator.manual_seed(3)
     states, actions = (
         cast(Tensor, batch[key]).reshape(64 * window, *tail) for key, tail in (("state", (2, 3)), ("action", (1,)))
     )
