@@ -118,6 +118,8 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
         noise=cfg.noise,
         teacher_forced_steps=cfg.burn_in if recurrent else 1,
         bptt_steps=cfg.bptt_steps,
+        residual_weight=0.0 if model.physics is None else cfg.residual_weight,
+        residual_noise=cfg.residual_noise,
         generator=torch.Generator().manual_seed(cfg.seed),
     )
     # Teacher-forced over the burn-in, then fed its own predictions.

@@ -216,6 +216,31 @@ def test_parameters_of_physics_train_with_the_network_or_before():
         fit_physics(physics, TREE, data)
 
 
+@pytest.mark.parametrize("window", [1, 3])
+def test_corrections_under_other_commands_are_penalised(window):
+    data = simulated(Pendulum(11.0))
+    model, plain = residual_model(Pendulum(), data)
+    bound, generator = model.bind(TREE), torch.Generator().manual_seed(3)
+    loss = ForwardModelLoss(bound, residual_weight=2.0, residual_noise=0.1, generator=generator)
+    loss.load_training_state({**plain.training_state(), "generator": None})
+    batch = trajectory_buffer(data, batch_size=64, window=window, seed=0).sample()
+    value = loss(batch)["loss_forward_model"]
+    generator.manual_seed(3)
+    states, actions = (
+        cast(Tensor, batch[key]).reshape(64 * window, *tail) for key, tail in (("state", (2, 3)), ("action", (1,)))
+    )
+    chosen, others = (torch.randperm(64 * window, generator=generator)[:128] for _ in range(2))
+    state, action = loss.perturb(states[chosen], 0.1), actions[others]
+    assert (state - states[chosen]).abs().max() > 0.01
+    correction = bound.delta(state, action) - bound.layout.delta(state, Pendulum()(state, action))
+    scaled = (correction * loss.error_weight)[:, 1]  # an angle and a velocity
+    expected = plain(batch)["loss_forward_model"] + 2 * scaled.square().mean()
+    torch.testing.assert_close(value, expected, rtol=1e-5, atol=0)
+    for weight, message in ((-1.0, "must not be negative"), (1.0, "physics=")):
+        with pytest.raises(ValueError, match=message):
+            ForwardModelLoss(ForwardModel.for_scene(TREE, **SMALL).bind(TREE), residual_weight=weight)
+
+
 def test_changed_physics_are_traced_again():
     physics, data = Pendulum(), simulated(Pendulum(11.0))
     bound = residual_model(physics, data)[0].bind(TREE)

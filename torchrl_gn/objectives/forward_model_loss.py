@@ -13,6 +13,9 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor
+from torchrl_gn.dynamics.executors.eager import EagerExecutor
+from torchrl_gn.dynamics.executors.native import NativeDelta
+from torchrl_gn.dynamics.features.controls import present_actions
 from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
@@ -22,6 +25,8 @@ FIT_NORMALIZERS = (
     "Call fit_normalizers(transitions) of the loss with thousands of clean transitions [B], once before training;"
     " trajectory_buffer(trajectories, batch_size=5000).sample() draws them."
 )
+
+_CORRECTED = 128  # states of a batch in which the correction of physics is penalised
 
 
 class ForwardModelLoss(LossModule):
@@ -43,6 +48,10 @@ class ForwardModelLoss(LossModule):
             the errors are those of the whole window. Default: never.
         channel_weights: ``[N, 12]`` (or broadcast) factors of each channel's squared error, for example of less than 1
             where measurement noise makes up most of a step's change. Default: all 1.
+        residual_weight: factor of a penalty on the correction of known physics, squared like an error, in up to 128 of
+            the batch's states under actions of others. In logs under feedback control it keeps a residual model from
+            learning the controller as dynamics, and near the physics where the log has no data.
+        residual_noise: standard deviation of the noise on those states, like ``noise``.
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` consecutive steps, ``action`` ``[B, (H,) A]``,
     ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if it reads them.
@@ -76,10 +85,14 @@ class ForwardModelLoss(LossModule):
         teacher_forced_steps: int = 1,
         bptt_steps: int | None = None,
         channel_weights: Tensor | None = None,
+        residual_weight: float = 0.0,
+        residual_noise: float = 0.0,
     ) -> None:
         super().__init__()
-        if not 0 <= noise < math.inf:
-            raise ValueError(f"noise={noise} must not be negative, NaN or infinite.")
+        sizes = {"noise": noise, "residual_weight": residual_weight, "residual_noise": residual_noise}
+        for name, size in sizes.items():
+            if not 0 <= size < math.inf:
+                raise ValueError(f"{name}={size} must not be negative, NaN or infinite.")
         if isinstance(model, SpecializedPredictor):
             raise TypeError("A specialised model passes no gradient to the weights; train the bound model.")
         if teacher_forced_steps < 1:
@@ -88,7 +101,10 @@ class ForwardModelLoss(LossModule):
             )
         if bptt_steps is not None and bptt_steps < 1:
             raise ValueError(f"bptt_steps={bptt_steps} must be at least 1, or None for the whole window.")
+        if residual_weight and model.model.physics is None:
+            raise ValueError(f"residual_weight={residual_weight} is for models with physics=, which this one lacks.")
         self.model, self.noise, self.generator = model, noise, generator
+        self.residual_weight, self.residual_noise = residual_weight, residual_noise
         self.teacher_forced_steps, self.bptt_steps = teacher_forced_steps, bptt_steps
         scale = torch.zeros(model.layout.delta_size, dtype=torch.float64, device=model.movable.device)
         self.register_buffer("noise_scale", scale)
@@ -194,13 +210,31 @@ class ForwardModelLoss(LossModule):
         errors, scale = errors / steps, self._scale(self.noise_scale)
         movable = torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
         loss = errors.sum() / movable.sum().clamp(min=1)
+        if self.residual_weight:
+            correction = self._correction(executor, state, action).sum() / movable.sum().clamp(min=1)
+            loss = loss + self.residual_weight * correction
         out = {f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)}
         return TensorDict({"loss_forward_model": loss, **out}, [])
 
+    def _correction(self, executor: EagerExecutor | NativeDelta, state: Tensor, action: Tensor) -> Tensor:
+        """Squared correction of the physics by component, in states ``[B, H, N, 13]`` under each other's actions."""
+        state, action = state.flatten(0, 1), action.flatten(0, 1)
+        device = state.device if self.generator is None else self.generator.device
+        drawn = [
+            torch.randperm(len(state), generator=self.generator, device=device)[:_CORRECTED].to(state.device)
+            for _ in range(2)
+        ]
+        state, action = self.perturb(state[drawn[0]], self.residual_noise), action[drawn[1]]
+        physics = self.trained.physics
+        assert physics is not None
+        after = physics(state, action[..., : present_actions(self.model.scene)]).to(state.dtype)
+        return self.component_errors(executor.delta(state, action)[0], self.model.layout.delta(state, after))
+
     def _require_noise_scale(self) -> None:
-        if self.noise and not bool(self.noise_scale.any()):
+        noise = self.noise or (self.residual_noise if self.residual_weight else 0.0)
+        if noise and not bool(self.noise_scale.any()):
             raise RuntimeError(
-                f"{type(self).__name__}: noise={self.noise} is in standard deviations of the states, which are not"
+                f"{type(self).__name__}: noise={noise} is in standard deviations of the states, which are not"
                 " known. Call fit_scales(transitions) with thousands of clean transitions [B], or use noise=0."
             )
 
@@ -221,16 +255,17 @@ class ForwardModelLoss(LossModule):
             require_finite(parameters, f"{self.model.parameters_key!r} of the batch")
         return parameters
 
-    def perturb(self, state: Tensor) -> Tensor:
-        """States ``[*B, N, 13]`` with input noise."""
-        if self.noise == 0:
+    def perturb(self, state: Tensor, noise: float | None = None) -> Tensor:
+        """States ``[*B, N, 13]`` with input noise, or that of another standard deviation."""
+        size = self.noise if noise is None else noise
+        if size == 0:
             return state
         shape = (*state.shape[:-1], self.model.layout.delta_size)
         # Drawn on the generator's device, so that a seed gives the same noise on any.
         device = state.device if self.generator is None else self.generator.device
-        noise = torch.randn(shape, generator=self.generator, dtype=state.dtype, device=device).to(state.device)
-        scale = (self.noise * self.noise_scale).to(state.dtype) * self.model.movable
-        return self.model.layout.apply(state, noise * scale)
+        drawn = torch.randn(shape, generator=self.generator, dtype=state.dtype, device=device).to(state.device)
+        scale = (size * self.noise_scale).to(state.dtype) * self.model.movable
+        return self.model.layout.apply(state, drawn * scale)
 
     def _scale(self, like: Tensor) -> Tensor:
         """Weights ``[N, 12]``: inverse standard deviations of movable channels by their weights, 0 for fixed ones."""
