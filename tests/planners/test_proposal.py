@@ -123,6 +123,8 @@ def test_bad_policies_are_refused_by_name():
         gradient_planner(StatePolicy(scene))
     with pytest.raises(ValueError, match="propose_every_step=True needs a policy"):
         ILQGPlanner(scene_env(), HORIZON, propose_every_step=True)
+    with pytest.raises(ValueError, match=r"reads \['observation'\], which ModelEnv\('cart'\) does not predict"):
+        gradient_planner(TensorDictModule(torch.nn.Linear(3, 1), ["observation"], ["action"]))
     with pytest.raises(ValueError, match=r"must write actions \[2, 1\], got \[2, 3\]"):
         gradient_planner(policy_of(lambda state: state[..., 1, :3]))(at(1.0, 0.5))
     with pytest.raises(ValueError, match="proposal=: 'action' has nan"):

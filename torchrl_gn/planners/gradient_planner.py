@@ -90,7 +90,7 @@ class GradientPlanner(RecedingHorizonPlanner):
             )
         if not 0 < shrink <= 1:
             raise ValueError(f"shrink must be above 0 and at most 1, got {shrink}")
-        check_proposal(proposal, propose_every_step)
+        check_proposal(proposal, propose_every_step, env)
         super().__init__(env)
         self.horizon, self.iterations, self.shrink = horizon, iterations, shrink
         self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up

@@ -107,7 +107,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         check_plannable(env, warm_up, horizon=horizon, iterations=iterations, num_threads=threads)
         if not 0 <= control_cost < math.inf:
             raise ValueError(f"control_cost must be finite and not negative, got {control_cost}")
-        check_proposal(proposal, propose_every_step)
+        check_proposal(proposal, propose_every_step, env)
         super().__init__(env)
         self.proposal, self.propose_every_step = proposal, propose_every_step
         self.horizon, self.iterations = horizon, iterations

@@ -13,9 +13,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_gn.finite import require_finite
 
+_CONSTANT = ("task", "target")  # entries that a policy may read besides what an environment writes
 
-def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool) -> None:
-    """Raise TypeError unless a policy writes ``action``, ValueError if there is none to propose at every step."""
+
+def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env: EnvBase) -> None:
+    """Raise TypeError unless a policy writes ``action``, ValueError if it reads what ``env`` does not write."""
     if proposal is None:
         if every_step:
             raise ValueError("propose_every_step=True needs a policy: give proposal= too")
@@ -23,6 +25,13 @@ def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool) -> N
         raise TypeError(f"proposal= must be a TensorDict module that writes 'action', got {type(proposal).__name__}")
     elif not getattr(proposal, "fitted", True):
         raise ValueError(f"{type(proposal).__name__} has learned no policy yet: call fit_policy on it, or load one")
+    else:
+        known = {*env.observation_spec.keys(True), *env.state_spec.keys(True), *_CONSTANT}
+        if unknown := [key for key in proposal.in_keys if key not in known]:
+            raise ValueError(
+                f"the policy of proposal= reads {unknown}, which {env} does not predict: put a module before it that"
+                " makes them of 'state'"
+            )
 
 
 @torch.no_grad()

@@ -58,7 +58,8 @@ def fit_value(
     Args:
         episodes: ``[M, T]``, as ``env.rollout`` and collectors give them, or several such of different ``T``: ``state``
             ``[M, T, N, 13]``, ``("next", "state")``, ``("next", "reward")`` ``[M, T, 1]`` and, if any episode ends
-            within, ``("next", "done")`` and ``("next", "terminated")``.
+            within, ``("next", "done")`` and ``("next", "terminated")``. Rewards are learned as they are: of unstable
+            steps see :class:`~torchrl_gn.envs.SceneEnv`.
         lmbda: :math:`\lambda` of the targets: 0 looks one step ahead, 1 to the end of the episode.
         iterations: number of targets.
         steps: optimiser steps on each.
@@ -74,7 +75,8 @@ def fit_value(
     _check_counts(iterations=iterations, steps=steps, batch_size=batch_size)
     given = _as_list(episodes)
     keys = ("state", ("next", "state"), ("next", "reward"))
-    parts = [_require(part, index, keys) for index, part in enumerate(given)]
+    device = value.normalizer.mean.device
+    parts = [_require(part, index, keys).to(device) for index, part in enumerate(given)]
     value.features.fit(torch.cat([part["state"].flatten(0, 1) for part in parts]))
     parts = [_transitions(value, part) for part in parts]
     features = torch.cat([part["features"].flatten(0, 1) for part in parts])
@@ -124,7 +126,8 @@ def fit_policy(
         FloatingPointError: the gradient is not finite; no weight changes at that step.
     """
     _check_counts(steps=steps, batch_size=batch_size)
-    parts = [_require(part, index, ("state", "action")) for index, part in enumerate(_as_list(episodes))]
+    given, device = enumerate(_as_list(episodes)), policy.middle.device
+    parts = [_require(part, index, ("state", "action")).to(device) for index, part in given]
     state, action = (torch.cat([part[key].flatten(0, 1) for part in parts]) for key in ("state", "action"))
     if action.shape[1:] != policy.middle.shape:
         raise ValueError(f"The episodes' actions must be [M, T, {len(policy.middle)}], got {list(action.shape)}.")
