@@ -16,6 +16,9 @@ planner:
 Any other robot (`system=PATH`) needs a model (`checkpoint=PATH`) and a task: `horizon`, `steps`, and as `reward` a list
 of terms, as in `[{type: Velocity, body: torso, axis: x}, {type: Effort, weight: 0.1}]` (docs/planning.md).
 
+`value=PATH` and `policy=PATH` are what recipes/value.py learned from earlier episodes: planners then see further than
+the horizon, and begin with the policy's plan.
+
 A checkpoint of an inference model first identifies the system from random controls. `variants=true` gives every episode
 its own random variant of the system; it needs a checkpoint trained on variants (the package has some for pendulum and
 cheetah). The same `run_dir` goes on with the saved episodes, also with more steps or planners.
@@ -52,6 +55,8 @@ from _common.planning_task import (
     bind_model,
     draw_targets,
     fill_in,
+    load_policy,
+    load_value,
     make_scenes,
     reward_of,
     shipped_models,
@@ -60,7 +65,7 @@ from _common.planning_task import (
 from torchrl_gn.data import spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo, StatePolicy
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.rewards import FreezeGoal
 from torchrl_gn.scenes import Scene
@@ -88,21 +93,22 @@ class RandomControl(TensorDictModuleBase):
 
 
 def make_planner(
-    name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, done: int
+    name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, done: int, policy: StatePolicy | None = None
 ) -> TensorDictModuleBase:
     """Make a planner that goes on after ``done`` steps; its random numbers depend on them."""
+    proposing = {} if policy is None else {"proposal": policy, "propose_every_step": bool(cfg.policy_every_step)}
     seed = cfg.seed + 1_000_000 * done
     torch.manual_seed(seed)  # what TorchRL's planners draw from
     if name in ("random", "nothing"):
         return RandomControl(env.scene, cfg.episodes, cfg.steps, cfg.seed + 2, float(name == "random"), step=done)
     if name == "ilqg":
-        return ILQGPlanner(env, cfg.horizon, seed=seed, **cfg.ilqg)
+        return ILQGPlanner(env, cfg.horizon, seed=seed, **proposing, **cfg.ilqg)
     if name == "ilqr":
         assert imagined is not None
-        return ILQGPlanner(imagined, cfg.horizon, seed=seed, **cfg.ilqr)
+        return ILQGPlanner(imagined, cfg.horizon, seed=seed, **proposing, **cfg.ilqr)
     if name == "gn":
         assert imagined is not None
-        more = {key: value for key, value in cfg.gn.items() if key != "lr"}
+        more = proposing | {key: value for key, value in cfg.gn.items() if key != "lr"}
         optimizer = partial(torch.optim.Adam, lr=cfg.gn.lr)
         return GradientPlanner(imagined, cfg.horizon, optimizer=optimizer, seed=seed, **more)
     where = env if name.endswith("_true") else imagined
@@ -162,7 +168,11 @@ def main(cfg: DictConfig) -> None:
     # Identify variants first whoever plans, so that all planners have the same starts.
     needed = set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint or (cfg.variants and shipped_models(cfg))
     bound, inference = bind_model(cfg, scene) if needed else (None, None)
-    imagined = None if bound is None else ModelEnv(bound, reward)
+    value, proposal = load_value(cfg, reward), load_policy(cfg, scene)
+    imagined = None if bound is None else ModelEnv(bound, reward, terminal=value)
+    physics = env  # to plan on
+    if value is not None:
+        physics = SceneEnv(scenes, reward, terminal=value, num_threads=cfg.simulation_threads)
     run = RunFolder(cfg.run_dir, "mpc")
     refuse_other_options(cfg, run, MAY_CHANGE)
     task = cfg.reward if isinstance(cfg.reward, str) else "own"
@@ -183,7 +193,7 @@ def main(cfg: DictConfig) -> None:
             )
         if not torch.allclose(episodes.records["state"][0], start["state"]):
             raise ValueError(f"{episodes.path} began in other states than the other planners do; name a new run_dir.")
-        planner = make_planner(name, cfg, env, imagined, len(episodes))
+        planner = make_planner(name, cfg, physics, imagined, len(episodes), proposal)
         if cfg.delay and not isinstance(planner, RandomControl):
             planner = PlanAhead(cast(Any, planner), cfg.delay)
         policy = planner if target is None else TensorDictSequential([FreezeGoal(reward), planner])

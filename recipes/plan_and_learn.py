@@ -10,8 +10,12 @@ goes on, with more rounds too. Without a model of the system it first trains one
 real robot with its task, one of recipes/config/robot. No figure of the paper. Results:
 docs/results/learning-from-planning.md.
 
+`value=true` learns the value of states (recipes/value.py) from all episodes after every round, and plans with it beyond
+the horizon in the next, so that short horizons do; `policy=true` lets a policy that imitates them begin the plans.
+
 Writes config.yaml, metrics.json, the table as table.md, rewards over time as rewards.png, and each round's episodes
-(executed<round>) and model (learned<round>, with its error table) to its run folder. All options:
+(executed<round>), model (learned<round>, with its error table) and value (valued<round>, with its figure) to its run
+folder. All options:
 recipes/config/plan_and_learn.yaml.
 """
 
@@ -25,7 +29,7 @@ from omegaconf import DictConfig
 from safetensors.torch import load_file
 
 from _common import as_list, clean_exit, open_log, scene_options, with_help
-from _common.sweeps import FORWARD_MODEL, MPC, Run, override, refuse_changes, report_sweep, run_all
+from _common.sweeps import FORWARD_MODEL, MPC, VALUE, Run, override, refuse_changes, report_sweep, run_all
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, load_pretrained, pretrained_names
@@ -42,10 +46,12 @@ def task_options(cfg: DictConfig) -> list[str]:
     return options + [f"{key}={override(cfg[key])}" for key in ("reward", "horizon") if cfg[key] is not None]
 
 
-def planning(cfg: DictConfig, folder: Path, index: int, model: str) -> Run:
+def planning(cfg: DictConfig, folder: Path, index: int, model: str, valued: Run | None) -> Run:
     """Episodes executed through a model; in the last round baselines beside it."""
     options = (*task_options(cfg), f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"executor={cfg.executor}")
     options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
+    if valued is not None:
+        options += tuple(f"{key}={valued.folder}" for key in ("value", "policy") if cfg[key])
     last = index == cfg.rounds
     planners = [cfg.planner, *(cfg.baselines if last else ())]
     options += (
@@ -72,18 +78,28 @@ def learning(cfg: DictConfig, folder: Path, index: int, model: str | None, execu
     return Run(FORWARD_MODEL, folder / f"learned{index}", (*options, *more), f"learning, round {index}")
 
 
-def make_runs(cfg: DictConfig, folder: Path, model: str | None) -> tuple[list[Run | None], list[Run]]:
-    """Every round's learning, None if there is nothing to learn before the first episodes, and planned episodes."""
+def valuing(cfg: DictConfig, folder: Path, index: int, executed: list[Run]) -> Run:
+    """A value, and a policy, of all episodes up to a round's."""
+    files = [str(run.folder / f"{cfg.planner}.safetensors") for run in executed]
+    options = (f"episodes={override(files)}", f"discount={cfg.discount}", f"seed={cfg.seed + index}")
+    options += (f"threads={cfg.threads}", *as_list(cfg.valuing))
+    return Run(VALUE, folder / f"valued{index}", options, f"value, round {index}")
+
+
+def make_runs(cfg: DictConfig, folder: Path, model: str | None) -> tuple[list[Run | None], list[Run], list[Run | None]]:
+    """Every round's learning (None if there is nothing to learn yet), planned episodes, and value to plan with."""
     learned: list[Run | None] = [None if model else learning(cfg, folder, 0, None, [])]
     executed: list[Run] = []
+    valued: list[Run | None] = [None]
     for index in range(cfg.rounds + 1):
         if index:
             learned.append(learning(cfg, folder, index, model, executed))
+            valued.append(valuing(cfg, folder, index - 1, executed) if cfg.value or cfg.policy else None)
         if (learn := learned[-1]) is not None:
             model = str(learn.folder)
         assert model is not None
-        executed.append(planning(cfg, folder, index, model))
-    return learned, executed
+        executed.append(planning(cfg, folder, index, model, valued[-1]))
+    return learned, executed, valued
 
 
 @with_help
@@ -95,8 +111,10 @@ def main(cfg: DictConfig) -> None:
     if model is not None:
         load_pretrained(model)  # refused before anything is written
     scene = load_scene(cfg.system, **scene_options(cfg))
-    learned, executed = make_runs(cfg, folder.path.resolve(), model)  # named in the options, which may not change
-    refuse_changes([run for run in (*learned, *executed) if run is not None])
+    learned, executed, valued = make_runs(
+        cfg, folder.path.resolve(), model
+    )  # named in the options, which may not change
+    refuse_changes([run for run in (*learned, *executed, *valued) if run is not None])
     tracker = open_log(cfg, folder)
     lines = ["| round | mean reward (std over starts) | ms a step | one-step error | 100 steps |", "|---" * 5 + "|"]
     metrics: dict[str, float] = {}
@@ -110,6 +128,11 @@ def main(cfg: DictConfig) -> None:
             measured = learn.numbers()
             errors = {name: measured[name] for name in ("one_step_error", "rollout_error_100")}
             metrics |= {f"round {index}/{name}": value for name, value in errors.items()}
+        if (value := valued[index]) is not None:
+            failed = run_all([value], 1, desc=value.name)
+            if failed:
+                break
+            metrics |= {f"round {index}/value_{key}": value.numbers()[key] for key in ("explained", "return")}
         failed = run_all([execution], 1, desc=execution.name)
         if failed:
             break

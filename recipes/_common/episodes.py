@@ -66,6 +66,24 @@ class Episodes:
             save_file(apart, temporary)
 
 
+def transitions(path: Path) -> list[TensorDict]:
+    """Steps ``[M, T]`` of saved episodes, as TorchRL's rollouts have them, by their length.
+
+    An episode that became unstable ends before. ValueError if none has a stable step.
+    """
+    kept = load_file(path)
+    lengths = kept["state"].isfinite().flatten(2).all(-1).sum(1) - 1
+    found = []
+    for length in lengths[lengths > 0].unique().tolist():
+        state, action, reward = (kept[name][lengths == length] for name in ("state", "action", "reward"))
+        after = {"state": state[:, 1 : length + 1], "reward": reward[:, :length, None]}
+        steps = {"state": state[:, :length], "action": action[:, :length], "next": after}
+        found.append(TensorDict(steps, [len(state), length]))
+    if not found:
+        raise ValueError(f"{path} has no episode with a stable step.")
+    return found
+
+
 def planned_state(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase) -> Tensor:
     """Last state ``[N, 13]`` of the first episode's plan, predicted by the model or, without one, simulated."""
     plans = cast(Tensor, now["plan", "actions"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -16,10 +17,11 @@ from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_sta
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
+from torchrl_gn.planners import StatePolicy, StateValue
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
-from torchrl_gn.training import load_pretrained, pretrained_names
+from torchrl_gn.training import load_pretrained, plain_config, pretrained_names
 
 ON_MODEL, ON_PHYSICS = ("gn", "ilqr", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
 
@@ -85,6 +87,30 @@ def bind_model(cfg: DictConfig, scene: Scene):
         raise ValueError("The model was trained on one system, not on variants: give checkpoint=PATH of one that was.")
     bound = checkpoint.model.bind(scene, parameters_key="parameters" if cfg.variants else None)
     return specialize(bound, executor=cfg.executor), None
+
+
+def load_value(cfg: DictConfig, reward: Reward) -> StateValue | None:
+    """The value that plans end in; ValueError if it was learned for another reward."""
+    if cfg.value is None:
+        return None
+    checkpoint = load_pretrained(cfg.value)
+    value, learned_for = checkpoint.value, checkpoint.config.get("reward")
+    if learned_for is not None and learned_for != plain_config(cfg)["reward"]:
+        raise ValueError(f"value={cfg.value} was learned for the reward {learned_for}, not {cfg.reward}.")
+    if reward.target_shape is not None:
+        raise ValueError(f"value={cfg.value}: a value of states does not know the target of {reward}.")
+    return value
+
+
+def load_policy(cfg: DictConfig, scene: Scene) -> StatePolicy | None:
+    """The policy that proposes plans; ValueError if it is of another scene."""
+    if cfg.policy is None:
+        return None
+    path = Path(cfg.policy)
+    policy = load_pretrained(path / "policy.safetensors" if path.is_dir() else path).policy
+    if policy.scene.node_names != scene.node_names:
+        raise ValueError(f"policy={cfg.policy} is of scene {policy.scene.name!r}, not {scene.name!r}.")
+    return policy
 
 
 def reward_of(cfg: DictConfig, scene: Scene) -> Reward:

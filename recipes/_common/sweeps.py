@@ -24,7 +24,7 @@ from torchrl_gn.training import RayCluster, RunFolder, Tracker
 from torchrl_gn.training.run_folder import METRICS_FILE
 
 RECIPES = Path(__file__).parents[1]
-FORWARD_MODEL, MPC = RECIPES / "forward_model.py", RECIPES / "mpc.py"
+FORWARD_MODEL, MPC, VALUE = (RECIPES / f"{name}.py" for name in ("forward_model", "mpc", "value"))
 OPTIONS_FILE = "options.json"
 MAY_DIFFER = ("threads=", "executor=", "data.folder=")  # of a finished run
 

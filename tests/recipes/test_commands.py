@@ -26,6 +26,7 @@ NESTED = {  # options that hold options of other recipes
     ("benchmark_planning", "overrides"): "mpc",
     ("plan_and_learn", "planning"): "mpc",
     ("plan_and_learn", "training"): "forward_model",
+    ("plan_and_learn", "valuing"): "value",
 }
 
 

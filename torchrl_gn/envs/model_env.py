@@ -30,6 +30,7 @@ from torchrl_gn.envs.specs import (
     step_reward,
 )
 from torchrl_gn.envs.starts import StartSampler, StartStates
+from torchrl_gn.envs.terminal import TerminalValue, plan_rewards, step_entries, terminal_of
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
@@ -49,7 +50,7 @@ class ModelEnv(ModelBasedEnvBase):
     Args:
         model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
-        done, unstable_reward: as of :class:`~torchrl_gn.envs.SceneEnv`.
+        done, unstable_reward, terminal: as of :class:`~torchrl_gn.envs.SceneEnv`.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own. A
             :class:`~torchrl_gn.scenes.KinematicTree` needs states ``[M, N, C]``, for example of a log.
         seed: default: drawn from torch's global generator.
@@ -68,6 +69,7 @@ class ModelEnv(ModelBasedEnvBase):
         reward: RewardFunction | None = None,
         *,
         done: DoneFunction | None = None,
+        terminal: TerminalValue | None = None,
         start_states: StartStates | None = None,
         unstable_reward: float | None = None,
         seed: int | None = None,
@@ -88,6 +90,7 @@ class ModelEnv(ModelBasedEnvBase):
             self.scene = cast(Any, model.scene).present
         self.reward = reward_of(reward, self, self.scene)
         self.ends = done
+        self.terminal = terminal_of(terminal, self, self.scene)
         self.unstable_reward, self.spares_learners = finite_reward(unstable_reward), unstable_reward is None
         self.starts = StartSampler(self.scene, start_states, seed)
         self._state_shape = self.scene.num_nodes, self.scene.state_size
@@ -135,6 +138,8 @@ class ModelEnv(ModelBasedEnvBase):
             reset.set("hidden_state", hidden_state)
         if self.history:
             reset.set("past_actions", self._past_actions(tensordict).clone())
+        if self.terminal is not None:
+            reset.set("discount", torch.ones(*shape, 1))
         return reset.to(self.device)
 
     def _past_actions(self, tensordict: TensorDictBase) -> Tensor:
@@ -158,6 +163,7 @@ class ModelEnv(ModelBasedEnvBase):
         predicted = self.world_model(self._inputs(tensordict))["next"]
         stable = predicted["state"].isfinite().flatten(-2).all(-1, keepdim=True)
         entries: dict[str, Any] = outcome(self, tensordict, state, action, predicted["state"], stable)
+        entries |= step_entries(self, tensordict, state, entries)
         entries |= self.carried(tensordict, predicted)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
@@ -188,6 +194,7 @@ class ModelEnv(ModelBasedEnvBase):
         """States ``[*B, H + 1, N, 13]`` and rewards ``[*B, H, 1]`` of action sequences ``[*B, H, A]``; differentiable.
 
         Equals stepping a TensorDict ``[*B]``, but is faster; predictions that are not finite are returned as they are.
+        With a terminal value the rewards are those of :func:`~torchrl_gn.envs.terminal.plan_rewards`.
         """
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
         if actions.shape != shape or shape[-2] < 1:
@@ -203,7 +210,8 @@ class ModelEnv(ModelBasedEnvBase):
             batch = tensordict.ndim
             task = task.unsqueeze(batch).expand(*task.shape[:batch], shape[-2], *task.shape[batch:])
         before, after = states[..., :-1, :, :], states[..., 1:, :, :]
-        return states, step_reward(self.reward, before, actions, after, task)
+        rewards = step_reward(self.reward, before, actions, after, task)
+        return states, plan_rewards(self.terminal, rewards, states[..., -1, :, :])
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
         return False  # rollouts run their full length, without waiting for a GPU

@@ -15,6 +15,7 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.drawing import draw_states
 from torchrl_gn.envs.specs import DoneFunction, RewardFunction, finite_reward, outcome, read, reward_of, set_specs
 from torchrl_gn.envs.starts import StartSampler, StartStates
+from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.load import load_scene
 from torchrl_gn.scenes.scene import Scene
@@ -39,6 +40,9 @@ class SceneEnv(EnvBase):
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
         done: function of the state after a step ``[*B, N, 13]`` that says where the episode ends, bool ``[*B]`` or
             ``[*B, 1]``; or a TensorDict module, which reads the step's entries and writes ``terminated``.
+        terminal: value ``[*B, 1]`` of the state ``[*B, N, 13]`` that a plan ends in, for environments to plan on; its
+            attribute ``discount``, if any, discounts the plan's rewards. Rewards then sum to those of a plan, less a
+            constant, see :func:`~torchrl_gn.envs.terminal.step_entries`. For rewards without a target.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own.
         unstable_reward: of a step that became unstable. Default: -1e6, which no planner takes; under
             :func:`~torchrl_gn.envs.batched`, where policies learn, 100 times the reward of staying in the last good
@@ -62,6 +66,7 @@ class SceneEnv(EnvBase):
         reward: RewardFunction | None = None,
         *,
         done: DoneFunction | None = None,
+        terminal: TerminalValue | None = None,
         start_states: StartStates | None = None,
         num_threads: int | None = None,
         unstable_reward: float | None = None,
@@ -77,6 +82,7 @@ class SceneEnv(EnvBase):
         self.reward = reward_of(reward, self, self.scene)
         self.num_threads = num_threads
         self.ends = done
+        self.terminal = terminal_of(terminal, self, self.scene)
         self.unstable_reward, self.spares_learners = finite_reward(unstable_reward), unstable_reward is None
         self.starts = StartSampler(self.scene, start_states, seed)
         self._simulator: Simulator | None = None
@@ -104,6 +110,8 @@ class SceneEnv(EnvBase):
         entries = {"state": self.simulator.observe(physics, which), "physics": physics}
         if variant is not None:
             entries["variant"] = variant
+        if self.terminal is not None:
+            entries["discount"] = torch.ones(*shape, 1)
         return TensorDict(entries, batch_size=shape).to(self.device)
 
     def variant_of(self, tensordict: TensorDictBase) -> Tensor | None:
@@ -128,6 +136,7 @@ class SceneEnv(EnvBase):
         stable = simulated["stable"].to(self.device).unsqueeze(-1)
         state, next_state = simulated["state"].to(self.device).unbind(-3)
         entries = outcome(self, tensordict, state, action, next_state, stable)
+        entries |= step_entries(self, tensordict, state, entries)
         entries["physics"] = torch.where(stable, simulated["physics"][..., 1, :].to(self.device), physics.detach())
         if variant is not None:
             entries["variant"] = variant.to(self.device, copy=True)

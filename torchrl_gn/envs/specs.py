@@ -24,11 +24,11 @@ from torchrl_gn.scenes.scene import Scene
 RewardFunction = Callable[..., Tensor]
 DoneFunction = Callable[..., Any]
 _UNSTABLE = -1e6  # below all others, so that no planner takes an unstable step
-_DIVERGED = 1e10  # a state with larger numbers has diverged
+DIVERGED = 1e10  # a state with larger numbers has diverged
 _STAYING = 100  # steps in the last good state that an unstable step costs a learner
 
 
-def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -> None:
+def set_specs(env: Any, scene: Scene, *, physics: bool, variants: int = 1) -> None:
     """Set an environment's specs for a scene: float64 observations, float32 actions and rewards."""
     device = env.device
 
@@ -40,8 +40,14 @@ def set_specs(env: EnvBase, scene: Scene, *, physics: bool, variants: int = 1) -
         observation["physics"] = unbounded(scene.physics_size)
     if variants > 1:
         observation["variant"] = Bounded(0, variants - 1, shape=torch.Size((1,)), dtype=torch.int64, device=device)
+    if env.terminal is not None:
+        observation["discount"] = Unbounded(shape=torch.Size((1,)), device=device)
     env.observation_spec = Composite(observation, device=device)
-    inputs = {"physics" if physics else "state", "variant"} & observation.keys()  # of a step, besides the action
+    inputs = {
+        "physics" if physics else "state",
+        "variant",
+        "discount",
+    } & observation.keys()  # of a step, besides the action
     env.state_spec = Composite({key: observation[key].clone() for key in inputs}, device=device)
     actions: dict[str, Any] = {"shape": torch.Size((scene.num_actions,)), "dtype": torch.float32, "device": device}
     low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (scene.action_low, scene.action_high))
@@ -105,7 +111,7 @@ def step_reward(
 
 def _refuse_nan(reward: Any, value: Tensor, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> None:
     """Raise ValueError, naming the reward or the term of it, if it is NaN at states that have not diverged."""
-    sane = [(each.abs() < _DIVERGED).flatten(-2).all(-1) for each in (state, next_state, action.unsqueeze(-1))]
+    sane = [(each.abs() < DIVERGED).flatten(-2).all(-1) for each in (state, next_state, action.unsqueeze(-1))]
     if not bool((value.squeeze(-1).isnan() & torch.stack(sane).all(0)).any()):
         return
     terms = [term for _, term in terms_of(reward)] if isinstance(reward, Reward) else [reward]

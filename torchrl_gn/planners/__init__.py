@@ -1,6 +1,10 @@
-"""Planners: gradient MPC through the learned model, iLQG on the true physics."""
+"""Planners: gradient MPC through the learned model, iLQG on the true physics; values and policies that help them."""
 
 from torchrl_gn.planners.gradient_planner import GradientPlanner as GradientPlanner
 from torchrl_gn.planners.ilqg import ILQGPlanner as ILQGPlanner
 from torchrl_gn.planners.plan_ahead import PlanAhead as PlanAhead
 from torchrl_gn.planners.return_to_go import ReturnToGo as ReturnToGo
+from torchrl_gn.planners.state_features import StateFeatures as StateFeatures
+from torchrl_gn.planners.state_features import task_invariances as task_invariances
+from torchrl_gn.planners.state_policy import StatePolicy as StatePolicy
+from torchrl_gn.planners.state_value import StateValue as StateValue

@@ -10,6 +10,7 @@ from typing import cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
@@ -18,6 +19,7 @@ from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
+from torchrl_gn.planners.proposal import check_proposal, propose
 
 _MIN_STEP_SIZE = 0.01  # as a fraction of the optimiser's
 
@@ -46,6 +48,10 @@ class GradientPlanner(RecedingHorizonPlanner):
         optimizer: makes the optimiser of the actions, in units of half their range. Default: Adam, learning rate 0.1.
         shrink: factor on the step size after a step without improvement; an improvement doubles it, up to 1.
         action_cost: cost per step and mean squared action, in units of half the range.
+        proposal: policy, for example a :class:`~torchrl_gn.planners.StatePolicy`, whose actions in the model are one of
+            the samples.
+        propose_every_step: also of the candidates at later control steps: instead of the last perturbed one, or of the
+            only one where it is better.
         seed: default: drawn from torch's global generator.
 
     Raises:
@@ -66,6 +72,8 @@ class GradientPlanner(RecedingHorizonPlanner):
         optimizer: OptimizerFactory | None = None,
         shrink: float = 0.7,
         action_cost: float = 0.0,
+        proposal: TensorDictModuleBase | None = None,
+        propose_every_step: bool = False,
         seed: int | None = None,
     ) -> None:
         if not isinstance(env, ModelEnv):
@@ -82,10 +90,12 @@ class GradientPlanner(RecedingHorizonPlanner):
             )
         if not 0 < shrink <= 1:
             raise ValueError(f"shrink must be above 0 and at most 1, got {shrink}")
+        check_proposal(proposal, propose_every_step, env)
         super().__init__(env)
         self.horizon, self.iterations, self.shrink = horizon, iterations, shrink
         self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
         self.candidates, self.samples, self.noise, self.action_cost = candidates, samples, noise, action_cost
+        self.proposal, self.propose_every_step = proposal, propose_every_step
         self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)
         low, high = torch.as_tensor(env.scene.action_low), torch.as_tensor(env.scene.action_high)
         self.register_buffer("middle", ((low + high) / 2).float())
@@ -137,7 +147,7 @@ class GradientPlanner(RecedingHorizonPlanner):
                 if len(rows) == 0:
                     continue
                 some = entries if len(rows) == len(flat) else cast(TensorDictBase, entries[rows])
-                start = self.resample(plan[rows]) if resumed else self.initial_plan(some)
+                start = self.later_plan(some, plan[rows]) if resumed else self.initial_plan(some)
                 best[rows], improved = self._improve(some, start, step_size[rows], resumed=resumed)
                 if resumed:
                     step_size[rows] *= torch.where(improved, 2.0, self.shrink)
@@ -166,6 +176,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         """Entries that a rollout reads, detached."""
         self.imagined.predictor.parameters_in(flat)  # refuses other variants, which the entries below no longer show
         keys = [key for key in (*self.imagined.world_model.in_keys, "past_actions", "task") if key != "action"]
+        keys += [] if self.proposal is None else [key for key in self.proposal.in_keys if key not in keys]
         read = flat.select(*keys, strict=False).detach()
         # Autograd refuses tensors made in inference mode: clone them.
         usable = read.apply(lambda entry: entry.clone() if entry.is_inference() else entry)
@@ -179,10 +190,12 @@ class GradientPlanner(RecedingHorizonPlanner):
         return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
 
     def initial_plan(self, entries: TensorDictBase) -> Tensor:
-        """Return the best random sequences ``[B, K, H, A]``, zero actions among them."""
+        """Return the best random sequences ``[B, K, H, A]``, zero actions and the proposal among them."""
         rows = len(entries)
         drawn = self.random_plans(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
+        if self.proposal is not None:
+            drawn = torch.cat([self.proposed_plan(entries), drawn[:, : self.samples - 1]], dim=1)
         # A compiled model recompiles, in minutes, for every number of rows: use the later one.
         size = self.candidates if self.imagined.predictor.fixed_batch else self.samples
         drawn = drawn[:, : self.samples // size * size]
@@ -205,6 +218,25 @@ class GradientPlanner(RecedingHorizonPlanner):
             return plan
         noise = self.noise * self.random_plans(len(plan), count)
         return torch.cat([plan[:, : self.candidates - count], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
+
+    def proposed_plan(self, entries: TensorDictBase) -> Tensor:
+        """The policy's scaled sequences ``[B, 1, H, A]``."""
+        assert self.proposal is not None
+        size = self.candidates if self.imagined.predictor.fixed_batch else 1
+        actions = propose(self.proposal, self.imagined, _repeated(entries, size), self.horizon)[::size]
+        return self._scaled(actions.to(self.half_range.dtype)).clamp(-1, 1).unsqueeze(1)
+
+    def later_plan(self, entries: TensorDictBase, plan: Tensor) -> Tensor:
+        """Candidates ``[B, K, H, A]`` to improve, from a warm start."""
+        plan = self.resample(plan)
+        if not self.propose_every_step:
+            return plan
+        proposed = self.proposed_plan(entries)
+        if self.candidates == 1:
+            with torch.no_grad():
+                old, new = (self.predicted_returns(entries, each) for each in (plan, proposed))
+            return torch.where((new > old)[..., None, None], proposed, plan)
+        return torch.cat([plan[:, :-1], proposed], dim=1)
 
     @torch.no_grad()
     def _improve(

@@ -6,11 +6,13 @@ import contextlib
 import math
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
@@ -20,11 +22,13 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
+from torchrl_gn.envs.terminal import plan_rewards
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
 from torchrl_gn.planners.linearize import RewardExpansion
 from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
 from torchrl_gn.planners.plant import LearnedPlant, Plant, SimulatedPlant
+from torchrl_gn.planners.proposal import check_proposal, propose
 
 _INITIAL_SAMPLES = 16  # random sequences; a first plan starts from the best
 
@@ -54,6 +58,8 @@ class ILQGPlanner(RecedingHorizonPlanner):
         warm_up: iterations of a first plan, from the best of some random sequences. Default: ten times ``iterations``.
         control_cost: quadratic cost per control and step, of a control at its bound; keep it below a step's reward.
         central: central differences of the physics: 1.5 times the time, equal plans where measured.
+        proposal: policy whose actions in ``env`` are one of the sequences that a first plan starts from.
+        propose_every_step: also one of two at later control steps, beside the last plan.
         seed: default: drawn from torch's global generator.
 
     Raises:
@@ -78,6 +84,8 @@ class ILQGPlanner(RecedingHorizonPlanner):
         *,
         control_cost: float = 1e-5,
         central: bool = False,
+        proposal: TensorDictModuleBase | None = None,
+        propose_every_step: bool = False,
         seed: int | None = None,
         num_threads: int | None = None,
     ):
@@ -99,7 +107,9 @@ class ILQGPlanner(RecedingHorizonPlanner):
         check_plannable(env, warm_up, horizon=horizon, iterations=iterations, num_threads=threads)
         if not 0 <= control_cost < math.inf:
             raise ValueError(f"control_cost must be finite and not negative, got {control_cost}")
+        check_proposal(proposal, propose_every_step, env)
         super().__init__(env)
+        self.proposal, self.propose_every_step = proposal, propose_every_step
         self.horizon, self.iterations = horizon, iterations
         self.warm_up = 10 * iterations if warm_up is None else warm_up
         self.control_cost, self.central, self.num_threads = control_cost, central, num_threads
@@ -140,11 +150,15 @@ class ILQGPlanner(RecedingHorizonPlanner):
         tasks = None if task is None else _flat(task, len(tensordict.shape))
         variant = env.variant_of(tensordict) if isinstance(env, SceneEnv) else None
         variants = [0] * len(starts) if variant is None else variant.flatten().tolist()
+        proposed: list[np.ndarray | None] = [None] * len(starts)
+        if self.proposal is not None and (self.propose_every_step or not all(resumed)):
+            flat = tensordict.exclude("next", "action", KEY).detach().reshape(-1)
+            proposed = list(propose(self.proposal, env, flat, self.horizon).double().cpu().numpy())
         with frozen(env) if isinstance(env, ModelEnv) else contextlib.nullcontext():
             for row, start in enumerate(starts):
                 plan = plans[row] if resumed[row] else None
                 task = None if tasks is None else tasks[row]
-                plans[row] = self._plan_row(self.plant(variants[row]), start, plan, task)
+                plans[row] = self._plan_row(self.plant(variants[row]), start, plan, task, proposed[row])
         return torch.from_numpy(plans).reshape(actions.shape).to(actions.device)
 
     def _starts(self, tensordict: TensorDictBase) -> np.ndarray:
@@ -161,14 +175,19 @@ class ILQGPlanner(RecedingHorizonPlanner):
             raise ValueError(f"{key!r} must be {[*tensordict.shape, *shape]}, got {list(found.shape)}")
         return found.detach().double().reshape(tensordict.numel(), -1).cpu().numpy()
 
-    def _plan_row(self, plant: Plant, start: np.ndarray, plan: np.ndarray | None, task: Any) -> np.ndarray:
+    def _plan_row(
+        self, plant: Plant, start: np.ndarray, plan: np.ndarray | None, task: Any, proposed: np.ndarray | None
+    ) -> np.ndarray:
         env = self._env
-        reward = RewardExpansion(cast(Any, env.reward), task, env.device)
+        reward = RewardExpansion(cast(Any, env.reward) if env.terminal is None else self._plan_reward, task, env.device)
         solver = ILQGSolver(plant, reward, control_cost=self.control_cost)
         iterations = self.warm_up if plan is None else self.iterations
         rest = np.zeros((1, *self._plan_shape))
-        attempts: list[Callable[[], np.ndarray]] = [] if plan is None else [lambda: plan[None]]
-        attempts += [lambda: spline_controls(env.scene, _INITIAL_SAMPLES, self.horizon, self._rng), lambda: rest]
+        offered = rest[:0] if proposed is None or not (plan is None or self.propose_every_step) else proposed[None]
+        attempts: list[Callable[[], np.ndarray]] = []
+        attempts += [] if plan is None else [lambda: np.concatenate((plan[None], offered))]
+        drawn = partial(spline_controls, env.scene, _INITIAL_SAMPLES, self.horizon, self._rng)
+        attempts += [lambda: np.concatenate((offered, drawn())), lambda: rest]
         for sequences in attempts:
             best = solver.follow(start, solver.controls(sequences()))
             if math.isfinite(best.cost):
@@ -184,6 +203,11 @@ class ILQGPlanner(RecedingHorizonPlanner):
                 stacklevel=2,
             )
         return solver.actions(solver.controls(rest[0])) if plan is None else plan
+
+    def _plan_reward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> Tensor:
+        """Rewards ``[*B, H, 1]`` of the steps of plans."""
+        rewards = cast(Any, self._env.reward)(state, action, next_state, task)
+        return plan_rewards(self._env.terminal, rewards, next_state[..., -1, :, :])
 
     @property
     def _env(self) -> SceneEnv | ModelEnv:

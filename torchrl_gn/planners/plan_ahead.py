@@ -20,6 +20,7 @@ from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.plan import check_count
 
 KEY = "ahead"
+_OF_STEPS = ("reward", "discount", "done", "terminated")  # entries of a predicted step that a plan does not begin with
 
 
 class PlanAhead(TensorDictModuleBase):
@@ -143,7 +144,7 @@ class PlanAhead(TensorDictModuleBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         with torch.no_grad():
             after = cast(Any, self.planner.env).step(tensordict.exclude("next", KEY))["next"]
-        return tensordict.exclude("next", "action", KEY).update(after.exclude("reward", "done", "terminated"))
+        return tensordict.exclude("next", "action", KEY).update(after.exclude(*_OF_STEPS))
 
     def _in_background(self, tensordict: TensorDictBase, planned: Tensor) -> TensorDictBase:
         if planned.any() and not planned.all():

@@ -10,6 +10,10 @@ from torchrl_gn.training.checkpoint import save_checkpoint as save_checkpoint
 from torchrl_gn.training.fit import History as History
 from torchrl_gn.training.fit import fit as fit
 from torchrl_gn.training.fit_physics import fit_physics as fit_physics
+from torchrl_gn.training.fit_value import ImitationHistory as ImitationHistory
+from torchrl_gn.training.fit_value import ValueHistory as ValueHistory
+from torchrl_gn.training.fit_value import fit_policy as fit_policy
+from torchrl_gn.training.fit_value import fit_value as fit_value
 from torchrl_gn.training.off_policy import OffPolicyTrainer as OffPolicyTrainer
 from torchrl_gn.training.off_policy import mean_return as mean_return
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer

@@ -22,6 +22,7 @@ import torchrl_gn
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.identification import IdentifyingModel
+from torchrl_gn.planners import StatePolicy, StateValue
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import Scene, scene_from_description
 
@@ -30,8 +31,14 @@ WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")  # the models that come
 FORMAT = 4  # version of the checkpoint format that this package writes and reads
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
-Trained = ForwardModel | IdentifyingModel | Agent  # what a checkpoint can hold
-KINDS: dict[str, type[Trained]] = {"forward_model": ForwardModel, "identifying_model": IdentifyingModel, "agent": Agent}
+Trained = ForwardModel | IdentifyingModel | Agent | StateValue | StatePolicy  # what a checkpoint can hold
+KINDS: dict[str, type[Trained]] = {
+    "forward_model": ForwardModel,
+    "identifying_model": IdentifyingModel,
+    "agent": Agent,
+    "state_value": StateValue,
+    "state_policy": StatePolicy,
+}
 _Kind = TypeVar("_Kind", bound=Trained)
 
 
@@ -63,6 +70,16 @@ class Checkpoint:
     def agent(self) -> Agent:
         """The agent; CheckpointError if it is a model without a policy."""
         return self._as(Agent)
+
+    @property
+    def value(self) -> StateValue:
+        """The value of states; CheckpointError if it is another kind of model."""
+        return self._as(StateValue)
+
+    @property
+    def policy(self) -> StatePolicy:
+        """The policy over states; CheckpointError if it is another kind of model."""
+        return self._as(StatePolicy)
 
     def _as(self, kind: type[_Kind]) -> _Kind:
         if not isinstance(self.trained, kind):
@@ -109,7 +126,8 @@ def save_checkpoint(
     """Write a checkpoint, atomically and without pickle.
 
     Args:
-        scene: the scene, or scenes, it is trained on; none of an agent, which holds its graph.
+        scene: the scene, or scenes, it is trained on; none of an agent, a value or a policy,
+            which hold their own.
         config: configuration of the run; like ``metrics``, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
     """

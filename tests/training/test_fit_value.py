@@ -1,0 +1,184 @@
+"""The value of a linear system against its closed form, and the policy that played."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.training import fit_policy, fit_value, load_pretrained, save_checkpoint
+
+from .. import zoo
+
+STEP, DISCOUNT, GAIN, WEIGHTS = 0.1, 0.9, (1.5, 1.2), (1.0, 0.1)
+A = np.array([[1.0, STEP], [0.0, 1.0]]) - np.outer([STEP**2, STEP], GAIN)  # with the policy u = -GAIN x
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return zoo.load("cart", ("-1 1", "-20 20"), timestep=STEP)
+
+
+def bodies(points: torch.Tensor) -> torch.Tensor:
+    """States ``[*B, 2, 13]`` of places and speeds ``[*B, 2]``."""
+    state = torch.zeros(*points.shape[:-1], 2, 13, dtype=torch.float64)
+    state[..., 3] = 1.0
+    state[..., 1, 0], state[..., 1, 7] = points.unbind(-1)
+    return state
+
+
+def play(episodes: int = 200, steps: int = 15, seed: int = 0) -> TensorDict:
+    """Episodes ``[M, T]`` under the policy, cut by a time limit."""
+    rng = np.random.default_rng(seed)
+    points = [rng.uniform(-1, 1, (episodes, 2))]
+    for _ in range(steps):
+        points.append(points[-1] @ A.T)
+    path = torch.from_numpy(np.stack(points, axis=1))
+    reward = -(path[:, 1:].square() * torch.tensor(WEIGHTS)).sum(-1, keepdim=True)
+    state, action = bodies(path), -(path[:, :-1] @ torch.tensor(GAIN).double()).unsqueeze(-1)
+    after = {"state": state[:, 1:], "reward": reward}
+    return TensorDict({"state": state[:, :-1], "action": action, "next": after}, [episodes, steps])
+
+
+def true_value(points: torch.Tensor) -> torch.Tensor:
+    matrix = np.zeros((2, 2))
+    for _ in range(500):
+        matrix = A.T @ (np.diag(WEIGHTS) + DISCOUNT * matrix) @ A
+    return -((points @ torch.from_numpy(matrix)) * points).sum(-1, keepdim=True)
+
+
+def small(scene, **options) -> StateValue:
+    torch.manual_seed(0)
+    return StateValue(scene, **{"discount": DISCOUNT, "hidden": (64, 64), "members": 1, **options})
+
+
+POINTS = torch.from_numpy(np.random.default_rng(1).uniform(-0.8, 0.8, (200, 2)))
+
+
+@pytest.fixture(scope="module")
+def learned(scene):
+    value = small(scene)
+    return value, fit_value(value, play(), iterations=20, steps=100, seed=0)
+
+
+def test_it_recovers_the_value_of_a_linear_system(learned):
+    """Beyond the episodes' time limits, after which a fifth of the value is still to come."""
+    value, history = learned
+    with torch.no_grad():
+        error = value(bodies(POINTS)) - true_value(POINTS)
+    assert error.square().mean().sqrt() < 0.03 * true_value(POINTS).std()
+    assert history.explained > 0.99 and history.losses[-1] < 0.1 * history.losses[0]
+
+
+def test_where_an_episode_terminated_nothing_follows(scene):
+    episodes = play(steps=1)
+    rewards = torch.full_like(episodes["next", "reward"], -1.0)
+    episodes["next", "reward"] = rewards
+    ended = torch.ones_like(rewards, dtype=torch.bool)
+    for terminated, expected in ((ended, -1.0), (~ended, -1 / (1 - DISCOUNT))):
+        episodes["next", "terminated"], episodes["next", "done"] = terminated, ended
+        value = small(scene)
+        fit_value(value, episodes, iterations=3, steps=5)
+        torch.testing.assert_close(value(episodes["state"]), torch.full_like(rewards, expected))
+
+
+def test_the_smallest_of_its_networks_counts(scene):
+    value = small(scene, members=3)
+    fit_value(value, play(4), iterations=1, steps=1)
+    state = bodies(POINTS[:5])
+    every = value.normalizer.inverse(value.normalized(value.features(state, torch.float32)))
+    assert every.std(-1).min() > 0
+    torch.testing.assert_close(value(state), every.amin(-1, keepdim=True).double())
+
+
+def test_a_seed_repeats_it_and_several_lengths_go_together(scene):
+    parts = [play(4), play(3, 7, seed=1)]
+    found = []
+    for seed in (0, 0, 1):
+        value = small(scene)
+        fit_value(value, parts, iterations=2, steps=3, seed=seed)
+        found.append(value(bodies(POINTS[:5])))
+    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
+
+
+def test_gradient_and_hessian_are_those_of_finite_differences(learned):
+    value = learned[0].double()
+    x, eps = torch.tensor([0.3, -0.4], dtype=torch.float64), 1e-4
+
+    def of(point: torch.Tensor) -> torch.Tensor:
+        return value(bodies(point)).squeeze()
+
+    steps = eps * torch.eye(2).double()
+    by_differences = torch.stack([(of(x + step) - of(x - step)) / (2 * eps) for step in steps])
+    torch.testing.assert_close(torch.autograd.functional.jacobian(of, x), by_differences, rtol=1e-5, atol=1e-6)
+    hessian = torch.autograd.functional.hessian(of, x)
+    second = torch.stack(
+        [
+            torch.autograd.functional.jacobian(of, x + step) - torch.autograd.functional.jacobian(of, x - step)
+            for step in steps
+        ]
+    )
+    torch.testing.assert_close(hessian, second / (2 * eps), rtol=1e-4, atol=1e-5)
+    value.float()
+
+
+def test_the_policy_acts_as_in_the_episodes(scene):
+    torch.manual_seed(0)
+    policy = StatePolicy(scene, hidden=(64, 64))
+    history = fit_policy(policy, play(), steps=1500, seed=0)
+    action = policy(TensorDict({"state": bodies(POINTS)}, [200]))["action"].detach()
+    expected = -(POINTS @ torch.tensor(GAIN).double()).unsqueeze(-1).float()
+    assert (action - expected).square().mean().sqrt() < 0.05 * expected.std()
+    assert history.losses[-1] < 0.1 * history.losses[0] and len(history.losses) == 10
+
+
+def test_checkpoints_hold_them(learned, scene, tmp_path):
+    value, policy = learned[0], StatePolicy(scene, hidden=(8,))
+    fit_policy(policy, play(4), steps=1)
+    for name, network in (("value", value), ("policy", policy)):
+        path = tmp_path / f"{name}.safetensors"
+        save_checkpoint(path, network, scene=scene)
+        state, loaded = bodies(POINTS[:5]), getattr(load_pretrained(path), name)
+        same = [each(state) if name == "value" else each.act(state) for each in (network, loaded)]
+        assert torch.equal(*same) and loaded.fitted and loaded.scene.name == scene.name
+    assert load_pretrained(tmp_path / "value.safetensors").value.discount == DISCOUNT
+    content = bytearray((tmp_path / "value.safetensors").read_bytes())
+    content[-3] ^= 1
+    (tmp_path / "value.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match="damaged"):
+        load_pretrained(tmp_path / "value.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("key", "match"),
+    [("state", "'state' of episodes number 1"), (("next", "reward"), r"\('next', 'reward'\) of episodes number 1")],
+)
+def test_numbers_that_are_not_finite_are_refused_by_name(scene, key, match):
+    parts = [play(2), play(2)]
+    parts[1][key][0, 3, 0] = torch.nan
+    value = small(scene)
+    with pytest.raises(ValueError, match=match):
+        fit_value(value, parts)
+    assert not value.fitted
+
+
+def test_other_bad_inputs_are_refused_by_name(scene):
+    value, good = small(scene), play(2)
+    with pytest.raises(ValueError, match=r"no entry \('next', 'reward'\)"):
+        fit_value(value, good.exclude(("next", "reward")))
+    with pytest.raises(ValueError, match=r"\[M, T\], number 0 is \[15\]"):
+        fit_value(value, good[0])
+    with pytest.raises(ValueError, match="no played episodes"):
+        fit_value(value, [])
+    with pytest.raises(ValueError, match="lmbda=2"):
+        fit_value(value, good, lmbda=2)
+    with pytest.raises(ValueError, match="iterations=0"):
+        fit_value(value, good, iterations=0)
+    wide = good.clone().set("action", torch.zeros(2, 15, 2))
+    with pytest.raises(ValueError, match=r"actions must be \[M, T, 1\]"):
+        fit_policy(StatePolicy(scene), wide)
+    for options in ({"discount": 0.0}, {"discount": 1.5}, {"members": 0}, {"hidden": ()}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            StateValue(scene, **options)

@@ -1,0 +1,86 @@
+"""The value of the state that a plan ends in, as reward of its last step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchrl_gn.envs.specs import DIVERGED, reward_of
+from torchrl_gn.finite import is_traced
+from torchrl_gn.scenes.scene import Scene
+
+TerminalValue = Callable[[Tensor], Tensor]
+
+
+def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> TerminalValue | None:
+    """The value on the environment's device, copied if need be; ValueError if it does not fit scene or reward."""
+    if terminal is None:
+        return None
+    if not callable(terminal):
+        raise TypeError(f"terminal= must be a function of states, got {type(terminal).__name__}")
+    name = type(terminal).__name__
+    if not 0 < (discount := discount_of(terminal)) <= 1:
+        raise ValueError(f"the discount of terminal= must be above 0 and at most 1, got {discount} of {name}")
+    if getattr(env.reward, "target_shape", None) is not None:
+        raise ValueError(f"a value of states does not know the target of {env.reward}: leave terminal= out")
+    if not getattr(terminal, "fitted", True):
+        raise ValueError(f"{name} has learned no value yet: call fit_value on it, or load one")
+    own = getattr(terminal, "scene", scene)
+    if own.node_names != scene.node_names:
+        raise ValueError(f"{name} is of scene {own.name!r}, whose bodies are not those of {scene.name!r}")
+    return reward_of(terminal, env, scene)
+
+
+def discount_of(terminal: TerminalValue | None) -> float:
+    """Discount of a step that a value was learned with: its attribute, 1 without one."""
+    return float(getattr(terminal, "discount", 1.0))
+
+
+def terminal_value(terminal: TerminalValue, state: Tensor) -> Tensor:
+    """Values ``[*B, 1]`` of states ``[*B, N, 13]``; ValueError for another shape, or NaN of a finite state."""
+    value = terminal(state)
+    if value.shape != (shape := (*state.shape[:-2], 1)):
+        raise ValueError(f"the terminal value must be {list(shape)}, {terminal} returned {list(value.shape)}")
+    # A GPU would have to be waited for.
+    if value.device.type == "cpu" and not is_traced() and bool((nan := value.isnan().squeeze(-1)).any()):
+        if bool((nan & (state.abs() < DIVERGED).flatten(-2).all(-1)).any()):
+            raise ValueError(f"the terminal value {terminal} returned NaN for a finite state")
+    return value
+
+
+def plan_rewards(terminal: TerminalValue | None, rewards: Tensor, last_state: Tensor) -> Tensor:
+    r"""Discounted rewards ``[*B, H, 1]`` of a plan's steps, the last with the value of its last state ``[*B, N, 13]``.
+
+    Their sum is :math:`\sum_{t<H} \gamma^t r_t + \gamma^H V(s_H)`. Without a value, the rewards as they are.
+    """
+    if terminal is None:
+        return rewards
+    steps, discount = rewards.shape[-2], discount_of(terminal)
+    value = discount**steps * terminal_value(terminal, last_state).to(rewards.dtype)
+    factors = discount ** torch.arange(steps, dtype=rewards.dtype, device=rewards.device)
+    return rewards * factors.unsqueeze(-1) + pad(value.unsqueeze(-2), (0, 0, steps - 1, 0))
+
+
+def step_entries(env: Any, tensordict: TensorDictBase, state: Tensor, entries: dict[str, Tensor]) -> dict[str, Tensor]:
+    r"""Replace the ``reward`` among a step's ``entries``, so that rewards sum to those of a plan; none without a value.
+
+    With :math:`w_t = \gamma^t`, the entry ``discount`` (1 where it is missing), :math:`w_t r_t + w_{t+1} V(s_{t+1}) -
+    w_t V(s_t)`: all values but the last cancel (potential-based shaping, Ng et al. 1999) and that of the plan's first
+    state, which no action changes. So planners that step without knowing the horizon maximise :func:`plan_rewards`.
+    Where the episode has ``terminated``, the next value is 0. ``state`` is that before the step. Also writes the next
+    ``discount``.
+    """
+    terminal, reward = env.terminal, entries["reward"]
+    if terminal is None:
+        return {}
+    weight = tensordict.get("discount", None)
+    weight = torch.ones_like(reward) if weight is None else weight
+    after = discount_of(terminal) * weight
+    next_value = torch.where(entries["terminated"], 0.0, terminal_value(terminal, entries["state"]).to(reward.dtype))
+    value = terminal_value(terminal, state).to(reward.dtype)
+    return {"reward": weight * reward + (after * next_value - weight * value), "discount": after}

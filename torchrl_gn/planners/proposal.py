@@ -1,0 +1,54 @@
+"""Action sequences that a policy proposes to a planner."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from torchrl_gn.finite import require_finite
+
+_CONSTANT = ("task", "target")  # entries that a policy may read besides what an environment writes
+
+
+def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env: EnvBase) -> None:
+    """Raise TypeError unless a policy writes ``action``, ValueError if it reads what ``env`` does not write."""
+    if proposal is None:
+        if every_step:
+            raise ValueError("propose_every_step=True needs a policy: give proposal= too")
+    elif "action" not in getattr(proposal, "out_keys", ()):
+        raise TypeError(f"proposal= must be a TensorDict module that writes 'action', got {type(proposal).__name__}")
+    elif not getattr(proposal, "fitted", True):
+        raise ValueError(f"{type(proposal).__name__} has learned no policy yet: call fit_policy on it, or load one")
+    else:
+        known = {*env.observation_spec.keys(True), *env.state_spec.keys(True), *_CONSTANT}
+        if unknown := [key for key in proposal.in_keys if key not in known]:
+            raise ValueError(
+                f"the policy of proposal= reads {unknown}, which {env} does not predict: put a module before it that"
+                " makes them of 'state'"
+            )
+
+
+@torch.no_grad()
+def propose(proposal: TensorDictModuleBase, env: EnvBase, starts: TensorDictBase, horizon: int) -> Tensor:
+    """Actions ``[B, H, A]`` of a policy, without exploration, that is followed from ``starts`` ``[B]`` in ``env``.
+
+    ValueError if an action is misshapen or not finite.
+    """
+    actions: list[Tensor] = []
+    now = starts.copy()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(horizon):
+            now = proposal(now)
+            action = cast(Tensor, now["action"])
+            if action.shape != (shape := (*starts.shape, *env.action_spec.shape)):
+                raise ValueError(f"the policy of proposal= must write actions {list(shape)}, got {list(action.shape)}")
+            require_finite(action, "the policy of proposal=: 'action'")
+            actions.append(env.action_spec.project(action))
+            now = step_mdp(env.step(now.set("action", actions[-1])), keep_other=True, exclude_done=True)
+    return torch.stack(actions, dim=-2)

@@ -1,0 +1,106 @@
+"""Normalised features of a scene's states, for networks that judge or act in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.rewards.bodies import require_bodies
+from torchrl_gn.scenes import PhysicalParameters, Scene, scene_from_description
+
+_STATES = 16  # to compare rewards at
+_FLOOR, _LIMIT = 1e-6, 5.0  # standard deviations: rounding noise, and where a planner has left the data
+
+
+class StateFeatures(Float64Buffers):
+    """The forward model's canonical state of all bodies, encoded and normalised, side by side.
+
+    Features beyond five standard deviations are clipped. TypeError for a robot known by its joints alone.
+
+    Args:
+        canonicalizer: which of the scene's invariances are built in, see :func:`task_invariances`. Default: none.
+    """
+
+    rest: Tensor
+    pivot: Tensor
+
+    def __init__(self, scene: Scene, canonicalizer: Canonicalizer | None = None) -> None:
+        super().__init__()
+        require_bodies(scene)
+        self.scene, self.options = scene, canonicalizer or Canonicalizer(recenter=False, yaw=False)
+        self.canonicalizer = self.options.bind(scene, BODY_STATE)
+        self.physical = PhysicalParameters.of(scene)
+        self.constants({"rest": self.physical.rest, "pivot": self.physical.pivot})
+        self.size = scene.num_nodes * BODY_STATE.encoded_size()
+        self.normalizer = Normalizer(self.size, floor=_FLOOR, limit=_LIMIT)
+
+    @torch.no_grad()
+    def fit(self, state: Tensor) -> None:
+        """Fit the normaliser to states ``[*B, N, 13]``, unless it has seen some; ValueError if one is not finite."""
+        if not self.normalizer.fitted:
+            self.normalizer.update(self._encoded(state))
+
+    def forward(self, state: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+        """Features ``[*B, F]`` of states ``[*B, N, 13]``; differentiable."""
+        return self.normalizer(self._encoded(state), dtype)
+
+    def _encoded(self, state: Tensor) -> Tensor:
+        if state.shape[-2:] != (shape := (self.scene.num_nodes, BODY_STATE.size)):
+            raise ValueError(f"States of {self.scene.name!r} must be {['*B', *shape]}, got {list(state.shape)}.")
+        canonical = self.canonicalizer(state, self.physical._replace(rest=self.rest, pivot=self.pivot))
+        return BODY_STATE.encode(canonical.state, "matrix", canonical.matrices).flatten(-2)
+
+    def description(self) -> dict[str, Any]:
+        """JSON-able values for :meth:`arguments_from`."""
+        return {"scene": self.scene.description(), "canonicalizer": asdict(self.options)}
+
+    @staticmethod
+    def arguments_from(description: dict[str, Any]) -> dict[str, Any]:
+        """``scene``, ``canonicalizer`` and the other options of a network's description."""
+        scene, canonicalizer = scene_from_description(description["scene"]), description["canonicalizer"]
+        return {**description, "scene": scene, "canonicalizer": Canonicalizer(**canonicalizer)}
+
+
+def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicalizer:
+    """Which of a scene's invariances its reward ``(state, action, next_state, task) -> [*B, 1]`` has too.
+
+    Compares rewards of random states with those of the same states moved and rotated.
+    """
+    generator = torch.Generator().manual_seed(0)
+    state, next_state = torch.randn(2, _STATES, scene.num_nodes, BODY_STATE.size, generator=generator).double()
+    action = torch.randn(_STATES, scene.num_actions, generator=generator).double()
+    for each in (state, next_state):
+        where = each[..., BODY_STATE.slices["orientation"]]
+        where.copy_(quaternion.normalize(where))
+    inner = torch.as_tensor(scene.predicted).unsqueeze(-1)
+    shift = torch.zeros(BODY_STATE.size, dtype=torch.float64)
+    shift[:3] = torch.as_tensor(scene.translation_invariant).double() * torch.tensor([0.7, -1.3, 0.4])
+    before = reward(state, action, next_state, None)
+
+    def keeps(moved: Callable[[Tensor], Tensor]) -> bool:
+        moved_states = (torch.where(inner, moved(each), each) for each in (state, next_state))
+        first, second = moved_states
+        return bool(torch.allclose(reward(first, action, second, None), before, rtol=1e-9, atol=1e-9))
+
+    yaw = False
+    if (frame := scene.yaw_frame) is not None:
+        rotation = torch.zeros(4, dtype=torch.float64)
+        rotation[0], rotation[1 + frame.axis] = 0.8, 0.6
+        yaw = keeps(lambda each: BODY_STATE.rotate(each, rotation.expand(_STATES, 4)))
+    return Canonicalizer(recenter=keeps(lambda each: each + shift), yaw=yaw)
+
+
+def check_hidden(hidden: Sequence[int]) -> list[int]:
+    """Hidden sizes as a list; ValueError if one is not at least 1."""
+    if not hidden or any(size < 1 or size != int(size) for size in hidden):
+        raise ValueError(f"hidden={list(hidden)} must name hidden sizes of at least 1.")
+    return [int(size) for size in hidden]

@@ -1,0 +1,88 @@
+"""The value of a scene's states, learned from played episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
+from torchrl_gn.planners.state_features import StateFeatures, check_hidden
+from torchrl_gn.scenes import Scene
+
+
+class StateValue(nn.Module):
+    r"""Discounted return :math:`V(s) = \sum_k \gamma^k r_k` of the policy in the data, from a state on.
+
+    The smallest of a few networks over the scene's :class:`~torchrl_gn.planners.StateFeatures`, so that states where
+    they disagree are not sought. Differentiable twice. For environments to plan on, as their ``terminal``; learned by
+    :func:`~torchrl_gn.training.fit_value`. 0 until then.
+
+    Args:
+        discount: :math:`\gamma` of a control step.
+        hidden: hidden sizes of each network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
+        members: number of networks.
+        canonicalizer: as of the features.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_gn.scenes import load_scene
+        >>> scene = load_scene("pendulum")
+        >>> StateValue(scene, discount=0.99)(torch.zeros(5, scene.num_nodes, 13)).shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        discount: float = 0.99,
+        hidden: Sequence[int] = (128, 128),
+        members: int = 2,
+        canonicalizer: Canonicalizer | None = None,
+    ) -> None:
+        super().__init__()
+        if not 0 < discount <= 1:
+            raise ValueError(f"discount={discount} must be above 0 and at most 1.")
+        if members < 1:
+            raise ValueError(f"members={members} must be at least 1.")
+        self.discount, self.hidden = float(discount), check_hidden(hidden)
+        self.features = StateFeatures(scene, canonicalizer)
+        self.members = nn.ModuleList(LayerNormMLP(self.features.size, 1, self.hidden) for _ in range(members))
+        self.normalizer = Normalizer(1)
+
+    @property
+    def scene(self) -> Scene:
+        return self.features.scene
+
+    @property
+    def fitted(self) -> bool:
+        """Whether it has learned from data. Waits for the device."""
+        return self.normalizer.fitted
+
+    def forward(self, state: Tensor) -> Tensor:
+        """Values ``[*B, 1]`` of states ``[*B, N, 13]``, in their dtype; ValueError for another shape."""
+        weight = next(self.members.parameters())
+        return self.of_features(self.features(state, weight.dtype)).to(state.dtype)
+
+    def of_features(self, features: Tensor) -> Tensor:
+        """Values ``[*B, 1]`` of features ``[*B, F]``."""
+        return self.normalizer.inverse(self.normalized(features).amin(-1, keepdim=True))
+
+    def normalized(self, features: Tensor) -> Tensor:
+        """Every network's value ``[*B, members]``, in standard deviations from the mean."""
+        return torch.cat([member(features) for member in self.members], dim=-1)
+
+    def description(self) -> dict[str, Any]:
+        """JSON-able values from which :meth:`from_description` rebuilds the network."""
+        own = {"discount": self.discount, "hidden": self.hidden, "members": len(self.members)}
+        return {**self.features.description(), **own}
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> StateValue:
+        """Build the network of a :meth:`description`, with fresh weights."""
+        return cls(**StateFeatures.arguments_from(description))

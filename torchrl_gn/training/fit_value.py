@@ -1,0 +1,211 @@
+"""Learn a value of states, and a policy that imitates, from played episodes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.objectives.value import TDLambdaEstimator
+
+from torchrl_gn.finite import require_finite
+from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.training.optimizers import make_optimizer
+
+Episodes = TensorDictBase | Sequence[TensorDictBase]
+
+
+@dataclass
+class ImitationHistory:
+    """Course of :func:`fit_policy`."""
+
+    losses: list[float] = field(
+        default_factory=list
+    )  # mean squared error of scaled actions, of each tenth of the steps
+
+
+@dataclass
+class ValueHistory:
+    """Course of :func:`fit_value`."""
+
+    losses: list[float] = field(default_factory=list)  # mean squared error of each iteration, relative to the variance
+    explained: float = math.nan  # share of the last targets' variance that the value explains
+
+
+def fit_value(
+    value: StateValue,
+    episodes: Episodes,
+    *,
+    lmbda: float = 0.95,
+    iterations: int = 30,
+    steps: int = 100,
+    batch_size: int = 256,
+    lr: float = 3e-3,
+    seed: int = 0,
+) -> ValueHistory:
+    r"""Learn the value of the policy that played some episodes, in place, by fitted iterations of TD(:math:`\lambda`).
+
+    Every iteration computes targets with the value as it is (``TDLambdaEstimator``), then fits the networks to them.
+    Episodes that end by a time limit, or by the end of the data, continue with the value of their last state; only
+    where they ``terminated`` nothing follows. A new value's normalisers are fitted first; its first targets continue
+    with the mean reward for ever.
+
+    Args:
+        episodes: ``[M, T]``, as ``env.rollout`` and collectors give them, or several such of different ``T``: ``state``
+            ``[M, T, N, 13]``, ``("next", "state")``, ``("next", "reward")`` ``[M, T, 1]`` and, if any episode ends
+            within, ``("next", "done")`` and ``("next", "terminated")``. Rewards are learned as they are: of unstable
+            steps see :class:`~torchrl_gn.envs.SceneEnv`.
+        lmbda: :math:`\lambda` of the targets: 0 looks one step ahead, 1 to the end of the episode.
+        iterations: number of targets.
+        steps: optimiser steps on each.
+        lr: peak learning rate of Adam, cosine to 0.
+        seed: of the batches. Weights are made before, with torch's global generator.
+
+    Raises:
+        ValueError: an option is out of range, an entry is missing or misshapen, or it has NaN or Inf.
+        FloatingPointError: the gradient is not finite; no weight changes at that step.
+    """
+    if not 0 <= lmbda <= 1:
+        raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
+    _check_counts(iterations=iterations, steps=steps, batch_size=batch_size)
+    given = _as_list(episodes)
+    keys = ("state", ("next", "state"), ("next", "reward"))
+    device = value.normalizer.mean.device
+    parts = [_require(part, index, keys).to(device) for index, part in enumerate(given)]
+    value.features.fit(torch.cat([part["state"].flatten(0, 1) for part in parts]))
+    parts = [_transitions(value, part) for part in parts]
+    features = torch.cat([part["features"].flatten(0, 1) for part in parts])
+    network = TensorDictModule(value.of_features, ["features"], ["state_value"])
+    estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
+    optimizer = make_optimizer(value.members, "adam", lr=lr)
+    generator = torch.Generator(features.device).manual_seed(seed)
+    history = ValueHistory()
+    targets = torch.empty(0)
+    for iteration in range(iterations):
+        targets = _targets(value, estimator, parts)
+        if not value.fitted:
+            value.normalizer.update(targets)
+        normalized, losses = value.normalizer(targets), []
+        for step in range(steps):
+            batch = torch.randint(len(features), (batch_size,), generator=generator, device=features.device)
+            loss = (value.normalized(features[batch]) - normalized[batch]).square().mean()
+            done = iteration * steps + step
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step(done, done / (iterations * steps))
+            losses.append(loss.detach())
+        history.losses.append(float(torch.stack(losses).mean()))
+    with torch.no_grad():
+        left = (targets - value.of_features(features)).var() / targets.var()
+    history.explained = 1 - float(left)
+    return history
+
+
+def fit_policy(
+    policy: StatePolicy,
+    episodes: Episodes,
+    *,
+    steps: int = 3000,
+    batch_size: int = 256,
+    lr: float = 1e-3,
+    seed: int = 0,
+) -> ImitationHistory:
+    """Teach a policy, in place, to act as in played episodes (behaviour cloning).
+
+    Args:
+        episodes: ``[M, T]`` or several such: ``state`` ``[M, T, N, 13]`` and ``action`` ``[M, T, A]``.
+        steps, batch_size, lr, seed: as of :func:`fit_value`.
+
+    Raises:
+        ValueError: an option is out of range, an entry is missing or misshapen, or it has NaN or Inf.
+        FloatingPointError: the gradient is not finite; no weight changes at that step.
+    """
+    _check_counts(steps=steps, batch_size=batch_size)
+    given, device = enumerate(_as_list(episodes)), policy.middle.device
+    parts = [_require(part, index, ("state", "action")).to(device) for index, part in given]
+    state, action = (torch.cat([part[key].flatten(0, 1) for part in parts]) for key in ("state", "action"))
+    if action.shape[1:] != policy.middle.shape:
+        raise ValueError(f"The episodes' actions must be [M, T, {len(policy.middle)}], got {list(action.shape)}.")
+    policy.features.fit(state)
+    features = policy.features(state, next(policy.network.parameters()).dtype)
+    varied = policy.half_range > 0
+    scaled = torch.where(varied, (action - policy.middle) / policy.half_range, 0.0).to(features.dtype)
+    optimizer = make_optimizer(policy.network, "adam", lr=lr)
+    generator = torch.Generator(features.device).manual_seed(seed)
+    history, recent = ImitationHistory(), []
+    for step in range(steps):
+        batch = torch.randint(len(features), (batch_size,), generator=generator, device=features.device)
+        loss = (policy.scaled(features[batch]) - scaled[batch]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step(step, step / steps)
+        recent.append(loss.detach())
+        if 10 * (step + 1) // steps > 10 * step // steps:
+            history.losses.append(float(torch.stack(recent).mean()))
+            recent.clear()
+    return history
+
+
+def _check_counts(**counts: int) -> None:
+    for name, count in counts.items():
+        if count < 1 or count != int(count):
+            raise ValueError(f"{name}={count} must be a whole number of at least 1.")
+
+
+def _as_list(episodes: Episodes) -> list[TensorDictBase]:
+    parts = [episodes] if isinstance(episodes, TensorDictBase) else list(episodes)
+    if not parts or not all(part.numel() for part in parts):
+        raise ValueError("There are no played episodes to learn from.")
+    return parts
+
+
+def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
+    """Entries of episodes ``[M, T]`` that are there and finite."""
+    if part.ndim != 2:
+        raise ValueError(f"Episodes must be TensorDicts [M, T], number {index} is {list(part.shape)}.")
+    found = {}
+    for key in keys:
+        if (entry := part.get(key, None)) is None:
+            raise ValueError(f"Episodes number {index} have no entry {key!r}.")
+        require_finite(entry, f"{key!r} of episodes number {index}")
+        found[key] = entry
+    flags = {key: part.get(key, None) for key in (("next", "done"), ("next", "terminated"))}
+    return TensorDict({**found, **{key: flag for key, flag in flags.items() if flag is not None}}, part.shape)
+
+
+def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
+    """Features, rewards and ends of steps ``[M, T]``, as the estimator reads them."""
+    dtype = next(value.members.parameters()).dtype
+    reward = part["next", "reward"]
+    if reward.shape != (*part.shape, 1):
+        raise ValueError(f"The episodes' rewards must be {[*part.shape, 1]}, got {list(reward.shape)}.")
+    terminated = part.get(("next", "terminated"), None)
+    terminated = torch.zeros_like(reward, dtype=torch.bool) if terminated is None else terminated
+    done = part.get(("next", "done"), None)
+    done = terminated.clone() if done is None else done | terminated
+    done[:, -1] = True  # the data end
+    with torch.no_grad():
+        states = part["state"], part["next", "state"]
+        here, there = (value.features(state, dtype) for state in states)
+    after = {"features": there, "reward": reward.to(dtype), "done": done, "terminated": terminated}
+    return TensorDict({"features": here, "next": after}, part.shape)
+
+
+@torch.no_grad()
+def _targets(value: StateValue, estimator: TDLambdaEstimator, parts: Sequence[TensorDict]) -> Tensor:
+    """Targets ``[steps, 1]`` of all steps."""
+    forever = None
+    if not value.fitted:
+        rewards = torch.cat([part["next", "reward"].flatten() for part in parts])
+        forever = float(rewards.mean()) / (1 - value.discount) if value.discount < 1 else 0.0
+    found = []
+    for part in parts:
+        next_value = None if forever is None else torch.full_like(part["next", "reward"], forever)
+        target = estimator.value_estimate(part.clone(), next_value=next_value)
+        found.append(cast(Tensor, target).flatten(0, 1))
+    return torch.cat(found)
