@@ -22,8 +22,9 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, with_help
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import fresh_errors, summary
-from torchrl_gn.policies import Agent
+from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, save_checkpoint
 
@@ -49,8 +50,8 @@ def main(cfg: DictConfig) -> None:
     own, file = loaded.scenes(), Path(cfg.file)
     half = loaded.trained.half()
     model, how = copy.deepcopy(half).float(), {key: cfg[key] for key in ("sequences", "length", "seed")}
-    if isinstance(model, Agent):
-        raise ValueError(f"{cfg.checkpoint} holds an agent; only models that predict states can be published.")
+    if not isinstance(model, (ForwardModel, IdentifyingModel)):
+        raise ValueError(f"{cfg.checkpoint} holds no model that predicts states; only those can be published.")
     scenes = tqdm([*own, *map(load_scene, as_list(cfg.also))], desc="evaluating", leave=False)
     tables = {scene.name: fresh_errors(model, scene, **how) for scene in scenes}
     errors = {name: {key: error.total for key, error in table.errors.items()} for name, table in tables.items()}

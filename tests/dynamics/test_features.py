@@ -10,11 +10,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import BodyState, Controls, Feature, ForwardModel, JointAxes, specialize
 from torchrl_gn.dynamics.features import FEATURES, StepInputs
 from torchrl_gn.dynamics.normalization import dynamic_graph
-from torchrl_gn.networks import CORES, Core, Graph, GraphSize
-from torchrl_gn.scenes import ParameterNames
+from torchrl_gn.networks import CORES, Core, GNCore, Graph, GraphSize
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.scenes import ParameterNames, load_scene
 
 from ..sizes import SMALL
 
@@ -113,3 +115,27 @@ def test_unknown_names_are_refused():
         ForwardModel.from_description({**description, "features": [{"feature": "smell"}]})
     with pytest.raises(ValueError, match="core='gone' is not known"):
         ForwardModel.from_description({**description, "core": "gone"})
+
+
+def test_features_and_cores_that_do_not_fit_are_named(monkeypatch):
+    scene = load_scene("pendulum")
+    data = collect_trajectories(scene, 2, steps=5, seed=0)
+    batch = trajectory_buffer(data, batch_size=8, seed=0).sample()
+
+    class Wide(GNCore):
+        def __init__(self, dynamic, static, out_nodes, **options):
+            super().__init__(dynamic, static, out_nodes + 1, **options)
+
+    with pytest.raises(ValueError, match="No feature is of edges"):
+        ForwardModel.for_scene(scene, features=(BodyState(),), hidden=8)
+    with monkeypatch.context() as patch:
+        patch.setattr(BodyState, "size", lambda self, layout: 1)
+        loss = ForwardModelLoss(ForwardModel.for_scene(scene, hidden=8).bind(scene))
+        with pytest.raises(ValueError, match=r"Features of nodes give \d+ numbers, but their size\(\) says"):
+            loss.fit_normalizers(batch)
+    monkeypatch.setitem(CORES, "wide", Wide)
+    model = ForwardModel.for_scene(scene, core="wide", hidden=8)
+    loss = ForwardModelLoss(model.bind(scene))
+    loss.fit_normalizers(batch)
+    with pytest.raises(ValueError, match="The core must give 12 features per node, not 13"):
+        model.bind(scene, reference=True).step(data["state"][:, 0], data["action"][:, 0])

@@ -254,3 +254,15 @@ def test_a_failing_write_leaves_the_old_file(saved, make_model, scene, monkeypat
         save_checkpoint(saved, make_model(1), scene=scene)
     assert saved.read_bytes() == content
     assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_a_predictor_is_saved_with_its_scene(tmp_path, trained, scene):
+    save_checkpoint(tmp_path / "bound.safetensors", trained.model.bind(scene))
+    loaded = load_pretrained(tmp_path / "bound.safetensors")
+    assert same(dict(loaded.model.state_dict()), dict(trained.model.state_dict()))
+    assert loaded.scene().fingerprint() == scene.fingerprint()
+
+
+def test_what_a_checkpoint_cannot_hold_is_refused(tmp_path, trained):
+    with pytest.raises(TypeError, match="cannot hold a GNCore; give one of Predictor, ForwardModel"):
+        save_checkpoint(tmp_path / "core.safetensors", trained.model.core)

@@ -93,6 +93,8 @@ class ForwardModel(nn.Module):
         self.core_name, self.core_options = core, core_options
 
         def count(part: str) -> int:
+            if not any(feature.part == part for feature in self.features):
+                raise ValueError(f"No feature is of {part}: the network needs some of nodes and some of edges.")
             return sum(feature.size(layout) for feature in self.features if feature.part == part)
 
         self.dynamic_size = GraphSize(count("nodes"), count("edges"), 0)

@@ -116,6 +116,9 @@ def update_dynamic_normalizers(
             require_finite(value, what)
     model, movable, program = predictor.model, predictor.movable, predictor.program(parameters, reference=True)
     nodes, edges = eager.features(program, eager.canonical_state(program, state, action), action)
+    for part, given in (("nodes", nodes), ("edges", edges)):
+        if given.shape[-1] != (size := getattr(model.dynamic_size, part)):
+            raise ValueError(f"Features of {part} give {given.shape[-1]} numbers, but their size() says {size}.")
     model.node_normalizer.update(nodes)
     model.edge_normalizer.update(edges)
     model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)

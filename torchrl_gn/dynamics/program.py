@@ -68,6 +68,8 @@ class OutputScaling(NamedTuple):
         """Residual ``[*B, N, 12]`` in ``dtype``."""
         if self.runs is None:
             assert self.std is not None
+            if predicted.shape[-1] != len(self.std):
+                raise ValueError(f"The core must give {len(self.std)} features per node, not {predicted.shape[-1]}.")
             return (predicted * self.std.to(predicted.dtype) + self.mean.to(predicted.dtype)).to(dtype)
         predicted = predicted.to(dtype)
         constant = self.mean.to(dtype).expand(*predicted.shape[:-1], -1)

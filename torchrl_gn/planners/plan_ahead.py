@@ -10,6 +10,7 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, TensorDictPrimer
@@ -69,7 +70,8 @@ class PlanAhead(TensorDictModuleBase):
         if background and isinstance(planner.env, SceneEnv):
             planner = copy.deepcopy(planner)  # the caller may step the same simulator meanwhile
         self.planner, self.delay, self.background = planner, delay, background
-        self.in_keys, self.out_keys = planner.in_keys, [*planner.out_keys, KEY]
+        self.in_keys: list[NestedKey] = list(planner.in_keys)
+        self.out_keys: list[NestedKey] = [*planner.out_keys, KEY]
         self.late = 0
         self._thread: ThreadPoolExecutor | None = None
         self._coming: list[Future] = []  # plans in the order of the steps that they are for
@@ -84,7 +86,7 @@ class PlanAhead(TensorDictModuleBase):
             "planned": Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=spec.device),
         }
         primer = TensorDictPrimer({KEY: Composite(entries)}, default_value=0.0, expand_specs=True)
-        return Compose(*([] if own is None else [own()]), primer)
+        return Compose(*([primer] if own is None else [own(), primer]))  # pyright: ignore
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action that was committed for now, and commit another."""
@@ -100,7 +102,7 @@ class PlanAhead(TensorDictModuleBase):
             flat, rows = tensordict.reshape(-1), [planned.reshape(-1), ~planned.reshape(-1)]
             parts = [self._plan(cast(TensorDictBase, flat[at]), bool(planned.reshape(-1)[at].all())) for at in rows]
             order = torch.cat([at.nonzero().flatten() for at in rows]).argsort()
-            written = cast(TensorDictBase, torch.cat(parts)[order]).reshape(tensordict.shape)
+            written = cast(TensorDictBase, torch.cat(cast(Any, parts))[order]).reshape(tensordict.shape)
         tensordict.update(written)
         if isinstance(env := self.planner.env, ModelEnv) and env.carried_keys:
             with torch.no_grad():

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -116,7 +116,7 @@ def package_versions() -> dict[str, str]:
 
 def save_checkpoint(
     path: str | os.PathLike,
-    model: Trained,
+    model: Trained | Predictor,
     *,
     scene: Scene | Sequence[Scene] = (),
     config: Mapping[str, Any] | None = None,
@@ -126,19 +126,30 @@ def save_checkpoint(
     """Write a checkpoint, atomically and without pickle.
 
     Args:
-        scene: the scene, or scenes, it is trained on; none of an agent, a value or a policy,
-            which hold their own.
+        model: weights, or a predictor that holds them.
+        scene: the scene, or scenes, it is trained on; default: a predictor's own, else none. Agents, values and
+            policies hold their own.
         config: configuration of the run; like ``metrics``, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
+
+    Raises:
+        TypeError: if no checkpoint can hold the model.
     """
+    scenes = list(scene) if isinstance(scene, Sequence) else [scene]
+    if isinstance(model, Predictor):
+        model, scenes = model.model, scenes or [model.scene]
+    kind = next((name for name, kind in KINDS.items() if isinstance(model, kind)), None)
+    if kind is None:
+        kinds = ", ".join(cast(type, each).__name__ for each in (Predictor, *KINDS.values()))
+        raise TypeError(f"A checkpoint cannot hold a {type(model).__name__}; give one of {kinds}.")
     tensors: dict[str, Tensor] = {}
     plain = _flatten(training or {}, "training", tensors)
     tensors |= {f"model.{name}": value for name, value in model.state_dict().items()}
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     description = {
-        "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind)),
+        "kind": kind,
         "model": model.description(),
-        "scenes": [each.description() for each in (scene if isinstance(scene, Sequence) else [scene])],
+        "scenes": [each.description() for each in scenes],
         "config": dict(config or {}),
         "versions": package_versions(),
         "metrics": dict(metrics or {}),

@@ -139,7 +139,10 @@ def test_an_angle_that_turns_over_does_not_jump():
         ({"velocity": None}, r"lacks \['velocity'\]; it has .* names="),
         ({"length": np.array([30, 49])}, "adds up to 79 rows, but there are 80"),
         ({"velocity": np.zeros((79, 2))}, "do not fit"),
-        ({"load": np.zeros((80, 3))}, "'load' has 3 columns, not a multiple of the 2 joints"),
+        (
+            {"load": np.zeros((80, 3))},
+            "'load' has 3 columns, not a multiple of the 2 joints; name it angle, velocity, .* or leave it out",
+        ),
         ({"timestep": np.array(-1.0)}, "does not say its time step"),
         (
             {"time": np.arange(80) * 0.02},

@@ -177,7 +177,8 @@ def _extras(arrays: dict[str, np.ndarray], shape: tuple[int, int]) -> tuple[dict
         count, rest = divmod(values.shape[1], joints)
         if rest:
             wrong = f"{name!r} has {values.shape[1]} columns, not a multiple of the {joints} joints"
-            raise ValueError(f'{wrong}; leave it out with names={{{name!r}: ""}}.')
+            read = "angle, velocity, command, length, episode, time or timestep"
+            raise ValueError(f'{wrong}; name it {read}, or leave it out with names={{{name!r}: ""}}.')
         for index in range(count):
             extra[name if count == 1 else f"{name}{index}"] = values[:, index::count].astype(np.float64)
     return extra, unread
