@@ -122,7 +122,7 @@ def save_checkpoint(
         model, scenes = model.model, scenes or [model.scene]
     kind = next((name for name, kind in KINDS.items() if isinstance(model, kind)), None)
     if kind is None:
-        kinds = ", ".join(each.__name__ for each in (Predictor, *KINDS.values()))
+        kinds = "Predictor, " + ", ".join(each.__name__ for each in KINDS.values())
         raise TypeError(f"A checkpoint cannot hold a {type(model).__name__}; give one of {kinds}.")
     tensors: dict[str, Tensor] = {}
     plain = _flatten(training or {}, "training", tensors)
