@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -140,7 +140,7 @@ def save_checkpoint(
         model, scenes = model.model, scenes or [model.scene]
     kind = next((name for name, kind in KINDS.items() if isinstance(model, kind)), None)
     if kind is None:
-        kinds = "Predictor, " + ", ".join(each.__name__ for each in KINDS.values())
+        kinds = ", ".join(cast(type, each).__name__ for each in (Predictor, *KINDS.values()))
         raise TypeError(f"A checkpoint cannot hold a {type(model).__name__}; give one of {kinds}.")
     tensors: dict[str, Tensor] = {}
     plain = _flatten(training or {}, "training", tensors)
