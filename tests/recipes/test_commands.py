@@ -86,8 +86,11 @@ def test_commands_are_understood(page, tmp_path, monkeypatch, capsys):
                 if program == "torchrl-gn":
                     main(words)
                 elif program != "ray":
-                    place = next(index for index, word in enumerate(words) if word.startswith("recipes/"))
-                    check_options(Path(words[place]).stem, words[place + 1 :])
+                    place = next((index for index, word in enumerate(words) if word.startswith("recipes/")), None)
+                    if place is None:
+                        assert (ROOT / words[0]).is_file(), words
+                    else:
+                        check_options(Path(words[place]).stem, words[place + 1 :])
 
 
 @pytest.mark.parametrize(
