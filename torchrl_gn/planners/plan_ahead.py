@@ -18,6 +18,7 @@ from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
+from torchrl_gn.planners.plan import KEY as PLAN
 from torchrl_gn.planners.plan import check_count
 
 KEY = "ahead"
@@ -124,8 +125,8 @@ class PlanAhead(TensorDictModuleBase):
         """Entries to write: the first of ``actions``, the planner's own and the rest of the actions."""
         planned = torch.ones(*future.shape, 1, dtype=torch.bool, device=actions.device)
         ahead = TensorDict({"actions": actions[..., 1:, :], "planned": planned}, batch_size=future.shape)
-        entries: dict[Any, Any] = {key: future[key] for key in ("plan",) if key in future.keys()}
-        return TensorDict({**entries, "action": actions[..., 0, :], KEY: ahead}, batch_size=future.shape)
+        entries = TensorDict({"action": actions[..., 0, :], KEY: ahead}, batch_size=future.shape)
+        return entries.update(future.select(PLAN, strict=False))
 
     def _begin(self, tensordict: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         """The first actions ``[*B, delay, A]``, and the state after them."""
@@ -171,7 +172,7 @@ class PlanAhead(TensorDictModuleBase):
                 # In the thread, where the plans before this one are finished.
                 actions = torch.stack([now, *(each.result()[0] for each in before)], dim=-2)
                 plan = before[-1].result()[1] if before else first.result()[1]
-                return self._after(known.update(plan.select("plan", strict=False)), actions)
+                return self._after(known.update(plan.select(PLAN, strict=False)), actions)
 
             self._submit(ahead, before)
         ones = torch.ones(*tensordict.shape, 1, dtype=torch.bool, device=now.device)
