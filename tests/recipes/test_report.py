@@ -66,7 +66,8 @@ def finished(tmp_path) -> Path:
     run = tmp_path / "first"
     run.mkdir()
     (run / "config.yaml").write_text(
-        "# A run of evaluate\nseed: 3\nrun_dir: /some/first\ncheckpoint: /some/model\nlength: 100\ntraining: [lr=1e-3]\n"
+        "# A run of evaluate\nseed: 3\nrun_dir: /some/first\ncheckpoint: /some/model\nlength: 100\n"
+        "training: [lr=1e-3]\n"
     )
     (run / "metrics.json").write_text(json.dumps(METRICS))
     return run
