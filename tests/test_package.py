@@ -48,7 +48,7 @@ PUBLIC = {
     "envs": ["ModelEnv", "SceneEnv"],
     "evaluation": ["evaluate_errors", "rollout_video"],
     "identification": ["IdentifyingModel"],
-    "objectives": ["ForwardModelLoss", "IdentificationLoss", "SVGLoss"],
+    "objectives": ["ForwardModelLoss", "IdentificationLoss", "SHACLoss", "SVGLoss"],
     "planners": ["GradientPlanner", "ILQGPlanner", "PlanAhead"],
     "rewards": ["make_reward"],
     "scenes": ["load_scene"],
