@@ -47,7 +47,12 @@ class StateFeatures(Float64Buffers):
     def fit(self, state: Tensor) -> None:
         """Fit the normaliser to states ``[*B, N, 13]``, unless it has seen some; ValueError if one is not finite."""
         if not self.normalizer.fitted:
-            self.normalizer.update(self._encoded(state))
+            self.update(state)
+
+    @torch.no_grad()
+    def update(self, state: Tensor) -> None:
+        """Add states ``[*B, N, 13]`` to the normaliser; ValueError if one is not finite."""
+        self.normalizer.update(self._encoded(state))
 
     def forward(self, state: Tensor, dtype: torch.dtype | None = None) -> Tensor:
         """Features ``[*B, F]`` of states ``[*B, N, 13]``; differentiable."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,19 +10,25 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.planners.state_features import StateFeatures, check_hidden
 from torchrl_gn.scenes import Scene
 
+_LOG_STD, _LOG_STD_BOUNDS = -1.0, (-5.0, 1.0)  # at first, and where it may get
+
 
 class StatePolicy(TensorDictModuleBase):
-    """Deterministic action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]``.
+    """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]``.
 
     A network over the scene's :class:`~torchrl_gn.planners.StateFeatures`, learned from a planner's episodes by
-    :func:`~torchrl_gn.training.fit_policy`; a planner's ``proposal``. Differentiable.
+    :func:`~torchrl_gn.training.fit_policy` or through a model by :class:`~torchrl_gn.objectives.SHACLoss`; also
+    a planner's ``proposal``. Differentiable. Explores, with TorchRL's exploration type RANDOM, by noise before the
+    tanh that bounds its actions, of one learned standard deviation for each.
 
     Raises:
         ValueError: the scene has no actions, or some without bounds.
@@ -50,6 +57,7 @@ class StatePolicy(TensorDictModuleBase):
         low, high = torch.as_tensor(scene.action_low), torch.as_tensor(scene.action_high)
         self.register_buffer("middle", ((low + high) / 2).float(), persistent=False)
         self.register_buffer("half_range", ((high - low) / 2).float(), persistent=False)
+        self.log_std = nn.Parameter(torch.full((scene.num_actions,), _LOG_STD))
 
     @property
     def scene(self) -> Scene:
@@ -61,12 +69,24 @@ class StatePolicy(TensorDictModuleBase):
         return self.features.normalizer.fitted
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("action", self.act(tensordict["state"]))
+        explores, state = exploration_type() == ExplorationType.RANDOM, tensordict["state"]
+        return tensordict.set("action", self.sample(state)[0] if explores else self.act(state))
 
     def act(self, state: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in states ``[*B, N, 13]``; ValueError for another shape."""
         features = self.features(state, next(self.network.parameters()).dtype)
         return self.middle + self.half_range * self.scaled(features)
+
+    def sample(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Random actions ``[*B, A]``, reparameterised, and the log densities ``[*B]`` of their scaled ones."""
+        features = self.features(state, next(self.network.parameters()).dtype)
+        std = self.log_std.clamp(*_LOG_STD_BOUNDS).exp()
+        noise = torch.randn_like(before := self.network(features))
+        before = before + std * noise
+        # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)), which does not cancel.
+        slope = 2 * (math.log(2) - before - softplus(-2 * before))
+        density = -0.5 * (noise.square() + math.log(2 * math.pi)) - std.log() - slope
+        return self.middle + self.half_range * before.tanh(), density.sum(-1)
 
     def scaled(self, features: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in units of half their range, -1 to 1, of features ``[*B, F]``."""

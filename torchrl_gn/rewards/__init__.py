@@ -8,6 +8,8 @@ from torchrl_gn.rewards.imitate_pose import ImitatePose as ImitatePose
 from torchrl_gn.rewards.imitate_pose import arm_reach as arm_reach
 from torchrl_gn.rewards.reward import FreezeGoal as FreezeGoal
 from torchrl_gn.rewards.reward import Reward as Reward
+from torchrl_gn.rewards.suite import Run as Run
+from torchrl_gn.rewards.suite import RunUpright as RunUpright
 from torchrl_gn.rewards.tasks import REWARD_TYPES as REWARD_TYPES
 from torchrl_gn.rewards.tasks import AngularSpeed as AngularSpeed
 from torchrl_gn.rewards.tasks import Balance as Balance

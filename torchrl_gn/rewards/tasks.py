@@ -17,6 +17,7 @@ from torchrl_gn.rewards.bodies import Bodies, require_bodies
 from torchrl_gn.rewards.distance import REACHED, Distance
 from torchrl_gn.rewards.imitate_pose import ImitatePose
 from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.rewards.suite import Run, RunUpright
 from torchrl_gn.rewards.weighted_sum import rewards_from_options
 from torchrl_gn.scenes.scene import Scene
 
@@ -210,8 +211,10 @@ _REWARDS: dict[tuple[str, str], Callable[[Scene], Reward]] = {
     ("cheetah", "forward"): lambda scene: Velocity(scene, "torso", "x"),
     ("cheetah", "height"): lambda scene: Position(scene, "torso", "z"),
     ("cheetah", "vertical_speed"): lambda scene: Velocity(scene, "torso", "z", power=2),
+    ("cheetah", "run"): lambda scene: Run(scene, "torso"),
     ("cheetah", "spin"): lambda scene: AngularSpeed(scene, "torso"),
     ("walker2d", "forward"): lambda scene: Velocity(scene, "torso", "x"),
+    ("walker2d", "run"): lambda scene: RunUpright(scene, "torso"),
     ("walker2d", "height"): lambda scene: Position(scene, "torso", "z"),
     ("walker2d", "inverse_verticality"): lambda scene: Balance(scene, _WALKER_UPRIGHT),
     ("walker2d", "feet_to_head"): lambda scene: VerticalDistance(scene, _WALKER_FEET, "torso"),
@@ -231,6 +234,8 @@ REWARD_TYPES: dict[str, type[Reward]] = {
         ImitatePose,
         Position,
         Reach,
+        Run,
+        RunUpright,
         Upright,
         Velocity,
         VerticalDistance,

@@ -1,0 +1,164 @@
+"""The short-horizon actor-critic against its definition, and learning in a pretrained model."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
+
+from torchrl_gn.dynamics import specialize
+from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.objectives import SHACLoss
+from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.rewards import make_reward
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import load_pretrained
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_pretrained("pendulum").model
+
+
+@pytest.fixture(scope="module")
+def starts(scenes) -> Tensor:
+    return SceneEnv(scenes["pendulum"], seed=0).reset(TensorDict(batch_size=[32]))["state"]
+
+
+def make_loss(model, scene, starts: Tensor, *, native: bool = True, **options) -> SHACLoss:
+    torch.manual_seed(0)
+    bound = model.bind(scene)
+    env = ModelEnv(specialize(bound) if native else bound, make_reward("balance", scene))
+    policy, value = StatePolicy(scene, hidden=(16,)), StateValue(scene, discount=0.9, hidden=(16,))
+    loss = SHACLoss(policy, value, env, **options)
+    spread = starts + 0.3 * torch.randn(starts.shape, dtype=starts.dtype)
+    loss.fit_normalizers(spread, -3 * torch.rand(100, 1))
+    return loss
+
+
+def test_losses_are_those_of_the_definition(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts, steps=4, lmbda=0.7)
+    torch.manual_seed(1)
+    out = loss(TensorDict({"state": starts}, [32]))
+    torch.manual_seed(1)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        start = loss.env.reset(TensorDict({"state": starts}, [32]), set_state=True)
+        played = loss.env.rollout(4, loss.policy, tensordict=start, auto_reset=False)
+        reward, value = played["next", "reward"], loss.value
+        total = sum(0.9**k * reward[:, k] for k in range(4)) + 0.9**4 * value(played["next", "state"][:, -1])
+        wanted = -(total / value.normalizer.std).mean() - loss.log_alpha.exp() * out["entropy"]
+        torch.testing.assert_close(out["loss_actor"].detach().double(), wanted.double(), rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(out["reward"], reward.mean())
+        target, targets = value(played["next", "state"][:, -1]), []
+        for k in reversed(range(4)):
+            after = value(played["next", "state"][:, k])
+            target = reward[:, k] + 0.9 * (after if k == 3 else 0.3 * after + 0.7 * target)
+            targets.append(value.normalizer(target.float()))
+        judged = value.normalized(value.features(played["state"], torch.float32))
+        error = (judged - torch.stack(targets[::-1], 1)).square().mean()
+        torch.testing.assert_close(out["loss_value"].detach(), error, rtol=1e-4, atol=1e-6)
+
+
+def test_the_gradient_is_the_plain_models(model, scenes, starts):
+    found = []
+    for native in (True, False):
+        loss = make_loss(model, scenes["pendulum"], starts, native=native, steps=5)
+        torch.manual_seed(1)
+        loss(TensorDict({"state": starts}, [32]))["loss_actor"].backward()
+        found.append([weight.grad.clone() for weight in loss.policy.parameters()])
+    assert all(bool((gradient != 0).any()) for gradient in found[0])
+    for native, plain in zip(*found, strict=True):
+        torch.testing.assert_close(native, plain, rtol=1e-3, atol=1e-5)
+
+
+def test_each_loss_reaches_its_own_weights(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts, native=False, steps=3)
+    weights = {"actor": loss.policy, "value": loss.value.members, "alpha": nn.ParameterList([loss.log_alpha])}
+    assert {id(weight) for weight in loss.parameters()} == {id(w) for of in weights.values() for w in of.parameters()}
+    for name in weights:
+        loss.zero_grad()
+        loss(TensorDict({"state": starts}, [32]))[f"loss_{name}"].backward()
+        for other, network in weights.items():
+            reached = [weight.grad is not None and bool((weight.grad != 0).any()) for weight in network.parameters()]
+            assert all(reached) if other == name else not any(reached), (name, other)
+    assert all(weight.grad is None for weight in model.parameters())
+
+
+class Diverging(nn.Module):
+    """A model that overflows for every second sample."""
+
+    in_keys, out_keys = ["state", "action"], [("next", "state")]
+
+    def __init__(self, scene) -> None:
+        super().__init__()
+        self.scene = scene
+
+    def forward(self, tensordict):
+        state, action = tensordict["state"], tensordict["action"]
+        factor = torch.where(torch.arange(len(state)) % 2 == 0, 1.0, math.inf)[:, None, None]
+        return tensordict.set(("next", "state"), state + 1e-3 * factor * action.double().sum(-1)[:, None, None])
+
+
+def test_what_diverges_ends_and_spoils_nothing(scenes, starts):
+    scene = scenes["pendulum"]
+    torch.manual_seed(0)
+    policy, value = StatePolicy(scene, hidden=(16,)), StateValue(scene, discount=0.9, hidden=(16,))
+    env = ModelEnv(Diverging(scene), make_reward("balance", scene), unstable_reward=-5.0)
+    loss = SHACLoss(policy, value, env, steps=3)
+    loss.fit_normalizers(starts + torch.randn(starts.shape, dtype=starts.dtype), -torch.rand(100, 1))
+    out = loss(TensorDict({"state": starts}, [32]))
+    (out["loss_actor"] + out["loss_value"]).backward()
+    gradients = [weight.grad for weight in loss.parameters() if weight.grad is not None]
+    assert gradients and all(bool(gradient.isfinite().all()) for gradient in gradients)
+    assert any(bool((weight.grad != 0).any()) for weight in policy.network.parameters())
+
+
+def test_a_policy_learns_to_swing(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts, steps=16)
+    adam = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    rewards = []
+    for _ in range(60):
+        out = loss(TensorDict({"state": starts}, [32]))
+        adam.zero_grad()
+        (out["loss_actor"] + out["loss_value"] + out["loss_alpha"]).backward()
+        adam.step()
+        rewards.append(float(out["reward"]))
+    assert sum(rewards[-5:]) / 5 > sum(rewards[:5]) / 5 + 0.02
+
+
+def test_samples_have_the_density_of_a_bounded_normal(scenes, starts):
+    policy = StatePolicy(scenes["pendulum"], hidden=(16,))
+    policy.features.fit(starts + torch.randn(starts.shape, dtype=starts.dtype))
+    action, density = policy.sample(starts)
+    before = policy.network(policy.features(starts, torch.float32))
+    normal = TanhNormal(before, policy.log_std.exp(), upscale=1.0, tanh_loc=False)
+    scaled = (action - policy.middle) / policy.half_range
+    torch.testing.assert_close(density, normal.log_prob(scaled), rtol=1e-3, atol=1e-3)
+    now = TensorDict({"state": starts}, [32])
+    with set_exploration_type(ExplorationType.RANDOM):
+        assert not torch.equal(policy(now.copy())["action"], policy(now.copy())["action"])
+    assert torch.equal(policy(now.copy())["action"], policy.act(starts))
+
+
+def test_refuses_what_does_not_fit(model, scenes, starts):
+    scene = scenes["pendulum"]
+    loss = make_loss(model, scene, starts)
+    with pytest.raises(ValueError, match="steps=0 must be"):
+        SHACLoss(loss.policy, loss.value, loss.env, steps=0)
+    with pytest.raises(ValueError, match=r"lmbda=2\.0 must be"):
+        SHACLoss(loss.policy, loss.value, loss.env, lmbda=2.0)
+    with pytest.raises(ValueError, match="leave its terminal= out"):
+        SHACLoss(loss.policy, loss.value, ModelEnv(loss.env.world_model, loss.env.reward, terminal=loss.value))
+    with pytest.raises(ValueError, match="StatePolicy is of scene 'cartpole'"):
+        SHACLoss(StatePolicy(load_scene("cartpole")), loss.value, loss.env)
+    with pytest.raises(RuntimeError, match="call fit_normalizers first"):
+        SHACLoss(StatePolicy(scene), loss.value, loss.env)(TensorDict({"state": starts}, [32]))
+    with pytest.raises(KeyError, match="needs 'state'"):
+        loss(TensorDict({"observation": starts}, [32]))
+    with pytest.raises(ValueError, match="'state' of the batch"):
+        loss(TensorDict({"state": starts * math.nan}, [32]))

@@ -1,0 +1,71 @@
+"""Policies by a short-horizon actor-critic, round by round and resumed."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from torchrl_gn.training import load_pretrained
+
+SMALL = (
+    "system=pendulum",
+    "reward=balance",
+    "timestep=null",
+    "first.trajectories=4",
+    "first.length=50",
+    "first.steps=5",
+)
+SMALL += ("updates=3", "batch_size=8", "horizon=3", "hidden=[8]", "episodes=2", "steps=50", "model_steps=3")
+SMALL += ("model={hidden:8,latent:8}", "evaluate={episodes:2,steps:20}")
+
+
+def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    for folder, rounds in ((whole, 3), (resumed, 1), (resumed, 3)):
+        code, output, errors = call(*SMALL, f"rounds={rounds}", f"run_dir={folder}", recipe="shac")
+        assert code == 0 and "warning" not in errors.lower(), errors
+        assert str(folder / "policy.safetensors") in output and str(folder / "curve.png") in output
+    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (whole, resumed)]
+    for name in ("reward", "return", "frames", "error", "entropy", "loss_value"):
+        assert metrics[0][name] == metrics[1][name]
+    assert abs(metrics[0]["return"] - 20 * metrics[0]["reward"]) < 1e-4 and metrics[0]["imagined_reward"] < 0
+    assert metrics[0]["frames"] == 4 * 50 + 3 * 2 * 50
+    first, second = (load_file(folder / "policy.safetensors") for folder in (whole, resumed))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    one = load_file(whole / "rounds/000/policy.safetensors")
+    assert any(not torch.equal(one[name], first[name]) for name in first if name.startswith("model.network"))
+
+    # The networks are what the planning recipe takes.
+    assert load_pretrained(whole).model is not None
+    given = (f"checkpoint={whole}", f"policy={whole}", f"value={whole / 'value.safetensors'}")
+    planning = ("horizon=2", "steps=2", "episodes=2", "video=false", "gn.warm_up=1", "gn.samples=3", "gn.iterations=1")
+    code, _, errors = call("system=pendulum", *given, *planning, f"run_dir={tmp_path / 'mpc'}", recipe="mpc")
+    assert code == 0, errors
+
+
+def test_a_round_that_was_cut_short_is_done_again(tmp_path, call):
+    call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
+    before = json.loads((tmp_path / "metrics.json").read_text())
+    (tmp_path / "rounds/001/numbers.json").unlink()  # what is written last
+    code, _, errors = call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
+    assert code == 0, errors
+    assert json.loads((tmp_path / "metrics.json").read_text())["reward"] == before["reward"]
+
+
+def test_refuses_other_options_and_targets(tmp_path, call):
+    call(*SMALL, "rounds=1", f"run_dir={tmp_path}", recipe="shac")
+    code, _, errors = call(*SMALL, "updates=4", f"run_dir={tmp_path}", recipe="shac")
+    assert code == 1 and "updates=4 (was 3)" in errors
+    code, _, errors = call("system=swimmer3", "reward=reach", "timestep=null", recipe="shac")
+    assert code == 1 and "does not know the target" in errors
+    code, _, errors = call(*SMALL, "steps=70", f"run_dir={tmp_path / 'x'}", recipe="shac")
+    assert code == 1 and "steps=70" in errors
+
+
+@pytest.mark.parametrize("option", ["rounds=0", "policy_lr=-1", "horizon=0"])
+def test_checks_options_before_data_are_collected(option, tmp_path, call):
+    code, _, errors = call(*SMALL, option, f"run_dir={tmp_path / 'x'}", recipe="shac")
+    assert code == 1 and option.partition("=")[0] in errors and not (tmp_path / "x/rounds").exists()

@@ -1,0 +1,152 @@
+"""A short-horizon actor-critic: the policy's gradient through a learned model, with a value at the end."""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.objectives import LossModule
+from torchrl.objectives.value import TDLambdaEstimator
+
+from torchrl_gn.envs import ModelEnv
+from torchrl_gn.networks.frozen_weights import frozen
+from torchrl_gn.objectives.checks import read_entries
+from torchrl_gn.planners import StatePolicy, StateValue
+
+
+class SHACLoss(LossModule):
+    r"""Losses of a short-horizon actor-critic (SHAC, Xu et al. 2022) through a learned model.
+
+    From states of played episodes the policy acts for ``H`` steps in the model. It maximises
+
+    .. math::
+        \mathbb{E}\Big[\sum_{k=0}^{H-1} \gamma^k r_k + \gamma^H V(s_H)\Big] + \alpha \mathcal{H}(\pi),
+        \quad a_k \sim \pi(\cdot | s_k), \quad s_{k+1} = g(s_k, a_k)
+
+    with reparameterised actions, differentiated through model, reward and value: the paper's SVG(:math:`H`), on states
+    and with V instead of Q. The value regresses on TD(:math:`\lambda`) targets of the same imagined steps. The weight
+    :math:`\alpha` is learned, so that the entropy of actions, in units of half their range, stays at
+    ``target_entropy`` (as in SAC). Where the model diverges the episode ends.
+
+    Reads ``state`` ``[B, N, 13]``. Writes ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to
+    weights of its own; and ``reward``, the mean of imagined steps, and ``entropy``.
+
+    Args:
+        policy: its network and standard deviations are learned.
+        value: gives the discount :math:`\gamma`.
+        env: imagines the steps. No gradient reaches its model's weights.
+        steps: ``H``.
+        lmbda: :math:`\lambda` of the value's targets.
+        target_entropy: default: minus one for every component of an action.
+
+    Raises:
+        ValueError: an option is out of range, or policy, value and environment do not fit together.
+    """
+
+    def __init__(
+        self,
+        policy: StatePolicy,
+        value: StateValue,
+        env: ModelEnv,
+        *,
+        steps: int = 16,
+        lmbda: float = 0.95,
+        target_entropy: float | None = None,
+    ) -> None:
+        super().__init__()
+        if steps < 1 or steps != int(steps):
+            raise ValueError(f"steps={steps} must be a whole number of at least 1.")
+        if not 0 <= lmbda <= 1:
+            raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
+        if env.terminal is not None:
+            raise ValueError(f"{env} adds a value to its rewards: leave its terminal= out, this loss has value=.")
+        for network in (policy, value):
+            if network.scene.node_names != env.scene.node_names:
+                raise ValueError(
+                    f"{type(network).__name__} is of scene {network.scene.name!r}, not {env.scene.name!r}."
+                )
+        self.policy, self.value, self.steps = policy, value, int(steps)
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
+        self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
+        # Not registered, so that the model's weights stay out of parameters().
+        object.__setattr__(self, "env", env)
+        network = TensorDictModule(value.of_features, ["features"], ["state_value"])
+        estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
+        object.__setattr__(self, "_estimator", estimator)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        (state,) = read_entries(self, tensordict, ["state"])
+        if not (self.policy.fitted and self.value.fitted):
+            raise RuntimeError("Normalisers of policy or value have seen no data: call fit_normalizers first.")
+        imagined, entropy = self._imagine(state)
+        final = imagined["next", "state"][:, -1]
+        with frozen(self.value):
+            last = self.value(final)
+        reward, ended = imagined["next", "reward"], imagined["next", "terminated"]
+        alive = 1 - torch.cat((torch.zeros_like(ended[:, :1]), ended), 1).to(reward.dtype).cummax(1).values
+        discount = self.value.discount ** torch.arange(self.steps + 1, dtype=reward.dtype, device=reward.device)
+        weight = alive * discount.unsqueeze(-1)
+        total = (weight[:, :-1] * reward).sum(1) + weight[:, -1] * last.to(reward.dtype)
+        alpha, scale = self.log_alpha.exp(), self.value.normalizer.std.to(reward.dtype)
+        return TensorDict(
+            {
+                "loss_actor": -(total / scale).mean() - alpha.detach() * entropy,
+                "loss_value": self._value_loss(imagined, alive[:, :-1]),
+                "loss_alpha": alpha * (entropy.detach() - self.target_entropy),
+                "reward": reward.detach().mean(),
+                "entropy": entropy.detach(),
+            }
+        )
+
+    def fit_normalizers(self, state: Tensor, reward: Tensor | None = None) -> None:
+        """Add states ``[*B, N, 13]`` to the normalisers; scale a new value by rewards ``[*B, 1]`` that never end."""
+        for network in (self.policy, self.value):
+            network.features.update(state)
+        if reward is not None and not self.value.fitted:
+            self.value.normalizer.update(reward / max(1 - self.value.discount, 1e-3))
+
+    def _imagine(self, state: Tensor) -> tuple[TensorDict, Tensor]:
+        """Steps ``[B, H]`` of the policy in the model, and the mean entropy of its actions."""
+        now = self.env.reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
+        steps, entropies = [], []
+        with frozen(self.env.world_model), set_exploration_type(ExplorationType.RANDOM):
+            for _ in range(self.steps):
+                if (state := cast(Tensor, now["state"])).requires_grad:
+                    state.register_hook(_finite_rows)
+                action, log_prob = self.policy.sample(state)
+                action.register_hook(_finite_rows)
+                entropies.append(-log_prob)
+                now = self.env.step(now.set("action", action))
+                steps.append(now.select("state", ("next", "state"), ("next", "reward"), ("next", "terminated")))
+                now = step_mdp(now, exclude_done=True)
+        return cast(TensorDict, torch.stack(steps, 1)), torch.stack(entropies).mean()
+
+    def _value_loss(self, imagined: TensorDict, alive: Tensor) -> Tensor:
+        """Squared error of the value on its targets, in variances of its normaliser."""
+        dtype = next(self.value.members.parameters()).dtype
+        with torch.no_grad():
+            here, there = (
+                self.value.features(state, dtype) for state in (imagined["state"], imagined["next", "state"])
+            )
+            done = imagined["next", "terminated"].clone()
+            done[:, -1] = True  # imagination ends
+            after = {
+                "features": there,
+                "reward": imagined["next", "reward"].to(dtype),
+                "terminated": imagined["next", "terminated"],
+                "done": done,
+            }
+            batch = TensorDict({"features": here, "next": after}, imagined.shape)
+            targets = self.value.normalizer(cast(Tensor, self._estimator.value_estimate(batch)))
+        return (alive * (self.value.normalized(here) - targets).square()).mean()
+
+
+def _finite_rows(gradient: Tensor) -> Tensor:
+    """The gradient ``[B, ...]`` without those samples that it overflowed for: one must not spoil a whole batch."""
+    finite = gradient.flatten(1).isfinite().all(1)
+    return gradient.where(finite.view(-1, *[1] * (gradient.ndim - 1)), 0.0)
