@@ -7,8 +7,9 @@
 Every claim has a JSON file: what is claimed, the verdict, tables, commands, seeds, machine and text. A cell of a table
 is a string; a number of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, or the
 sum of a list of them, that may be multiplied ("times": 1000) and divided ("over": another metric); or a list of cells,
-shown with slashes between. Text quotes numbers that the claim's "values" name, as {NAME}. `check=true` writes nothing
-and fails if a page differs from what its data give.
+shown with slashes between. Text quotes numbers that the claim's "values" name, as {NAME}. "figure" draws numbers of a
+table (recipes/_common/report_figures.py) into docs/images/results. `check=true` writes nothing and fails if a page or
+figure differs from what its data give.
 
 `add=` puts the metrics of a finished run, with its command, date, processor and versions, beside the claim `to` as
 CLAIM.NAME.metrics.json, named `as` (default: the run folder's name), and prints the names of its metrics. No figure of
@@ -24,6 +25,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from _common import clean_exit, with_help
 from _common.report_data import add_run, read_run, recipe_of
+from _common.report_drawing import draw_figure
+from _common.report_figures import read_figures, stale_figures
 from _common.report_pages import make_pages
 
 REPORT = Path(__file__).parents[1] / "docs" / "results"
@@ -44,14 +47,20 @@ def main(cfg: DictConfig) -> None:
         print("\n".join(read_run(data, file.name)["metrics"]))
         print(file)
         return
-    pages = make_pages(data)
+    pages, figures, images = make_pages(data), read_figures(data), report.parent / "images" / "results"
     there = {file.name: file.read_text() for file in report.glob("*.md")}
     changed = sorted(name for name in pages.keys() | there.keys() if pages.get(name) != there.get(name))
-    if cfg.check and changed:
-        raise ValueError(f"{changed} of {report} differ from the data; run python recipes/report.py and commit them.")
+    stale = stale_figures(figures, images)
+    if cfg.check and changed + stale:
+        files = f"{changed + stale} of {report} and {images}"
+        raise ValueError(f"{files} differ from the data; run python recipes/report.py and commit them.")
     for name in changed:
         file = report / name
         file.write_text(pages[name]) if name in pages else file.unlink()
+        print(file)
+    for name in stale:
+        file = images / name
+        draw_figure(figures[file.stem], file) if file.stem in figures else file.unlink()
         print(file)
 
 

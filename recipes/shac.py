@@ -112,12 +112,12 @@ class ActorCritic:
         """Train the model on all data, then policy and value in it."""
         cfg, first = self.cfg, index == 0
         steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
-        fit(self.model, cast(TensorDict, torch.cat(data)), steps=steps, lr=lr, seed=cfg.seed + index)
+        fit(self.model, cast(TensorDict, torch.cat(cast(Any, data))), steps=steps, lr=lr, seed=cfg.seed + index)
         newest = data[-1]["state"]
         rewards = None
         if first:
             before, after = newest[:, :-1], newest[:, 1:]
-            rewards = self.loss.env.reward(before, data[-1]["action"], after, None).flatten(0, 1)
+            rewards = cast(Any, self.loss.env.reward)(before, data[-1]["action"], after, None).flatten(0, 1)
         self.loss.fit_normalizers(newest.flatten(0, 1), rewards)
         states = torch.cat([part["state"][:, :-1].flatten(0, 1) for part in data])
         sizes = {"updates": cfg.updates, "batch_size": cfg.batch_size}
@@ -175,6 +175,7 @@ def main(cfg: DictConfig) -> None:
     reward = reward_of(cfg, scene)
     if reward.target_shape is not None:
         raise ValueError(f"A policy of states does not know the target of {reward}.")
+    judge = reward if cfg.judged_reward is None else reward_of(cfg, scene, "judged_reward")
     run = RunFolder(cfg.run_dir, "shac")
     refuse_other_options(cfg, run, MAY_CHANGE)
     tracker = open_log(cfg, run, label=f"shac-{scene.name}")
@@ -195,7 +196,7 @@ def main(cfg: DictConfig) -> None:
             played = played_windows(play(env, learner.policy, episodes=cfg.episodes, steps=cfg.steps, explore=True))
             seconds = time.perf_counter() - began
             error = error_of(learner.model, played) if len(played) else math.nan
-            judged = play(SceneEnv(scene, reward, seed=10_000), learner.policy, **cfg.evaluate, explore=False)
+            judged = play(SceneEnv(scene, judge, seed=10_000), learner.policy, **cfg.evaluate, explore=False)
             rewards = judged["next", "reward"].squeeze(-1)
             before = (
                 rounds[-1] if rounds else {"frames": first["action"][..., 0].numel() * scene.substeps, "minutes": 0.0}

@@ -22,7 +22,7 @@ PACKAGE = Path(torchrl_gn.__file__).parent
 # A folder imports from itself and from those before it: the data flow is the reading order.
 ORDER = (
     "scenes", "data", "maths", "networks", "dynamics", "identification", "policies", "rewards",
-    "objectives", "drawing", "envs", "planners", "evaluation", "training",
+    "drawing", "envs", "planners", "objectives", "evaluation", "training",
 )  # fmt: skip
 # Earlier folders that a folder does not import either.
 APART = {
@@ -32,8 +32,8 @@ APART = {
     "identification": {"data"},
     "policies": {"data", "dynamics", "identification"},
     "rewards": {"data", "networks", "dynamics", "identification", "policies"},
-    "objectives": {"data", "rewards"},
-    "drawing": {"data", "networks", "dynamics", "identification", "policies", "rewards", "objectives"},
+    "drawing": {"data", "networks", "dynamics", "identification", "policies", "rewards"},
+    "objectives": {"data", "rewards", "drawing"},
 }
 ALLOWED = {folder: {*ORDER[:index], folder} - APART.get(folder, set()) for index, folder in enumerate(ORDER)}
 ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders, which import none of them
@@ -48,7 +48,7 @@ PUBLIC = {
     "envs": ["ModelEnv", "SceneEnv"],
     "evaluation": ["evaluate_errors", "rollout_video"],
     "identification": ["IdentifyingModel"],
-    "objectives": ["ForwardModelLoss", "IdentificationLoss", "SVGLoss"],
+    "objectives": ["ForwardModelLoss", "IdentificationLoss", "SHACLoss", "SVGLoss"],
     "planners": ["GradientPlanner", "ILQGPlanner", "PlanAhead"],
     "rewards": ["make_reward"],
     "scenes": ["load_scene"],

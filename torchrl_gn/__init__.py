@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from torchrl_gn.identification import IdentifyingModel as IdentifyingModel
     from torchrl_gn.objectives import ForwardModelLoss as ForwardModelLoss
     from torchrl_gn.objectives import IdentificationLoss as IdentificationLoss
+    from torchrl_gn.objectives import SHACLoss as SHACLoss
     from torchrl_gn.objectives import SVGLoss as SVGLoss
     from torchrl_gn.planners import GradientPlanner as GradientPlanner
     from torchrl_gn.planners import ILQGPlanner as ILQGPlanner
@@ -49,7 +50,7 @@ _FOLDERS = {
     "envs": ("ModelEnv", "SceneEnv"),
     "evaluation": ("evaluate_errors", "rollout_video"),
     "identification": ("IdentifyingModel",),
-    "objectives": ("ForwardModelLoss", "IdentificationLoss", "SVGLoss"),
+    "objectives": ("ForwardModelLoss", "IdentificationLoss", "SHACLoss", "SVGLoss"),
     "planners": ("GradientPlanner", "ILQGPlanner", "PlanAhead"),
     "rewards": ("make_reward",),
     "scenes": ("load_scene",),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -80,6 +80,6 @@ def windows(state: Tensor, action: Tensor) -> TensorDict:
 
 def played_windows(played: TensorDict) -> TensorDict:
     """Trajectories of :func:`play` without steps from where the simulation became unstable."""
-    alive = ~played["next", "terminated"].flatten(1).any(1)
+    alive = ~cast(Tensor, played["next", "terminated"]).flatten(1).any(1)
     state = torch.cat((played["state"], played["next", "state"][:, -1:]), 1)
     return windows(state[alive], played["action"][alive])

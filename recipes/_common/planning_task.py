@@ -113,10 +113,10 @@ def load_policy(cfg: DictConfig, scene: Scene) -> StatePolicy | None:
     return policy
 
 
-def reward_of(cfg: DictConfig, scene: Scene) -> Reward:
+def reward_of(cfg: DictConfig, scene: Scene, key: str = "reward") -> Reward:
     """The task's reward, by name or of terms."""
-    named = isinstance(cfg.reward, str)
-    return make_reward(cfg.reward if named else cast(Any, OmegaConf.to_container(cfg.reward)), scene)
+    named = isinstance(cfg[key], str)
+    return make_reward(cfg[key] if named else cast(Any, OmegaConf.to_container(cfg[key])), scene)
 
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:

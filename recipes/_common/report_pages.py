@@ -62,8 +62,11 @@ def _claim_page(name: str, claim: Mapping[str, Any], data: Path) -> str:
     parts = [f"# {claim['title']}", claim["claim"], f"**Verdict: {claim['verdict']}.**{qualified}"]
     for figure in claim.get("figures", ()):
         parts.append(f"![{figure['caption']}](../images/{figure['file']})")
+    if "figure" in claim:
+        alt = _filled(claim["figure"]["alt"], claim, data)
+        parts.append(f"![{alt}](../images/results/{name}.png)")
     for table in claim["tables"]:
-        rows = [[_shown(cell, data) for cell in row] for row in table["rows"]]
+        rows = [[shown(cell, data) for cell in row] for row in table["rows"]]
         parts += [_filled(table["title"], claim, data), _table(table["columns"], rows)]
     if "command" in claim:
         parts.append("```sh\n" + "\n".join(claim["command"]) + "\n```")
@@ -96,10 +99,10 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _shown(cell: Any, data: Path) -> str:
+def shown(cell: Any, data: Path) -> str:
     """A cell's text: of a string itself, of ``{"metric", "of", "format"}`` a run's number, of a list its parts."""
     if isinstance(cell, list):
-        return " / ".join(_shown(each, data) for each in cell)
+        return " / ".join(shown(each, data) for each in cell)
     return _number(cell, data) if isinstance(cell, Mapping) else str(cell)
 
 
@@ -118,7 +121,7 @@ def _number(cell: Mapping[str, Any], data: Path) -> str:
 def _filled(text: str, claim: Mapping[str, Any], data: Path) -> str:
     """Text with each ``{name}`` of the claim's ``values`` in place of its number."""
     values = claim.get("values", {})
-    return re.sub(r"\{(\w+)\}", lambda match: _shown(values[match[1]], data), text)
+    return re.sub(r"\{(\w+)\}", lambda match: shown(values[match[1]], data), text)
 
 
 def _source(claim: Mapping[str, Any]) -> str:

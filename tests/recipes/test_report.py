@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
 from _common.report_data import add_run, read_run
+from _common.report_drawing import draw_figure
+from _common.report_figures import numbers, read_figures, stale_figures
 from _common.report_pages import make_pages
 
 from .conftest import ROOT
@@ -21,6 +24,7 @@ CLAIM = {
     "verdict": "holds",
     "headline": "{best} of 1",
     "values": {"best": {"metric": "error", "of": "errors.first.metrics.json", "format": ".1e"}},
+    "figure": {"kind": "dots", "row": "{model}", "y": ["ms"], "axis": "ms", "alt": "The best of {best}"},
     "tables": [
         {
             "title": "Errors and milliseconds.",
@@ -82,6 +86,18 @@ def test_committed_pages_are_those_of_their_data():
     assert pages == {file.name: file.read_text() for file in REPORT.glob("*.md")}
 
 
+def test_committed_figures_are_those_of_their_data():
+    assert stale_figures(read_figures(REPORT / "data"), REPORT.parent / "images" / "results") == []
+
+
+def test_every_claim_has_a_picture():
+    pages = {file.stem: file.read_text() for file in REPORT.glob("*.md")}
+    without = {name for name, text in pages.items() if "](../images/" not in text}
+    assert without == {"README", "tried-and-dropped"}
+    pictures = list((REPORT.parent / "images" / "results").iterdir())
+    assert max(file.stat().st_size for file in pictures) <= 40_000
+
+
 def test_a_run_is_added_with_its_command_and_versions(report, finished):
     file = add_run(report / "data", finished, "errors", {"seed": 0, "run_dir": None, "checkpoint": None, "length": 100})
     added = read_run(report / "data", file.name)
@@ -100,6 +116,7 @@ def test_tables_quote_runs(report, finished):
     add_run(report / "data", finished, "errors", {})
     pages = make_pages(report / "data")
     assert "| GN | **1.2e-3** / diverges | 1,250 | 1016.3 |" in pages["errors.md"]
+    assert "![The best of 1.2e-3](../images/results/errors.png)" in pages["errors.md"]
     assert "- The best is 1.2e-3." in pages["errors.md"]
     assert "Source: [first](data/errors.first.metrics.json), transcribed, May 2026." in pages["errors.md"]
     assert "| *errors are low* | holds | 1.2e-3 of 1 | [Errors](errors.md) |" in pages["README.md"]
@@ -131,12 +148,127 @@ def test_every_claim_is_in_the_index(report):
         make_pages(report / "data")
 
 
+@pytest.mark.parametrize(
+    ("cell", "expected"),
+    [
+        ("**3.02**", [3.02]),
+        ("1.4e-3 / 11 / 8.6", [1.4e-3, 11, 8.6]),
+        ("42.8 (40.0 to 44.2)", [42.8, 40, 44.2]),
+        ("5.7e-3 ± 4e-4", [5.7e-3, 4e-4]),
+        ("46,879", [46879]),
+        ("9.2e-3, 7.6e-3,1,200", [9.2e-3, 7.6e-3, 1200]),
+        ("0.117-0.121", [0.117, 0.121]),
+        ("-1.39, -0.0016 (0.0010)", [-1.39, -0.0016, 0.001]),
+        ("**1e-06** `17 %`", [1e-6, 17]),
+        ("step, batch 2,000 of H2O in m²", [2000]),
+        ("3e-4 / diverges", [3e-4, float("inf")]),
+        ("not run", []),
+        ("", []),
+    ],
+)
+def test_numbers_of_a_cell(cell, expected):
+    assert numbers(cell) == expected
+
+
+TABLE = {
+    "title": "",
+    "columns": ["model, seed", "steps", "reward", "best"],
+    "rows": [
+        ["`GN`, 0", "1", "**2** (0.5)", "4"],
+        ["`GN`, 1", "1", "3 (0.25)", "4"],
+        ["MLP, 0", "10", "1 (1)", "2"],
+        ["MLP, 1", "", "", "2"],
+    ],
+}
+FIGURE = {"kind": "dots", "row": "{model, seed}", "y": ["reward"], "axis": "reward", "alt": "Rewards"}
+
+
+def panels_of(report, **options):
+    write(report / "data", "errors", CLAIM | {"tables": [TABLE], "values": {}, "headline": "", "figure": options})
+    return read_figures(report / "data")["errors"].panels
+
+
+def test_figures_take_the_numbers_that_they_name(report):
+    spread = {"column": "reward", "spread": 1, "name": "m/s"}
+    points = panels_of(report, **FIGURE | {"y": [spread], "until": ","})
+    assert points == {"": {"GN": {"m/s": [(2, 0.5), (3, 0.25)]}, "MLP": {"m/s": [(1, 1)]}}}
+    everything = {"column": 2, "take": "all"}
+    points = panels_of(report, **FIGURE | {"y": [everything], "rows": [0], "transpose": True})
+    assert points == {"": {"reward": {"GN, 0": [(2, 0), (0.5, 0)]}}}
+    points = panels_of(report, **FIGURE | {"between": ["steps", "best"], "rows": [1], "panel": "{best}"})
+    assert points == {"4": {"GN, 1": {"reward": [(66.666667, 0)]}}}
+    points = panels_of(report, **FIGURE | {"y": [{"column": "reward", "spread": "best"}], "rows": [2]})
+    assert points == {"": {"MLP, 0": {"reward": [(1, 2)]}}}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "pie"}, "kind='pie' must be one of"),
+        ({"colour": "red"}, r"unknown options \['colour'\]"),
+        ({"alt": ""}, "must say what is seen"),
+        ({"y": ["speed"]}, "speed"),
+        ({"y": ["model, seed"], "rows": [2], "row": "{best}", "labels": ["a", "b"]}, "zip"),
+        ({"y": [{"column": "best", "take": 1}]}, "index out of range"),
+    ],
+)
+def test_bad_figures_are_refused(report, change, message):
+    with pytest.raises(ValueError, match=f"errors.json, figure: .*{message}"):
+        panels_of(report, **FIGURE | change)
+
+
+def test_what_diverged_is_not_drawn(report):
+    table = TABLE | {"rows": [["GN", "1", "diverges", "2"]]}
+    write(report / "data", "errors", CLAIM | {"tables": [table], "figure": FIGURE})
+    with pytest.raises(ValueError, match="'diverges' has no number to draw; leave its row out"):
+        read_figures(report / "data")
+
+
+LINES = {"kind": "lines", "row": "{steps}", "rows": [0, 1, 2], "y": ["reward", "best"], "along": "steps", "log": True}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"kind": "bars", "until": ",", "ours": ["GN"], "at": 2.5},
+        {"y": ["reward", "best"], "log": True},
+        {"panel": "{best}", "transpose": True, "from": 0},
+        LINES,
+    ],
+    ids=["bars", "dots", "panels", "lines"],
+)
+def test_figures_are_stale_without_being_drawn_again(report, monkeypatch, options):
+    panels_of(report, **FIGURE | options)
+    images, figures = report / "images", read_figures(report / "data")
+    assert stale_figures(figures, images) == ["errors.png"]
+    draw_figure(figures["errors"], images / "errors.png")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # as if it were not installed
+    assert stale_figures(figures, images) == []
+    (images / "old.png").write_bytes((images / "errors.png").read_bytes())
+    assert stale_figures(figures, images) == ["old.png"]
+    (images / "old.png").unlink()
+    panels_of(report, **FIGURE | options | {"axis": "return"})
+    assert stale_figures(read_figures(report / "data"), images) == ["errors.png"]
+
+
+def test_numbers_that_change_make_a_figure_stale(report, finished):
+    file = add_run(report / "data", finished, "errors", {})
+    figure = read_figures(report / "data")["errors"]
+    draw_figure(figure, report / "images" / "errors.png")
+    added = read_run(report / "data", file.name)
+    added["metrics"]["seconds"] = 2
+    file.write_text(json.dumps(added))
+    assert stale_figures(read_figures(report / "data"), report / "images") == ["errors.png"]
+
+
 @pytest.mark.slow
 def test_recipe_adds_writes_and_checks(run, report, finished):
     folder = f"folder={report}"
     code, said, _ = run(f"add={finished}", "to=errors", folder, recipe="report")
     assert code == 0 and said.splitlines()[:2] == ["error", "far"]
     code, _, errors = run("check=true", folder, recipe="report")
-    assert code == 1 and "README.md" in errors
+    assert code == 1 and "README.md" in errors and "errors.png" in errors
     assert run(folder, recipe="report")[0] == 0
     assert run("check=true", folder, recipe="report")[0] == 0
+    (report.parent / "images" / "results" / "errors.png").unlink()
+    assert run("check=true", folder, recipe="report")[0] == 1

@@ -48,6 +48,9 @@ class SHACLoss(LossModule):
         ValueError: an option is out of range, or policy, value and environment do not fit together.
     """
 
+    env: ModelEnv
+    _estimator: TDLambdaEstimator
+
     def __init__(
         self,
         policy: StatePolicy,

@@ -43,9 +43,9 @@ class CenterOfMassVelocity(Float64Buffers):
 
     def forward(self, state: Tensor) -> Tensor:
         _, orientation = self.bodies.pose(state)
-        lever = quaternion.rotate(orientation, self.center.to(state.dtype))
+        offset = quaternion.rotate(orientation, self.center.to(state.dtype))
         velocity = self.bodies.linear_velocity(state)
-        velocity = velocity + torch.linalg.cross(self.bodies.angular_velocity(state), lever)
+        velocity = velocity + torch.linalg.cross(self.bodies.angular_velocity(state), offset)
         return (self.share.to(state.dtype).unsqueeze(-1) * velocity).sum(-2)
 
 

@@ -1,0 +1,169 @@
+"""Figures of the report, drawn of the numbers in a claim's own table.
+
+A claim's ``figure`` names what is drawn:
+
+- ``kind``: ``dots`` or ``bars`` along a horizontal axis, or ``lines``;
+- ``table`` (its index, default 0) and ``rows`` (their indices, default all);
+- ``row``: a row's label, in which ``{column}`` stands for a cell, cut at ``until``; or ``labels``, one a row. Rows of
+  the same label are drawn as one, a dot each;
+- ``y``: columns, by name or index, or ``{"column", "take", "spread", "name"}``: the number of a cell to draw (an index
+  or "all", default 0), the number or column that is its half-range, and the column's name in the figure;
+- ``panel``: a label as ``row`` is; rows of different panels are drawn on axes of their own;
+- ``between``: two columns; a number is drawn as its share of the way from the first to the second, in per cent;
+- ``transpose``: columns are drawn as rows, and rows as colours;
+- ``ours``: rows in colour among grey ones; ``log``; ``from``: where the axis of the numbers begins; ``at``: a dashed
+  line, a number or a claim's value;
+- ``axis``, ``along``: names, with units, of the axis of the numbers and of the horizontal axis of lines;
+- ``alt``: what is seen.
+
+A figure's file keeps a digest of this and of the numbers, so that whether it is up to date needs no drawing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from _common.report_data import read_claims
+from _common.report_pages import shown
+
+KINDS = ("dots", "bars", "lines")
+DIGEST = "Digest"  # key of the PNG's text
+_DRAWING = 1  # raise it when report_drawing.py changes: every figure is then drawn anew
+_KEYS = {"kind", "table", "rows", "row", "until", "labels", "y", "panel", "between", "transpose", "ours", "log", "at"}
+_KEYS |= {"from", "axis", "along", "alt"}
+_NUMBER = re.compile(r"(?<![\w.])-?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?", re.ASCII)
+
+Points = dict[str, dict[str, list[tuple[float, float]]]]  # (value, half-range), by row, by series
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """What a figure shows: its options and its points, by panel."""
+
+    options: Mapping[str, Any]
+    panels: Mapping[str, Points]
+
+    @property
+    def digest(self) -> str:
+        """Digest of all that is drawn."""
+        options = {key: value for key, value in self.options.items() if key != "alt"}
+        text = json.dumps([_DRAWING, options, self.panels], sort_keys=False)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def numbers(text: str) -> list[float]:
+    """Numbers of a cell in their order; infinity for "diverges".
+
+    >>> numbers("**42.8** (40.0 to 44.2)"), numbers("1.4e-3 / 11"), numbers("46,879, 3"), numbers("0.1-0.2")
+    ([42.8, 40.0, 44.2], [0.0014, 11.0], [46879.0, 3.0], [0.1, 0.2])
+    """
+    text = re.sub(r"[*`]", "", text).replace("diverges", "1e999")
+    return [float(match.replace(",", "")) for match in _NUMBER.findall(text)]
+
+
+def read_figures(data: Path) -> dict[str, ReportFigure]:
+    """Return the figures by the names of their claims.
+
+    Raises:
+        ValueError: naming the claim, if its figure asks for what its table does not hold.
+    """
+    figures = {}
+    for name, claim in read_claims(data).items():
+        if "figure" in claim:
+            try:
+                figures[name] = read_figure(claim, data)
+            except (KeyError, IndexError, ValueError) as error:
+                raise ValueError(f"{name}.json, figure: {error}") from error
+    return figures
+
+
+def read_figure(claim: Mapping[str, Any], data: Path) -> ReportFigure:
+    """Return a claim's figure.
+
+    Raises:
+        ValueError: if an option is unknown, or a cell lacks the number that is asked for or holds one that diverged.
+    """
+    options = claim["figure"]
+    if unknown := set(options) - _KEYS:
+        raise ValueError(f"unknown options {sorted(unknown)}; use some of {sorted(_KEYS)}.")
+    if options["kind"] not in KINDS:
+        raise ValueError(f"kind={options['kind']!r} must be one of {KINDS}.")
+    if not options["alt"] or not options["axis"]:
+        raise ValueError("alt and axis must say what is seen.")
+    table = claim["tables"][options.get("table", 0)]
+    columns = [_plain(column) for column in table["columns"]]
+    rows = [[_plain(shown(cell, data)) for cell in row] for row in table["rows"]]
+    chosen = options.get("rows", range(len(rows)))
+    labels = options.get("labels") or [_label(options["row"], columns, rows[at], options) for at in chosen]
+    panels: dict[str, Points] = {}
+    for label, row in zip(labels, [rows[at] for at in chosen], strict=True):
+        points = panels.setdefault(_label(options.get("panel", ""), columns, row), {})
+        for wanted in options["y"]:
+            wanted = wanted if isinstance(wanted, Mapping) else {"column": wanted}
+            column = _column(wanted["column"], columns)
+            found = _drawn(row[column], wanted)
+            if isinstance(beside := wanted.get("spread"), str):
+                found = [(value, numbers(row[_column(beside, columns)])[0]) for value, _ in found]
+            if "between" in options:
+                low, high = (numbers(row[_column(each, columns)])[0] for each in options["between"])
+                found = [(round(100 * (value - low) / (high - low), 6), 0.0) for value, _ in found]
+            keys = label, wanted.get("name", columns[column])
+            outer, inner = reversed(keys) if options.get("transpose") else keys
+            points.setdefault(outer, {}).setdefault(inner, []).extend(found)
+    if isinstance(at := options.get("at"), str):
+        options = {**options, "at": numbers(shown(claim["values"][at], data))[0]}
+    return ReportFigure(options, panels)
+
+
+def stale_figures(figures: Mapping[str, ReportFigure], folder: Path) -> list[str]:
+    """Names of the files of ``folder`` that are missing, not of these figures, or not of any."""
+    there = {file.name: text_of(file).get(DIGEST) for file in folder.glob("*.png")}
+    wanted = {f"{name}.png": figure.digest for name, figure in figures.items()}
+    return sorted(name for name in there.keys() | wanted.keys() if there.get(name) != wanted.get(name, ""))
+
+
+def text_of(file: Path) -> dict[str, str]:
+    """Text by key that a PNG keeps (its ``tEXt`` chunks)."""
+    content, at, texts = file.read_bytes(), 8, {}
+    while at + 8 <= len(content):
+        length, kind = struct.unpack(">I4s", content[at : at + 8])
+        if kind == b"tEXt":
+            key, _, text = content[at + 8 : at + 8 + length].partition(b"\0")
+            texts[key.decode("latin-1")] = text.decode("latin-1")
+        at += length + 12  # length, kind, checksum
+    return texts
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[*`]", "", text)
+
+
+def _column(wanted: str | int, columns: Sequence[str]) -> int:
+    return wanted if isinstance(wanted, int) else columns.index(wanted)
+
+
+def _label(template: str, columns: Sequence[str], row: Sequence[str], options: Mapping[str, Any] | None = None) -> str:
+    label = re.sub(r"\{([^}]+)\}", lambda match: row[columns.index(match[1])], template)
+    return label.partition(options["until"])[0] if options and "until" in options else label
+
+
+def _drawn(cell: str, wanted: Mapping[str, Any]) -> list[tuple[float, float]]:
+    """Numbers of a cell to draw, with their half-ranges; none of an empty cell."""
+    found = numbers(cell)
+    take = wanted.get("take", 0)
+    if not cell:
+        return []
+    if not found or not all(map(math.isfinite, found)):
+        raise ValueError(f"the cell {cell!r} has no number to draw; leave its row out.")
+    if take == "all":
+        return [(value, 0.0) for value in found]
+    spread = wanted.get("spread")
+    return [(found[take], found[spread] if isinstance(spread, int) and len(found) > spread else 0.0)]
