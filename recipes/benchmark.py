@@ -5,10 +5,11 @@
 Measures, on the same rollouts (starts and random controls as in the data sets), GN forward models of several sizes and
 MLPs, trained here for `minutes` each (or `checkpoints=[FOLDER,...]`) and evaluated by message passing (reference),
 specialised and, where this processor is fast at it, in bfloat16; and MuJoCo at its own and at coarser settings.
-Errors are against a finely stepped MuJoCo, relative to the persistence baseline, over equal simulated
-time. Run time is wall time per simulated second of one trajectory, on `threads` threads (`threads=[1,2]`: on each of
-these numbers), at every batch size: medians, all methods in turn. A method is on the Pareto front of a batch size and a
-number of threads if no other is both faster and more accurate.
+Errors are against a finely stepped MuJoCo, relative to the persistence baseline, over equal simulated time. Run time is
+wall time per simulated second of one trajectory, on `threads` threads (`threads=[1,2]`: on each of these numbers), at
+every batch size: medians, all methods in turn. A method is on the Pareto front of a batch size and a number of threads
+if no other is both faster and more accurate. With several threads leave out the reference
+(`ways=[specialised,bfloat16]`): torch's threads wait in a loop after it, and take the processor from the next method.
 
 Writes config.yaml, metrics.json, the figure work_precision.png (one for each number of threads, if there are several)
 and the trained models to its run folder; the same run_dir goes on where it was interrupted. Results:
