@@ -59,7 +59,7 @@ def test_refuses_other_options_and_targets(tmp_path, call):
     call(*SMALL, "rounds=1", f"run_dir={tmp_path}", recipe="shac")
     code, _, errors = call(*SMALL, "updates=4", f"run_dir={tmp_path}", recipe="shac")
     assert code == 1 and "updates=4 (was 3)" in errors
-    code, _, errors = call("system=swimmer3", "reward=reach", "judged_reward=null", "timestep=null", recipe="shac")
+    code, _, errors = call("system=swimmer3", "reward=reach", "timestep=null", recipe="shac")
     assert code == 1 and "does not know the target" in errors
     code, _, errors = call(*SMALL, "steps=70", f"run_dir={tmp_path / 'x'}", recipe="shac")
     assert code == 1 and "steps=70" in errors
