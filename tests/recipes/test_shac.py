@@ -33,6 +33,7 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
         assert metrics[0][name] == metrics[1][name]
     assert abs(metrics[0]["return"] - 20 * metrics[0]["reward"]) < 1e-4 and metrics[0]["imagined_reward"] < 0
     assert metrics[0]["frames"] == 4 * 50 + 3 * 2 * 50
+    assert metrics[0]["round 2/return"] == metrics[0]["return"]
     first, second = (load_file(folder / "policy.safetensors") for folder in (whole, resumed))
     assert all(torch.equal(first[name], second[name]) for name in first)
     one = load_file(whole / "rounds/000/policy.safetensors")
