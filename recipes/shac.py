@@ -156,7 +156,8 @@ def report(run: RunFolder, scene: Scene, rounds: list[dict[str, Any]], judged: T
     if judged is not None:
         rollout_video(scene, judged["state"][0], None, video)
     best = max(rounds, key=lambda numbers: numbers["reward"])
-    return {**rounds[-1], **{f"best_{name}": best[name] for name in ("reward", "return", "frames")}}
+    each = {f"round {index}/{name}": value for index, of in enumerate(rounds) for name, value in of.items()}
+    return {**rounds[-1], **{f"best_{name}": best[name] for name in ("reward", "return", "frames")}, **each}
 
 
 @with_help

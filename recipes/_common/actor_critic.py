@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_gn.envs import SceneEnv
+from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.objectives import SHACLoss
 from torchrl_gn.planners import StatePolicy
 from torchrl_gn.training.optimizers import clip_gradients
@@ -64,6 +65,7 @@ def play(env: SceneEnv, policy: StatePolicy, *, episodes: int, steps: int, explo
     """Episodes ``[M, T]`` in MuJoCo, from new starts."""
     kind = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
+        env = cast(SceneEnv, for_learning(env))
         start = env.reset(TensorDict(batch_size=[episodes]))
         return env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
 

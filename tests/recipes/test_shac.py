@@ -33,6 +33,7 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
         assert metrics[0][name] == metrics[1][name]
     assert abs(metrics[0]["return"] - 20 * metrics[0]["reward"]) < 1e-4 and metrics[0]["imagined_reward"] < 0
     assert metrics[0]["frames"] == 4 * 50 + 3 * 2 * 50
+    assert metrics[0]["round 2/return"] == metrics[0]["return"]
     first, second = (load_file(folder / "policy.safetensors") for folder in (whole, resumed))
     assert all(torch.equal(first[name], second[name]) for name in first)
     one = load_file(whole / "rounds/000/policy.safetensors")
@@ -59,7 +60,7 @@ def test_refuses_other_options_and_targets(tmp_path, call):
     call(*SMALL, "rounds=1", f"run_dir={tmp_path}", recipe="shac")
     code, _, errors = call(*SMALL, "updates=4", f"run_dir={tmp_path}", recipe="shac")
     assert code == 1 and "updates=4 (was 3)" in errors
-    code, _, errors = call("system=swimmer3", "reward=reach", "judged_reward=null", "timestep=null", recipe="shac")
+    code, _, errors = call("system=swimmer3", "reward=reach", "timestep=null", recipe="shac")
     assert code == 1 and "does not know the target" in errors
     code, _, errors = call(*SMALL, "steps=70", f"run_dir={tmp_path / 'x'}", recipe="shac")
     assert code == 1 and "steps=70" in errors

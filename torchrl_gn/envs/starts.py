@@ -91,6 +91,15 @@ def _reset_each(env: EnvBase, size: torch.Size, _: TensorDictBase | None, reset:
     return reset if reset.shape == size else env.reset(TensorDict(batch_size=size))
 
 
+def for_learning(env: EnvBase) -> EnvBase:
+    """The environment with the unstable reward that learners bear, a copy as the given one may plan."""
+    if not vars(env).get("spares_learners", False):
+        return env
+    env = copy.copy(env)
+    env.unstable_reward = None  # pyright: ignore[reportAttributeAccessIssue]
+    return env
+
+
 def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
     """Fix the number of environments ``batch_size`` of a stateless one, each with its own start state.
 
@@ -105,7 +114,5 @@ def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
     size = torch.Size(batch_size)
     if not size or min(size) < 1:
         raise ValueError(f"batch_size must be numbers of at least 1, got {list(size)}")
-    if vars(env).get("spares_learners", False):
-        env = copy.copy(env)  # the given one may plan
-        env.unstable_reward = None  # pyright: ignore[reportAttributeAccessIssue]
+    env = for_learning(env)
     return TransformedEnv(env, BatchSizeTransform(batch_size=size, reset_func=partial(_reset_each, env, size)))

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import TDLambdaEstimator
 
 from torchrl_gn.envs import ModelEnv
+from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.objectives.checks import read_entries
 from torchrl_gn.planners import StatePolicy, StateValue
@@ -31,7 +32,8 @@ class SHACLoss(LossModule):
     with reparameterised actions, differentiated through model, reward and value: the paper's SVG(:math:`H`), on states
     and with V instead of Q. The value regresses on TD(:math:`\lambda`) targets of the same imagined steps. The weight
     :math:`\alpha` is learned, so that the entropy of actions, in units of half their range, stays at
-    ``target_entropy`` (as in SAC). Where the model diverges the episode ends.
+    ``target_entropy`` (as in SAC). Where the model diverges the episode ends, at what it costs a
+    learner (:class:`~torchrl_gn.envs.SceneEnv`).
 
     Reads ``state`` ``[B, N, 13]``. Writes ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to
     weights of its own; and ``reward``, the mean of imagined steps, and ``entropy``.
@@ -77,7 +79,7 @@ class SHACLoss(LossModule):
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
         # Not registered, so that the model's weights stay out of parameters().
-        object.__setattr__(self, "env", env)
+        object.__setattr__(self, "env", for_learning(env))
         network = TensorDictModule(value.of_features, ["features"], ["state_value"])
         estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
         object.__setattr__(self, "_estimator", estimator)
