@@ -5,13 +5,15 @@
 Measures, on the same rollouts (starts and random controls as in the data sets), GN forward models of several sizes and
 MLPs, trained here for `minutes` each (or `checkpoints=[FOLDER,...]`) and evaluated by message passing (reference),
 specialised and, where this processor is fast at it, in bfloat16; and MuJoCo at its own and at coarser settings.
-Errors are against a finely stepped MuJoCo, relative to the persistence baseline, over equal simulated
-time. Run time is wall time per simulated second of one trajectory, on `threads` threads, at every batch size: medians,
-all methods in turn. A method is on the Pareto front of a batch size if no other is both faster and more accurate.
+Errors are against a finely stepped MuJoCo, relative to the persistence baseline, over equal simulated time. Run time is
+wall time per simulated second of one trajectory, on `threads` threads (`threads=[1,2]`: on each of these numbers), at
+every batch size: medians, all methods in turn. A method is on the Pareto front of a batch size and a number of threads
+if no other is both faster and more accurate. With several threads leave out the reference
+(`ways=[specialised,bfloat16]`): torch's threads wait in a loop after it, and take the processor from the next method.
 
-Writes config.yaml, metrics.json, the figure work_precision.png and the trained models to its run folder; the same
-run_dir goes on where it was interrupted. Results: docs/results/run-time-against-error.md; when a learned model is the
-right choice: docs/speed.md.
+Writes config.yaml, metrics.json, the figure work_precision.png (one for each number of threads, if there are several)
+and the trained models to its run folder; the same run_dir goes on where it was interrupted. Results:
+docs/results/run-time-against-error.md; when a learned model is the right choice: docs/speed.md.
 """
 
 from __future__ import annotations
@@ -19,8 +21,7 @@ from __future__ import annotations
 import contextlib
 import math
 import statistics
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -32,28 +33,35 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 from tqdm import tqdm
 
-from _common import clean_exit, finish_run, open_run, with_help
+from _common import as_list, clean_exit, finish_run, open_run, with_help
+from _common.options import check_options
+from _common.run_time_table import Method, report
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from _common.timing import time_in_turn
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
-from torchrl_gn.evaluation import plot_loglog, squared_errors
+from torchrl_gn.evaluation import squared_errors
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import product_speeds
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.systems import find_system
 from torchrl_gn.training import RunFolder, load_pretrained
 
+WAYS = ("reference", "specialised", "bfloat16")
 
-@dataclass
-class Method:
-    """A way to predict states ``[B, T + 1, N, 13]`` from physics states ``[B, S]``, states and controls."""
 
-    name: str
-    family: str
-    run: Callable[[Tensor, Tensor, Tensor], Tensor]
-    error: float = math.nan
-    seconds: dict[int, float] = field(default_factory=dict)
+def thread_counts(threads: object) -> list[int]:
+    """The numbers of threads, each once.
+
+    Raises:
+        ValueError: if there is none, or one is not 1 or more.
+    """
+    counts = list(dict.fromkeys(as_list(threads)))
+    if not counts:
+        raise ValueError("threads=[] must be one number or several.")
+    for count in counts:
+        check_options({"threads": count})
+    return counts
 
 
 def trained(cfg: DictConfig, run: RunFolder) -> list[str]:
@@ -63,7 +71,7 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[str]:
     variants = {f"gn_{size}": [f"model.hidden={size}"] for size in cfg.sizes}
     for hidden in cfg.mlps:
         variants[f"mlp_{len(hidden)}x{hidden[0]}"] = ["model.core=mlp", f"model.hidden={list(hidden)}"]
-    shared = [f"system={cfg.system}", f"data.folder={run.data}", f"seed={cfg.seed}", f"threads={cfg.threads}"]
+    shared = [f"system={cfg.system}", f"data.folder={run.data}", f"seed={cfg.seed}"]
     shared += ["steps=null", f"minutes={cfg.minutes}", "clock=processor", *cfg.training]
     runs = [Run(FORWARD_MODEL, run.path / "models" / name, (*shared, *sizes), name) for name, sizes in variants.items()]
     refuse_failures(run_all(runs, 1))
@@ -84,8 +92,8 @@ def predict(model: Predictor, fast: bool, physics: Tensor, state: Tensor, action
         return model.rollout(state, actions)[0]
 
 
-def learned(checkpoints: list[str], scene: Scene) -> list[Method]:
-    """Every trained model, evaluated in every way."""
+def learned(checkpoints: list[str], scene: Scene, wanted: Sequence[str]) -> list[Method]:
+    """Every trained model, evaluated in every way that is wanted and known to this processor."""
     methods = []
     for checkpoint in checkpoints:
         model = load_pretrained(checkpoint).model.requires_grad_(False)
@@ -95,7 +103,7 @@ def learned(checkpoints: list[str], scene: Scene) -> list[Method]:
         ways = {"reference": (model.bind(scene, reference=True), False), "specialised": (specialize(bound), True)}
         if product_speeds().pays(torch.bfloat16):
             ways["bfloat16"] = (specialize(bound, dtype=torch.bfloat16), True)
-        for way, (module, fast) in ways.items():
+        for way, (module, fast) in ((way, ways[way]) for way in wanted if way in ways):
             methods.append(Method(f"{name}, {way}", f"{kind}, {way}", partial(predict, module, fast)))
     return methods
 
@@ -112,14 +120,20 @@ def variant(scene: Scene, substeps: int, iterations: int | None = None) -> Scene
     return load_scene(spec, timestep=scene.timestep, name=scene.name)
 
 
-def physical(cfg: DictConfig, scene: Scene) -> list[Method]:
-    """MuJoCo at its own and at coarser time steps and solver settings."""
+def simulate(simulators: dict[int, Simulator], physics: Tensor, _: Tensor, actions: Tensor) -> Tensor:
+    """States by the simulator with as many threads as torch."""
+    return simulators[torch.get_num_threads()].rollout(physics, actions)["state"]
+
+
+def physical(cfg: DictConfig, scene: Scene, counts: Sequence[int]) -> list[Method]:
+    """MuJoCo at its own and at coarser time steps and solver settings, on as many threads as torch has."""
     own, methods = scene.substeps, []
     settings = {substeps: None for substeps in cfg.substeps if substeps < own} | {own: None}
     for substeps, iterations in [*settings.items(), (own, 1)]:
-        mujoco = Simulator(variant(scene, substeps, iterations), num_threads=cfg.threads)
+        coarse = variant(scene, substeps, iterations)
+        mujoco = {count: Simulator(coarse, num_threads=count) for count in counts}
         name = f"MuJoCo, {substeps} physics steps" + (", 1 solver iteration" if iterations else "")
-        methods.append(Method(name, "MuJoCo", lambda start, _, actions, of=mujoco: of.rollout(start, actions)["state"]))
+        methods.append(Method(name, "MuJoCo", partial(simulate, mujoco)))
     return methods
 
 
@@ -135,62 +149,50 @@ def relative_error(prediction: Tensor, truth: Tensor, scene: Scene) -> float:
     return float((errors[moves] / baseline[moves]).mean())
 
 
-def measure(cfg: DictConfig, scene: Scene, methods: list[Method], data: tuple[Tensor, Tensor, Tensor]) -> None:
-    """Median wall seconds per simulated second of every method at every batch size."""
+def on_threads(count: int, method: Method, *arguments: Tensor) -> Tensor:
+    """Run a method on so many threads, of which the native executor takes as many as torch has."""
+    torch.set_num_threads(count)
+    return method.run(*arguments)
+
+
+def measure(
+    cfg: DictConfig, scene: Scene, methods: list[Method], counts: list[int], data: tuple[Tensor, Tensor, Tensor]
+) -> None:
+    """Median wall seconds per simulated second of every method on every number of threads at every batch size."""
     physics, state, actions = data
     for batch in cfg.batches:
         steps = max(1, min(actions.shape[1], cfg.state_steps // batch))
         rows = torch.arange(batch) % len(physics)
         arguments = physics[rows], state[rows], actions[rows, :steps]
-        works = {str(index): partial(method.run, *arguments) for index, method in enumerate(methods)}
-        seconds = time_in_turn(works, cfg.repeats, desc=f"timing, batch {batch}")
-        for method, values in zip(methods, seconds.values(), strict=True):
-            method.seconds[batch] = statistics.median(values) / (batch * steps * scene.timestep)
-
-
-def pareto(points: dict[str, tuple[float, float]]) -> set[str]:
-    """Names of the points that no other beats in both coordinates."""
-    return {
-        name
-        for name, (x, y) in points.items()
-        if math.isfinite(y) and not any(a <= x and b <= y and (a, b) != (x, y) for a, b in points.values())
-    }
+        pairs = {f"{count} {method.name}": (count, method) for count in counts for method in methods}
+        works = {name: partial(on_threads, count, method, *arguments) for name, (count, method) in pairs.items()}
+        for name, values in time_in_turn(works, cfg.repeats, desc=f"timing, batch {batch}").items():
+            count, method = pairs[name]
+            method.seconds[count, batch] = statistics.median(values) / (batch * steps * scene.timestep)
 
 
 @with_help
 @hydra.main(config_path="config", config_name="benchmark", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
-    torch.set_num_threads(cfg.threads)
+    counts = thread_counts(cfg.threads)
+    if unknown := [way for way in cfg.ways if way not in WAYS]:
+        raise ValueError(f"ways={unknown} are not known; use any of {list(WAYS)}.")
     scene = load_scene(cfg.system)
     run, tracker = open_run(cfg, "benchmark")
-    methods = [*physical(cfg, scene), *learned(trained(cfg, run), scene)]
+    methods = [*physical(cfg, scene, counts), *learned(trained(cfg, run), scene, cfg.ways)]
 
     rng = np.random.default_rng(cfg.seed)
     physics = torch.as_tensor(sample_start_states(scene, cfg.rollouts, rng))
     actions = torch.as_tensor(spline_controls(scene, cfg.rollouts, cfg.steps, rng))
     truth = Simulator(variant(scene, cfg.refinement * scene.substeps)).rollout(physics, actions)["state"]
-    for method in tqdm(methods, desc="errors", leave=False):
-        method.error = relative_error(method.run(physics, truth[:, 0], actions), truth, scene)
-    measure(cfg, scene, methods, (physics, truth[:, 0], actions))
+    data = physics, truth[:, 0], actions
+    for method in tqdm(methods, desc="errors", leave=False):  # of one number of threads: they agree up to rounding
+        method.error = relative_error(on_threads(counts[0], method, *data), truth, scene)
+    measure(cfg, scene, methods, counts, data)
 
-    metrics: dict[str, float | int] = {"threads": cfg.threads}
-    panels: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
     print(f"{scene.name}: error over {cfg.steps * scene.timestep:g} s; wall seconds per simulated second (*: Pareto)")
-    print(f"{'':38}{'error':>10}" + "".join(f"{f'batch {batch}':>14}" for batch in cfg.batches))
-    fronts = {batch: pareto({m.name: (m.seconds[batch], m.error) for m in methods}) for batch in cfg.batches}
-    for method in methods:
-        cells = ""
-        metrics[f"{method.name}/error"] = method.error
-        for batch, seconds in method.seconds.items():
-            mark = "*" if method.name in fronts[batch] else " "
-            cells += f"{seconds:13.2e}{mark}"
-            metrics[f"{method.name}/batch {batch}/seconds_per_simulated_second"] = seconds
-            line = panels.setdefault(f"s per simulated s, batch {batch}", {}).setdefault(method.family, ([], []))
-            line[0].append(seconds)
-            line[1].append(method.error)
-        print(f"{method.name:38}{method.error:10.1e}{cells}")
-    plot_loglog(panels, run.file("work_precision.png"), ylabel="error over equal simulated time")
+    metrics = report(methods, counts, list(cfg.batches), run)
     finish_run(cfg, run, tracker, metrics)
 
 

@@ -47,7 +47,7 @@ from torchrl_gn.training import RunFolder, fit, load_pretrained, plain_config, s
 MAY_CHANGE = ("rounds", "threads", "logger", "run_dir")
 COLUMNS = {
     "frames": "physics steps",
-    "minutes": "minutes",
+    "minutes": "processor minutes",
     "reward": "mean reward",
     "std": "std over starts",
     "return": "return",
@@ -190,12 +190,12 @@ def main(cfg: DictConfig) -> None:
     judged: TensorDict | None = None
     with tqdm(total=cfg.rounds, initial=len(done), desc="rounds", leave=False) as bar:
         for index in range(len(done), cfg.rounds):
-            began, seed = time.perf_counter(), cfg.seed + 1000 * (index + 1)
+            began, seed = time.process_time(), cfg.seed + 1000 * (index + 1)
             torch.manual_seed(seed)  # a resumed run draws what it would have drawn
             losses = learner.learn(data, index)
             env = SceneEnv(scene, reward, seed=seed)
             played = played_windows(play(env, learner.policy, episodes=cfg.episodes, steps=cfg.steps, explore=True))
-            seconds = time.perf_counter() - began
+            seconds = time.process_time() - began
             error = error_of(learner.model, played) if len(played) else math.nan
             judged = play(SceneEnv(scene, judge, seed=10_000), learner.policy, **cfg.evaluate, explore=False)
             rewards = judged["next", "reward"].squeeze(-1)

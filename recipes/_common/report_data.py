@@ -107,5 +107,7 @@ def _word(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{_word(each)}" for key, each in value.items()) + "}"
     if isinstance(value, str):
-        return f"runs/{Path(value).name}" if value.startswith("/") else value
+        if value.startswith("/"):
+            return f"runs/{Path(value).name}"
+        return json.dumps(value) if "=" in value else value  # an option of another recipe
     return json.dumps(value)

@@ -115,9 +115,13 @@ def test_a_sample_is_the_same_in_every_batch(quick, inputs, name, dtype):
     assert native(predictor).reason is None
 
 
+@pytest.mark.filterwarnings("ignore::torchrl_gn.processor.SlowDtypeWarning")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("name", FEW)
-def test_the_number_of_threads_does_not_matter(quick, inputs, name):
-    predictor = quick(name)
+def test_the_number_of_threads_does_not_matter(quick, inputs, name, dtype):
+    if dtype == torch.bfloat16 and not library.load_library().gn_has_bfloat16():
+        pytest.skip("the processor multiplies no bfloat16")
+    predictor = quick(name, products=dtype)
     for count in (1, 2, 7, 50):
         state, actions = inputs(predictor, count)
         expected = pull(predictor, state, actions)

@@ -71,6 +71,7 @@ def finished(tmp_path) -> Path:
     run.mkdir()
     (run / "config.yaml").write_text(
         "# A run of evaluate\nseed: 3\nrun_dir: /some/first\ncheckpoint: /some/model\nlength: 100\n"
+        "training: [lr=1e-3]\n"
     )
     (run / "metrics.json").write_text(json.dumps(METRICS))
     return run
@@ -102,7 +103,7 @@ def test_a_run_is_added_with_its_command_and_versions(report, finished):
     added = read_run(report / "data", file.name)
     assert file.name == "errors.first.metrics.json"
     assert added["metrics"] == {"error": 0.00123, "far": None, "seconds": 1.25}
-    assert added["run"]["command"] == "python recipes/evaluate.py seed=3 checkpoint=runs/model"
+    assert added["run"]["command"] == "python recipes/evaluate.py seed=3 checkpoint=runs/model 'training=[\"lr=1e-3\"]'"
     assert added["run"]["versions"] == {"torch": "2.13"} and added["run"]["seed"] == 3
     with pytest.raises(ValueError, match="to=none is not a claim"):
         add_run(report / "data", finished, "none", {})
