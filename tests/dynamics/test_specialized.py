@@ -166,6 +166,7 @@ def test_graphs_and_statistics_are_the_whole_ones(scenes, make_model, random_sta
     assert torch.equal(found.nodes, expected.nodes) and torch.equal(found.edges, expected.edges)
 
 
+@pytest.mark.filterwarnings("ignore::torchrl_gn.processor.SlowDtypeWarning")
 def test_bfloat16_is_close_and_keeps_the_states_dtype(scenes, make_model, random_states, random_actions):
     scene = scenes["swimmer6"]
     bound = make_model(scene, latent=64).bind(scene)

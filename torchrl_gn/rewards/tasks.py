@@ -202,7 +202,7 @@ def _component(axis: str) -> int:
 _WALKER_UPRIGHT = ("torso", "right_thigh", "left_thigh", "right_leg", "left_leg")
 _WALKER_FEET = ("right_foot", "left_foot")
 
-# (system, task) -> builder of the reward; one line per row of the paper's table.
+# (system, task) -> builder of the reward; one line per row of the paper's table, and the suite's `run`.
 _REWARDS: dict[tuple[str, str], Callable[[Scene], Reward]] = {
     ("pendulum", "balance"): lambda scene: Balance(scene, ["pole"]),
     ("cartpole", "balance"): lambda scene: Balance(scene, ["pole_1"]),
