@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import statistics
 import time
 from pathlib import Path
 from typing import Any, cast
@@ -156,8 +157,14 @@ def report(run: RunFolder, scene: Scene, rounds: list[dict[str, Any]], judged: T
     if judged is not None:
         rollout_video(scene, judged["state"][0], None, video)
     best = max(rounds, key=lambda numbers: numbers["reward"])
+    last = statistics.median(numbers["return"] for numbers in rounds[-5:])
     each = {f"round {index}/{name}": value for index, of in enumerate(rounds) for name, value in of.items()}
-    return {**rounds[-1], **{f"best_{name}": best[name] for name in ("reward", "return", "frames")}, **each}
+    return {
+        **rounds[-1],
+        "median_return_of_last_five": last,
+        **{f"best_{name}": best[name] for name in ("reward", "return", "frames")},
+        **each,
+    }
 
 
 @with_help
