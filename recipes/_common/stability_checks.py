@@ -20,6 +20,7 @@ from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor, U
 from torchrl_gn.evaluation import guarded_rollout, kinetic_energy
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.processor import SlowDtypeWarning
 from torchrl_gn.scenes import Scene, load_scene, make_variants, parameter_ranges
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
@@ -49,7 +50,11 @@ class Setting:
     def bind(self, weights: ForwardModel, scene: Scene, **options) -> Predictor:
         """Other weights or another scene, as this setting's model is."""
         bound = weights.bind(scene, **options)
-        return specialize(bound, dtype=self.model.dtype) if isinstance(self.model, SpecializedPredictor) else bound
+        if not isinstance(self.model, SpecializedPredictor):
+            return bound
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SlowDtypeWarning)  # rounding is measured, not time
+            return specialize(bound, dtype=self.model.dtype)
 
     def size(self, delta: Tensor) -> float:
         """Largest change, relative to the largest true one of its component; infinite if not finite."""
