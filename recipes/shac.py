@@ -93,21 +93,22 @@ class ActorCritic:
 
     def __init__(self, cfg: DictConfig, scene: Scene, reward: Reward, begun: Round | None) -> None:
         self.cfg, self.scene = cfg, scene
-        self.config = plain_config(cfg)
+        self.config, kept = plain_config(cfg), None
         if begun is None:
             invariances = task_invariances(scene, reward)
             self.model: Predictor = ForwardModel.for_scene(scene, **self.config["model"]).bind(scene)
             self.policy = StatePolicy(scene, hidden=cfg.hidden, canonicalizer=invariances)
             self.value = StateValue(scene, discount=cfg.discount, hidden=cfg.hidden, canonicalizer=invariances)
         else:
+            kept = load_pretrained(begun.policy)
             self.model = load_pretrained(begun.model).bind(scene)
-            self.policy, self.value = load_pretrained(begun.policy).policy, load_pretrained(begun.value).value
+            self.policy, self.value = kept.policy, load_pretrained(begun.value).value
         imagined = ModelEnv(specialize(self.model), reward)
         self.loss = SHACLoss(self.policy, self.value, imagined, steps=cfg.horizon, lmbda=cfg.lmbda)
         rates = {name: cfg[name] for name in ("policy_lr", "value_lr", "alpha_lr")}
         self.optimizer = ActorCriticOptimizer(self.loss, **rates)
-        if begun is not None:
-            self.optimizer.load_state_dict(load_pretrained(begun.policy).training)
+        if kept is not None:
+            self.optimizer.load_state_dict(kept.training)
 
     def learn(self, data: list[TensorDict], index: int) -> dict[str, float]:
         """Train the model on all data, then policy and value in it."""
@@ -195,6 +196,7 @@ def main(cfg: DictConfig) -> None:
     data = [windows(first["state"], first["action"]), *(each.read_played() for each in done)]
     rounds: list[dict[str, Any]] = [json.loads(each.numbers.read_text()) for each in done]
     judged: TensorDict | None = None
+    latest = [run.path / "policy.safetensors", run.path / "value.safetensors", run.checkpoint]
     with tqdm(total=cfg.rounds, initial=len(done), desc="rounds", leave=False) as bar:
         for index in range(len(done), cfg.rounds):
             began, seed = time.process_time(), cfg.seed + 1000 * (index + 1)
@@ -223,14 +225,13 @@ def main(cfg: DictConfig) -> None:
             learner.save(now := Round(run.path, index))
             now.write_played(played)
             write_json(now.numbers, rounds[-1])
-            for name, path in (("policy", now.policy), ("value", now.value), ("model", now.model)):
-                copy_to(path, run.checkpoint if name == "model" else run.path / f"{name}.safetensors")
+            for source, target in zip((now.policy, now.value, now.model), latest, strict=True):
+                copy_to(source, target)
             data.append(played)
             tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
-    checkpoints = [run.path / "policy.safetensors", run.path / "value.safetensors", run.checkpoint]
-    finish_run(cfg, run, tracker, report(run, scene, rounds, judged), checkpoints=checkpoints)
+    finish_run(cfg, run, tracker, report(run, scene, rounds, judged), checkpoints=latest)
 
 
 def copy_to(source: Path, target: Path) -> None:

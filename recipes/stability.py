@@ -14,7 +14,6 @@ Writes config.yaml, metrics.json and, if it trains one, the model to its run fol
 from __future__ import annotations
 
 import copy
-import warnings
 from pathlib import Path
 
 import hydra
@@ -28,9 +27,7 @@ from _common import stability_checks as checks
 from _common.stability_checks import DTYPES, Check, Setting
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
-from torchrl_gn.dynamics import specialize
 from torchrl_gn.maths import BODY_STATE
-from torchrl_gn.processor import SlowDtypeWarning
 from torchrl_gn.scenes import Scene, has_variants
 from torchrl_gn.training import load_pretrained
 
@@ -83,9 +80,7 @@ def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
     largest = true.flatten(0, -2).amax(0)
     exact = copy.deepcopy(loaded.model).double().requires_grad_(False).bind(scene)
     single = loaded.model.requires_grad_(False).bind(scene)
-    with warnings.catch_warnings():  # its digits are wanted here, however slow
-        warnings.simplefilter("ignore", SlowDtypeWarning)
-        rounded = specialize(single, dtype=torch.bfloat16)
+    rounded = checks.specialize_at(single, torch.bfloat16)
     models = {"float32": single, "float64": exact, "bfloat16": rounded}
     inputs = scene, states[:, -2], actions[:, -1], largest, cfg
     return {name: Setting(model, exact, *inputs) for name, model in models.items()}

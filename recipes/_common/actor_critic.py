@@ -1,4 +1,4 @@
-"""A short-horizon actor-critic round by round: its networks, their optimiser, and what they play."""
+"""A short-horizon actor-critic round by round: the networks' optimiser, and what the policy plays."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ class ActorCriticOptimizer:
     def learn(self, states: Tensor, recent: Tensor, *, updates: int, batch_size: int, desc: str) -> dict[str, float]:
         """Update from batches of played states ``[M, N, 13]``, half of them ``recent``; means of the last quarter."""
         kept: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
+        shares = (states, batch_size - batch_size // 2), (recent, batch_size // 2)
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
             for update in range(updates):
-                rows = [of[torch.randint(len(of), (size,))] for of, size in self._shares(states, recent, batch_size)]
+                rows = [of[torch.randint(len(of), (size,))] for of, size in shares]
                 out = self.loss(TensorDict({"state": torch.cat(rows)}, [batch_size]))
                 self.optimizer.zero_grad()
                 (out["loss_actor"] + out["loss_value"] + out["loss_alpha"]).backward()
@@ -55,10 +56,6 @@ class ActorCriticOptimizer:
         self.optimizer.load_state_dict(state["adam"])
         with torch.no_grad():
             self.loss.log_alpha.copy_(state["log_alpha"])
-
-    @staticmethod
-    def _shares(states: Tensor, recent: Tensor, batch_size: int) -> list[tuple[Tensor, int]]:
-        return [(states, batch_size - batch_size // 2), (recent, batch_size // 2)]
 
 
 def play(env: SceneEnv, policy: StatePolicy, *, episodes: int, steps: int, explore: bool) -> TensorDict:
@@ -81,7 +78,7 @@ def windows(state: Tensor, action: Tensor) -> TensorDict:
 
 
 def played_windows(played: TensorDict) -> TensorDict:
-    """Trajectories of :func:`play` without steps from where the simulation became unstable."""
+    """Trajectories of :func:`play`, without the episodes whose simulation became unstable."""
     alive = ~cast(Tensor, played["next", "terminated"]).flatten(1).any(1)
     state = torch.cat((played["state"], played["next", "state"][:, -1:]), 1)
     return windows(state[alive], played["action"][alive])

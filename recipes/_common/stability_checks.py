@@ -35,6 +35,13 @@ SMALL_SCENES = (
 )
 
 
+def specialize_at(bound: Predictor, dtype: torch.dtype | None) -> SpecializedPredictor:
+    """A predictor in a dtype, without a warning: its digits are wanted here, however slow it is."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SlowDtypeWarning)
+        return specialize(bound, dtype=dtype)
+
+
 @dataclass(frozen=True, eq=False)
 class Setting:
     """What the checks of one dtype work on."""
@@ -50,11 +57,7 @@ class Setting:
     def bind(self, weights: ForwardModel, scene: Scene, **options) -> Predictor:
         """Other weights or another scene, as this setting's model is."""
         bound = weights.bind(scene, **options)
-        if not isinstance(self.model, SpecializedPredictor):
-            return bound
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", SlowDtypeWarning)  # rounding is measured, not time
-            return specialize(bound, dtype=self.model.dtype)
+        return specialize_at(bound, self.model.dtype) if isinstance(self.model, SpecializedPredictor) else bound
 
     def size(self, delta: Tensor) -> float:
         """Largest change, relative to the largest true one of its component; infinite if not finite."""

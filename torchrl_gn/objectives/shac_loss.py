@@ -135,9 +135,9 @@ class SHACLoss(LossModule):
         """Squared error of the value on its targets, in variances of its normaliser."""
         dtype = next(self.value.members.parameters()).dtype
         with torch.no_grad():
-            here, there = (
-                self.value.features(state, dtype) for state in (imagined["state"], imagined["next", "state"])
-            )
+            states = torch.cat((imagined["state"], imagined["next", "state"][:, -1:]), 1)
+            features = self.value.features(states, dtype)
+            here, there = features[:, :-1], features[:, 1:]
             done = imagined["next", "terminated"].clone()
             done[:, -1] = True  # imagination ends
             after = {

@@ -42,8 +42,7 @@ class CenterOfMassVelocity(Float64Buffers):
         self.constants({"share": mass / mass.sum(), "center": model.body_ipos[rows]})
 
     def forward(self, state: Tensor) -> Tensor:
-        _, orientation = self.bodies.pose(state)
-        offset = quaternion.rotate(orientation, self.center.to(state.dtype))
+        offset = quaternion.rotate(self.bodies.orientation(state), self.center.to(state.dtype))
         velocity = self.bodies.linear_velocity(state)
         velocity = velocity + torch.linalg.cross(self.bodies.angular_velocity(state), offset)
         return (self.share.to(state.dtype).unsqueeze(-1) * velocity).sum(-2)
