@@ -65,7 +65,7 @@ from _common.planning_task import (
 from torchrl_gn.data import spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo, StatePolicy
+from torchrl_gn.planners import BoundedPolicy, GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.rewards import FreezeGoal
 from torchrl_gn.scenes import Scene
@@ -93,7 +93,7 @@ class RandomControl(TensorDictModuleBase):
 
 
 def make_planner(
-    name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, done: int, policy: StatePolicy | None = None
+    name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, done: int, policy: BoundedPolicy | None = None
 ) -> TensorDictModuleBase:
     """Make a planner that goes on after ``done`` steps; its random numbers depend on them."""
     proposing = {} if policy is None else {"proposal": policy, "propose_every_step": bool(cfg.policy_every_step)}

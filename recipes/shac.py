@@ -9,7 +9,8 @@ same run_dir goes on, with more rounds too. Results: docs/results/short-horizon-
 
 Writes config.yaml, metrics.json, table.md, the learning curve (curve.json and curve.png), a video of the last round's
 first judged episode (episode.gif), and the last policy, value and model (policy.safetensors, value.safetensors,
-checkpoint/), which recipes/mpc.py takes as policy=, value= and checkpoint=; every round's own are in rounds/. All
+checkpoint/), which recipes/mpc.py takes as policy=, value= and checkpoint=; every round's own are in rounds/. With
+several systems, a graph network as the policy learns on all at once, and each has its own value, model and video. All
 options: recipes/config/shac.yaml.
 """
 
@@ -21,33 +22,29 @@ import shutil
 import statistics
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 import torch
 from omegaconf import DictConfig
-from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 from tqdm import tqdm
 
-from _common import clean_exit, finish_run, open_log, refuse_other_options, scene_options, with_help
-from _common.actor_critic import WINDOW, ActorCriticOptimizer, play, played_windows, windows
+from _common import as_list, clean_exit, finish_run, open_log, refuse_other_options, scene_options, with_help
+from _common.actor_critic import WINDOW, play
+from _common.actor_critic_rounds import ActorCritic, Round, Task
 from _common.planning_task import reward_of
 from torchrl_gn.atomic import atomic_path, write_json
-from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
-from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation import evaluate_errors, plot_learning_curves, rollout_video
-from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.planners import StatePolicy, StateValue, task_invariances
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.rewards import Reward
-from torchrl_gn.scenes import Scene, load_scene
-from torchrl_gn.training import RunFolder, fit, load_pretrained, plain_config, save_checkpoint
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import RunFolder
+from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
 MAY_CHANGE = ("rounds", "threads", "logger", "run_dir")
 COLUMNS = {
-    "frames": "physics steps",
+    "frames": "frames",
     "minutes": "processor minutes",
     "reward": "mean reward",
     "std": "std over starts",
@@ -58,105 +55,32 @@ COLUMNS = {
 }
 
 
-class Round:
-    """What a round leaves in its folder; finished once the last file is written, its numbers."""
-
-    def __init__(self, folder: Path, index: int) -> None:
-        self.path = folder / "rounds" / f"{index:03}"
-        self.model, self.policy, self.value, self.played, self.numbers = (
-            self.path / name
-            for name in (
-                "model.safetensors",
-                "policy.safetensors",
-                "value.safetensors",
-                "played.safetensors",
-                "numbers.json",
-            )
-        )
-
-    @property
-    def finished(self) -> bool:
-        return self.numbers.exists()
-
-    def read_played(self) -> TensorDict:
-        """Trajectories ``[M]`` that the policy played."""
-        played = load_file(self.played)
-        return TensorDict(played, [len(played["action"])])
-
-    def write_played(self, played: TensorDict) -> None:
-        with atomic_path(self.played) as temporary:
-            save_file({key: value.contiguous() for key, value in played.items()}, temporary)
-
-
-class ActorCritic:
-    """Model, policy and value of a task, and how they learn from one round to the next."""
-
-    def __init__(self, cfg: DictConfig, scene: Scene, reward: Reward, begun: Round | None) -> None:
-        self.cfg, self.scene = cfg, scene
-        self.config, kept = plain_config(cfg), None
-        if begun is None:
-            invariances = task_invariances(scene, reward)
-            self.model: Predictor = ForwardModel.for_scene(scene, **self.config["model"]).bind(scene)
-            self.policy = StatePolicy(scene, hidden=cfg.hidden, canonicalizer=invariances)
-            self.value = StateValue(scene, discount=cfg.discount, hidden=cfg.hidden, canonicalizer=invariances)
-        else:
-            kept = load_pretrained(begun.policy)
-            self.model = load_pretrained(begun.model).bind(scene)
-            self.policy, self.value = kept.policy, load_pretrained(begun.value).value
-        imagined = ModelEnv(specialize(self.model), reward)
-        self.loss = SHACLoss(self.policy, self.value, imagined, steps=cfg.horizon, lmbda=cfg.lmbda)
-        rates = {name: cfg[name] for name in ("policy_lr", "value_lr", "alpha_lr")}
-        self.optimizer = ActorCriticOptimizer(self.loss, **rates)
-        if kept is not None:
-            self.optimizer.load_state_dict(kept.training)
-
-    def learn(self, data: list[TensorDict], index: int) -> dict[str, float]:
-        """Train the model on all data, then policy and value in it."""
-        cfg, first = self.cfg, index == 0
-        steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
-        fit(self.model, cast(TensorDict, torch.cat(cast(Any, data))), steps=steps, lr=lr, seed=cfg.seed + index)
-        newest = data[-1]["state"]
-        rewards = None
-        if first:
-            before, after = newest[:, :-1], newest[:, 1:]
-            rewards = cast(Any, self.loss.env.reward)(before, data[-1]["action"], after, None).flatten(0, 1)
-        self.loss.fit_normalizers(newest.flatten(0, 1), rewards)
-        states = torch.cat([part["state"][:, :-1].flatten(0, 1) for part in data])
-        sizes = {"updates": cfg.updates, "batch_size": cfg.batch_size}
-        return self.optimizer.learn(states, newest[:, :-1].flatten(0, 1), **sizes, desc=f"policy, round {index}")
-
-    def save(self, of: Round) -> None:
-        """Write the networks of a round, with what the next needs."""
-        of.path.mkdir(parents=True, exist_ok=True)
-        options = {"scene": self.scene, "config": self.config}
-        save_checkpoint(of.model, self.model, **options)
-        save_checkpoint(of.value, self.value, **options)
-        save_checkpoint(of.policy, self.policy, **options, training=self.optimizer.state_dict())
-
-
 def error_of(model: Predictor, played: TensorDict) -> float:
     """Error of a model over 20 steps of new trajectories."""
     return evaluate_errors(model, played, horizons=(20,), one_step=False).errors["rollout_error_20"].total
 
 
-def report(run: RunFolder, scene: Scene, rounds: list[dict[str, Any]], judged: TensorDict | None) -> dict[str, Any]:
-    """Write table, curve and video; return the metrics."""
-    rows = [list(COLUMNS.values())]
+def report(run: RunFolder, tasks: list[Task], rounds: list[dict[str, Any]], judged: list[TensorDict]) -> dict[str, Any]:
+    """Write table, curve and videos; return the metrics."""
+    several = {f"return {task.folder}": task.folder for task in tasks} if len(tasks) > 1 else {}
+    columns = {**COLUMNS, **several}
+    rows = [list(columns.values())]
     rows += [
-        [f"{numbers[name]:,.4g}" if name != "frames" else f"{numbers[name]:,}" for name in COLUMNS]
+        [f"{numbers[name]:,.4g}" if name != "frames" else f"{numbers[name]:,}" for name in columns]
         for numbers in rounds
     ]
     lines = [" | ".join(["", *row, ""]).strip() for row in rows]
-    lines.insert(1, "|" + "---|" * len(COLUMNS))
+    lines.insert(1, "|" + "---|" * len(columns))
     with atomic_path(run.file("table.md")) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     tqdm.write("\n".join(lines))
     frames = [numbers["frames"] for numbers in rounds]
-    write_json(run.file("curve.json"), {"frames": frames, "returns": [numbers["return"] for numbers in rounds]})
-    plot_learning_curves({"SHAC": (frames, [[each["return"] for each in rounds]])}, run.file("curve.png"))
-    video = run.file("episode.gif")
-    if judged is not None:
-        rollout_video(scene, judged["state"][0], None, video)
+    curves = {name: [numbers[key] for numbers in rounds] for key, name in (several or {"return": "SHAC"}).items()}
+    write_json(run.file("curve.json"), {"frames": frames, "returns": curves})
+    plot_learning_curves({name: (frames, [returns]) for name, returns in curves.items()}, run.file("curve.png"))
+    for task, episodes in zip(tasks, judged, strict=False):
+        name = f"{task.folder}.gif" if several else "episode.gif"
+        rollout_video(task.scene, episodes["state"][0], None, run.file(name))
     best = max(rounds, key=lambda numbers: numbers["reward"])
     last = statistics.median(numbers["return"] for numbers in rounds[-5:])
     each = {f"round {index}/{name}": value for index, of in enumerate(rounds) for name, value in of.items()}
@@ -168,11 +92,48 @@ def report(run: RunFolder, scene: Scene, rounds: list[dict[str, Any]], judged: T
     }
 
 
+def judge(cfg: DictConfig, learner: ActorCritic) -> tuple[list[TensorDict], dict[str, float]]:
+    """Play every task's judged episodes, without exploration; episodes and numbers."""
+    episodes, numbers = [], {}
+    for task in learner.tasks:
+        policy = learner.policy_for(task.scene)
+        episodes.append(play(task.env(task.judge, 10_000), policy, **cfg.evaluate, explore=False))
+        rewards = episodes[-1]["next", "reward"].squeeze(-1)
+        numbers[f"reward {task.folder}"] = rewards.mean().item()
+        numbers[f"std {task.folder}"] = rewards.mean(1).std().item()
+        numbers[f"return {task.folder}"] = cfg.action_repeat * rewards.sum(1).mean().item()
+    for name in ("reward", "std", "return"):
+        numbers[name] = statistics.fmean(numbers[f"{name} {task.folder}"] for task in learner.tasks)
+    if len(learner.tasks) == 1:
+        numbers = {name: numbers[name] for name in ("reward", "std", "return")}
+    return episodes, numbers
+
+
+def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float]:
+    """Play every task with exploration; trajectories, and the mean error of the models on them."""
+    played, errors = [], []
+    for task in learner.tasks:
+        played.append(task.play(learner.policy_for(task.scene), seed))
+        errors.append(error_of(task.model, played[-1]) if len(played[-1]) else math.nan)
+    return played, statistics.fmean(errors)
+
+
+def make_tasks(cfg: DictConfig) -> list[Task]:
+    """The task of every system."""
+    systems, tasks = as_list(cfg.system), []
+    for system in systems:
+        scene = load_scene(system, **scene_options(cfg))
+        reward = reward_of(cfg, scene)
+        judged = reward if cfg.judged_reward is None else reward_of(cfg, scene, "judged_reward")
+        tasks.append(Task(cfg, scene, reward, judged, scene.name if len(systems) > 1 else ""))
+    return tasks
+
+
 @with_help
 @hydra.main(version_base=None, config_path="config", config_name="shac")
 @clean_exit
 def main(cfg: DictConfig) -> None:
-    for name in ("rounds", "horizon", "updates", "episodes", "model_steps"):
+    for name in ("action_repeat", "rounds", "horizon", "updates", "episodes", "model_steps"):
         check_count(name, cfg[name], 1)
     if cfg.steps < 1 or cfg.steps % WINDOW or cfg.first.length < WINDOW:
         raise ValueError(
@@ -180,58 +141,51 @@ def main(cfg: DictConfig) -> None:
         )
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
-    scene = load_scene(cfg.system, **scene_options(cfg))
-    reward = reward_of(cfg, scene)
-    if reward.target_shape is not None:
-        raise ValueError(f"A policy of states does not know the target of {reward}.")
-    judge = reward if cfg.judged_reward is None else reward_of(cfg, scene, "judged_reward")
+    tasks = make_tasks(cfg)
     run = RunFolder(cfg.run_dir, "shac")
     refuse_other_options(cfg, run, MAY_CHANGE)
-    tracker = open_log(cfg, run, label=f"shac-{scene.name}")
     done: list[Round] = []
     while (each := Round(run.path, len(done))).finished:
         done.append(each)
-    learner = ActorCritic(cfg, scene, reward, done[-1] if done else None)
-    first = collect_trajectories(scene, cfg.first.trajectories, steps=cfg.first.length, seed=cfg.seed)
-    data = [windows(first["state"], first["action"]), *(each.read_played() for each in done)]
+    learner = ActorCritic(cfg, tasks, done[-1] if done else None)
+    tracker = open_log(cfg, run, label=f"shac-{tasks[0].scene.name}")
+    for task in tasks:
+        task.collect(done)
     rounds: list[dict[str, Any]] = [json.loads(each.numbers.read_text()) for each in done]
-    judged: TensorDict | None = None
-    latest = [run.path / "policy.safetensors", run.path / "value.safetensors", run.checkpoint]
+    judged: list[TensorDict] = []
+    latest = [run.path / "policy.safetensors"]
+    latest += [run.path / task.folder / "value.safetensors" for task in tasks]
+    latest += [run.path / task.folder / CHECKPOINT_FILE for task in tasks]
     with tqdm(total=cfg.rounds, initial=len(done), desc="rounds", leave=False) as bar:
         for index in range(len(done), cfg.rounds):
             began, seed = time.process_time(), cfg.seed + 1000 * (index + 1)
             torch.manual_seed(seed)  # a resumed run draws what it would have drawn
-            losses = learner.learn(data, index)
-            env = SceneEnv(scene, reward, seed=seed)
-            played = played_windows(play(env, learner.policy, episodes=cfg.episodes, steps=cfg.steps, explore=True))
+            losses, now = learner.learn(index), Round(run.path, index)
+            played, error = play_round(learner, seed)
             seconds = time.process_time() - began
-            error = error_of(learner.model, played) if len(played) else math.nan
-            judged = play(SceneEnv(scene, judge, seed=10_000), learner.policy, **cfg.evaluate, explore=False)
-            rewards = judged["next", "reward"].squeeze(-1)
-            before = (
-                rounds[-1] if rounds else {"frames": first["action"][..., 0].numel() * scene.substeps, "minutes": 0.0}
-            )
+            judged, numbers = judge(cfg, learner)
+            random_steps = len(tasks) * cfg.first.trajectories * cfg.first.length
+            before = rounds[-1] if rounds else {"frames": cfg.action_repeat * random_steps, "minutes": 0.0}
             rounds.append(
                 {
-                    "frames": before["frames"] + scene.substeps * cfg.episodes * cfg.steps,
+                    "frames": before["frames"] + len(tasks) * cfg.action_repeat * cfg.episodes * cfg.steps,
                     "minutes": before["minutes"] + seconds / 60,
-                    "reward": rewards.mean().item(),
-                    "std": rewards.mean(1).std().item(),
-                    "return": scene.substeps * rewards.sum(1).mean().item(),
+                    **numbers,
                     "error": error,
                     **losses,
                 }
             )
-            learner.save(now := Round(run.path, index))
-            now.write_played(played)
+            learner.save(now)
+            for task, trajectories in zip(tasks, played, strict=True):
+                task.add(trajectories, now)
             write_json(now.numbers, rounds[-1])
-            for source, target in zip((now.policy, now.value, now.model), latest, strict=True):
+            files = [now.policy, *(now.of(what, task) for what in ("value", "model") for task in tasks)]
+            for source, target in zip(files, latest, strict=True):
                 copy_to(source, target)
-            data.append(played)
             tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
-    finish_run(cfg, run, tracker, report(run, scene, rounds, judged), checkpoints=latest)
+    finish_run(cfg, run, tracker, report(run, tasks, rounds, judged), checkpoints=latest)
 
 
 def copy_to(source: Path, target: Path) -> None:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
+import mujoco
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from torchrl_gn.data import sample_start_states
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.planners import StatePolicy
+from torchrl_gn.planners import BoundedPolicy
+from torchrl_gn.scenes import Scene
 from torchrl_gn.training.optimizers import clip_gradients
 
 WINDOW = 50  # control steps of a trajectory that the model learns from
@@ -21,44 +26,94 @@ _BETAS = (0.7, 0.95)  # SHAC's: gradients change fast with the policy
 _KEPT = {"reward": "imagined_reward", "loss_value": "loss_value", "entropy": "entropy"}
 
 
+class TargetSquares:
+    """Targets anywhere in a square around the start, one of several sizes. The target is the origin: the scene moves.
+
+    ValueError if the scene cannot: it needs a root that slides along x and y, in physics that are the same everywhere.
+
+    Args:
+        half_sides: of the squares, metres, equally likely.
+    """
+
+    def __init__(self, scene: Scene, half_sides: Sequence[float]) -> None:
+        model, self.scene = scene.model, scene
+        self.half_sides = np.array([float(each) for each in half_sides])
+        if not (self.half_sides > 0).all():
+            raise ValueError(f"target_squares={list(half_sides)} must be positive half sides, metres.")
+        slides = [
+            np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (np.abs(model.jnt_axis) == axis).all(1))
+            for axis in np.eye(3)[:2]
+        ]
+        if not (scene.translation_invariant[:2].all() and all(len(found) for found in slides)):
+            raise ValueError(f"target_squares= needs a scene that slides freely along x and y, not {scene.name!r}.")
+        self.where = [1 + model.jnt_qposadr[found[0]] for found in slides]  # in a MuJoCo state, after the time
+
+    def start_states(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Full MuJoCo states ``[n, S]``."""
+        states = sample_start_states(self.scene, n, rng)
+        size = rng.choice(self.half_sides, (n, 1))
+        states[:, self.where] = rng.uniform(-size, size, (n, 2))
+        return states
+
+    def move(self, state: Tensor) -> Tensor:
+        """States ``[B, N, 13]`` with the first body somewhere else in a square around the target."""
+        sizes = torch.from_numpy(self.half_sides)[torch.randint(len(self.half_sides), (len(state), 1, 1))]
+        place = sizes * (2 * torch.rand(len(state), 1, 2, dtype=torch.float64) - 1)
+        moved = state.clone()
+        moved[:, 1:, :2] += place.to(state) - state[:, 1:2, :2]
+        return moved
+
+
 class ActorCriticOptimizer:
-    """Updates policy, value and the entropy's weight by Adam, each with its own rate and clipped gradient."""
+    """Updates policy, values and entropies' weights by Adam, each kind with its own rate and clipped gradients.
 
-    def __init__(self, loss: SHACLoss, *, policy_lr: float, value_lr: float, alpha_lr: float) -> None:
-        self.loss = loss
-        self.groups = [list(loss.policy.parameters()), list(loss.value.parameters()), [loss.log_alpha]]
-        rates = zip(self.groups, (policy_lr, value_lr, alpha_lr), strict=True)
-        self.optimizer = torch.optim.Adam([{"params": of, "lr": rate} for of, rate in rates], betas=_BETAS, fused=True)
+    Args:
+        losses: of every task, whose policies share their weights.
+    """
 
-    def learn(self, states: Tensor, recent: Tensor, *, updates: int, batch_size: int, desc: str) -> dict[str, float]:
-        """Update from batches of played states ``[M, N, 13]``, half of them ``recent``; means of the last quarter."""
+    def __init__(self, losses: Sequence[SHACLoss], *, policy_lr: float, value_lr: float, alpha_lr: float) -> None:
+        self.losses = list(losses)
+        self.policy = list(self.losses[0].policy.parameters())
+        self.values = [list(loss.value.parameters()) for loss in self.losses]
+        self.alphas = [loss.log_alpha for loss in self.losses]
+        groups = (
+            (self.policy, policy_lr),
+            ([each for of in self.values for each in of], value_lr),
+            (self.alphas, alpha_lr),
+        )
+        self.optimizer = torch.optim.Adam([{"params": of, "lr": lr} for of, lr in groups], betas=_BETAS, fused=True)
+
+    def learn(
+        self, starts: Sequence[Callable[[int], Tensor]], *, updates: int, batch_size: int, desc: str
+    ) -> dict[str, float]:
+        """Update from states ``[batch_size, N, 13]`` that every task's ``starts`` draws; means of the last quarter."""
         kept: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
-        shares = (states, batch_size - batch_size // 2), (recent, batch_size // 2)
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
             for update in range(updates):
-                rows = [of[torch.randint(len(of), (size,))] for of, size in shares]
-                out = self.loss(TensorDict({"state": torch.cat(rows)}, [batch_size]))
                 self.optimizer.zero_grad()
-                (out["loss_actor"] + out["loss_value"] + out["loss_alpha"]).backward()
-                for group in self.groups:
+                for loss, draw in zip(self.losses, starts, strict=True):
+                    out = loss(TensorDict({"state": draw(batch_size)}, [batch_size]))
+                    (out["loss_actor"] / len(self.losses) + out["loss_value"] + out["loss_alpha"]).backward()
+                    if update >= 3 * updates // 4:
+                        for name, values in kept.items():
+                            values.append(out[name].detach())
+                for group in (self.policy, *self.values, *([alpha] for alpha in self.alphas)):
                     clip_gradients(group, 1.0, f"update {update}")
                 self.optimizer.step()
-                if update >= 3 * updates // 4:
-                    for name, values in kept.items():
-                        values.append(out[name].detach())
                 bar.update()
         return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in kept.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        return {"adam": self.optimizer.state_dict(), "log_alpha": self.loss.log_alpha.detach()}
+        return {"adam": self.optimizer.state_dict(), "log_alphas": [alpha.detach() for alpha in self.alphas]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.optimizer.load_state_dict(state["adam"])
         with torch.no_grad():
-            self.loss.log_alpha.copy_(state["log_alpha"])
+            for alpha, kept in zip(self.alphas, state["log_alphas"], strict=True):
+                alpha.copy_(kept)
 
 
-def play(env: SceneEnv, policy: StatePolicy, *, episodes: int, steps: int, explore: bool) -> TensorDict:
+def play(env: SceneEnv, policy: BoundedPolicy, *, episodes: int, steps: int, explore: bool) -> TensorDict:
     """Episodes ``[M, T]`` in MuJoCo, from new starts."""
     kind = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):

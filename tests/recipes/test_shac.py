@@ -31,8 +31,8 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (whole, resumed)]
     for name in ("reward", "return", "frames", "error", "entropy", "loss_value"):
         assert metrics[0][name] == metrics[1][name]
-    assert abs(metrics[0]["return"] - 20 * metrics[0]["reward"]) < 1e-4 and metrics[0]["imagined_reward"] < 0
-    assert metrics[0]["frames"] == 4 * 50 + 3 * 2 * 50
+    assert abs(metrics[0]["return"] - 2 * 20 * metrics[0]["reward"]) < 1e-4 and metrics[0]["imagined_reward"] < 0
+    assert metrics[0]["frames"] == 2 * (4 * 50 + 3 * 2 * 50)
     assert metrics[0]["round 2/return"] == metrics[0]["return"]
     first, second = (load_file(folder / "policy.safetensors") for folder in (whole, resumed))
     assert all(torch.equal(first[name], second[name]) for name in first)
@@ -44,6 +44,40 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     given = (f"checkpoint={whole}", f"policy={whole}", f"value={whole / 'value.safetensors'}")
     planning = ("horizon=2", "steps=2", "episodes=2", "video=false", "gn.warm_up=1", "gn.samples=3", "gn.iterations=1")
     code, _, errors = call("system=pendulum", *given, *planning, f"run_dir={tmp_path / 'mpc'}", recipe="mpc")
+    assert code == 0, errors
+
+
+SWIMMERS = (
+    *SMALL,
+    "system=[swimmer3,swimmer4]",
+    "policy=graph",
+    "graph={hidden:[8],latent:8}",
+    "timestep=0.1",
+    "reward=near",
+    "target_squares=[0.3,2]",
+    "action_repeat=1",
+)
+
+
+def test_one_graph_policy_learns_on_several_systems(tmp_path, call):
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    for folder, rounds in ((whole, 2), (resumed, 1), (resumed, 2)):
+        code, output, errors = call(*SWIMMERS, f"rounds={rounds}", f"run_dir={folder}", recipe="shac")
+        assert code == 0 and "warning" not in errors.lower(), errors
+        assert str(folder / "swimmer4/value.safetensors") in output and str(folder / "swimmer3.gif") in output
+    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (whole, resumed)]
+    for name in ("return swimmer3", "return swimmer4", "return", "error", "entropy"):
+        assert metrics[0][name] == metrics[1][name]
+    assert metrics[0]["return"] == (metrics[0]["return swimmer3"] + metrics[0]["return swimmer4"]) / 2
+    assert metrics[0]["frames"] == 2 * (4 * 50 + 2 * 2 * 50)
+    played = load_file(whole / "rounds/001/swimmer3/played.safetensors")
+    away = played["state"][:, 0, 1, :2].norm(dim=-1)
+    assert away.min() > 0 and away.max() > 0.05 and away.max() < 3  # the target is the origin
+    assert load_pretrained(whole / "swimmer4").model is not None
+
+    # The policy proposes plans for a length that it has not learned on.
+    planning = ("horizon=2", "steps=2", "video=false", "gn.warm_up=1", "gn.samples=3", "gn.iterations=1")
+    code, _, errors = call("system=swimmer5", f"policy={whole}", *planning, f"run_dir={tmp_path / 'mpc'}", recipe="mpc")
     assert code == 0, errors
 
 
@@ -64,6 +98,20 @@ def test_refuses_other_options_and_targets(tmp_path, call):
     assert code == 1 and "does not know the target" in errors
     code, _, errors = call(*SMALL, "steps=70", f"run_dir={tmp_path / 'x'}", recipe="shac")
     assert code == 1 and "steps=70" in errors
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("policy=cnn",), "policy=cnn must be mlp or graph"),
+        (("system=[pendulum,pendulum]",), "graph to learn on several systems"),
+        (("target_squares=[0.3]",), "slides freely along x and y, not 'pendulum'"),
+        (("system=swimmer3", "reward=near", "target_squares=[-1]"), "must be positive half sides"),
+    ],
+)
+def test_refuses_tasks_that_do_not_fit(options, message, tmp_path, call):
+    code, _, errors = call(*SMALL, *options, f"run_dir={tmp_path / 'x'}", recipe="shac")
+    assert code == 1 and message in errors
 
 
 @pytest.mark.parametrize("option", ["rounds=0", "policy_lr=-1", "horizon=0"])

@@ -1,4 +1,4 @@
-"""Rewards of the control suite's running tasks, against the suite itself."""
+"""Rewards of the control suite's running and swimming tasks, against the suite itself."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrl_gn.data import Simulator
-from torchrl_gn.rewards import Reward, Run, RunUpright, make_reward
+from torchrl_gn.rewards import Near, Reward, Run, RunUpright, make_reward
 from torchrl_gn.scenes import load_scene
 
 suite = pytest.importorskip("dm_control.suite")
@@ -56,6 +56,36 @@ def test_equals_the_suite(system: str, domain: str, task: str, speed: float) -> 
     theirs = suite_rewards(domain, task, states)
     assert theirs.std() > 0.02
     np.testing.assert_allclose(ours.numpy(), theirs, atol=1e-9)
+
+
+def test_near_equals_the_suites_swimmer() -> None:
+    scene = load_scene("swimmer6")
+    states = random_states(scene, -1.0, 1.0)
+    loaded = suite.load("swimmer", "swimmer6")
+    loaded.physics.named.model.geom_pos["target", ["x", "y"]] = 0.0
+    theirs = []
+    for state in states:
+        mujoco.mj_setState(
+            loaded.physics.model.ptr, loaded.physics.data.ptr, state, mujoco.mjtState.mjSTATE_FULLPHYSICS
+        )
+        mujoco.mj_forward(loaded.physics.model.ptr, loaded.physics.data.ptr)
+        theirs.append(loaded.task.get_reward(loaded.physics))
+    observed = Simulator(scene).observe(torch.as_tensor(states)).requires_grad_()
+    reward, action = make_reward("near", scene), torch.zeros(200, scene.num_actions)
+    ours = reward(observed, action, observed)
+    assert np.std(theirs) > 0.1 and max(theirs) == 1.0
+    np.testing.assert_allclose(ours.detach().squeeze(-1).numpy(), theirs, atol=1e-9)
+    ours.sum().backward()
+    assert observed.grad is not None and bool(observed.grad.isfinite().all())
+    # With a target of the episode's own, which may be anywhere.
+    moving = Near(scene, "head", offset=(0.0, -0.06, 0.0))
+    shift = torch.tensor([3.0, -2.0, 0.0], dtype=torch.float64)
+    moved = observed.detach().clone()
+    moved[:, 1:, :3] += shift
+    target = shift + torch.tensor([0.0, 0.0, 0.05])
+    torch.testing.assert_close(moving(moved, action, moved, target.expand(200, 3)), ours.detach())
+    with pytest.raises(ValueError, match=r"radius=0 and margin=0\.5"):
+        Near(scene, "head", radius=0)
 
 
 def test_by_name_and_differentiable() -> None:

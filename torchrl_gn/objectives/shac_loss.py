@@ -17,7 +17,7 @@ from torchrl_gn.envs import ModelEnv
 from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.objectives.checks import read_entries
-from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.planners import BoundedPolicy, StateValue
 
 
 class SHACLoss(LossModule):
@@ -55,7 +55,7 @@ class SHACLoss(LossModule):
 
     def __init__(
         self,
-        policy: StatePolicy,
+        policy: BoundedPolicy,
         value: StateValue,
         env: ModelEnv,
         *,

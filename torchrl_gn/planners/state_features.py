@@ -43,10 +43,15 @@ class StateFeatures(Float64Buffers):
         self.size = scene.num_nodes * BODY_STATE.encoded_size()
         self.normalizer = Normalizer(self.size, floor=_FLOOR, limit=_LIMIT)
 
+    @property
+    def fitted(self) -> bool:
+        """Whether the normaliser has data. Waits for the device."""
+        return self.normalizer.fitted
+
     @torch.no_grad()
     def fit(self, state: Tensor) -> None:
         """Fit the normaliser to states ``[*B, N, 13]``, unless it has seen some; ValueError if one is not finite."""
-        if not self.normalizer.fitted:
+        if not self.fitted:
             self.update(state)
 
     @torch.no_grad()

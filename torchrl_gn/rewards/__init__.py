@@ -3,6 +3,7 @@
 from torchrl_gn.rewards.bodies import Bodies as Bodies
 from torchrl_gn.rewards.bodies import find_body as find_body
 from torchrl_gn.rewards.distance import Distance as Distance
+from torchrl_gn.rewards.distance import Near as Near
 from torchrl_gn.rewards.distance import TargetDistance as TargetDistance
 from torchrl_gn.rewards.imitate_pose import ImitatePose as ImitatePose
 from torchrl_gn.rewards.imitate_pose import arm_reach as arm_reach

@@ -66,12 +66,34 @@ class Distance(Reward):
         return -torch.where(away, torch.where(away, square, 1.0).sqrt(), 0.0)
 
 
-class TargetDistance(nn.Module):
+class Near(Distance):
     """The suite's reward for reaching a target: 1 within ``radius`` of the target, less at larger distances.
 
     At a distance ``d``, ``1 / (1 + (3 (d - radius) / margin)^2)``, as ``dm_control.utils.rewards.tolerance`` with a
-    long tail. ``entry`` of the observation is the vector to the target. The gradient there is 0.
+    long tail. Metres; ``target`` and ``offset`` as of :class:`Distance`. The gradient within ``radius`` is 0.
     """
+
+    def __init__(
+        self,
+        scene: Scene,
+        body: str,
+        *,
+        target: Sequence[float] | None = None,
+        offset: Sequence[float] = (0.0, 0.0, 0.0),
+        radius: float = 0.1,
+        margin: float = 0.5,
+    ):
+        super().__init__(scene, body, target=target, offset=offset, power=2)
+        _check_sizes(radius, margin)
+        self.radius, self.margin = radius, margin
+        self.shown = {**self.shown, "radius": radius, "margin": margin}
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return _long_tail(-super().forward(state, action, next_state, task), self.radius, self.margin)
+
+
+class TargetDistance(nn.Module):
+    """The reward of :class:`Near`, of observations: ``entry`` is the vector to the target."""
 
     def __init__(
         self, graph: ObservationGraph, entry: str = "to_target", *, radius: float = 0.1, margin: float = 0.5
@@ -79,14 +101,23 @@ class TargetDistance(nn.Module):
         super().__init__()
         if entry not in graph.observation:
             raise ValueError(f"Observations of {graph.name!r} have no {entry!r}; there are {list(graph.observation)}.")
-        if not (0 < radius < math.inf and 0 < margin < math.inf):
-            raise ValueError(f"radius={radius} and margin={margin} must be positive and finite.")
+        _check_sizes(radius, margin)
         names = list(graph.observation)
         start = sum(graph.observation[name] for name in names[: names.index(entry)])
         self.where, self.radius, self.margin = slice(start, start + graph.observation[entry]), radius, margin
 
     def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
         square = next_observation[..., self.where].square().sum(-1, keepdim=True)
-        # Clamp before the root: its gradient stays finite at 0.
-        beyond = square.clamp(min=self.radius**2).sqrt() - self.radius
-        return 1 / (1 + (3 * beyond / self.margin).square())
+        return _long_tail(square, self.radius, self.margin)
+
+
+def _check_sizes(radius: float, margin: float) -> None:
+    if not (0 < radius < math.inf and 0 < margin < math.inf):
+        raise ValueError(f"radius={radius} and margin={margin} must be positive and finite.")
+
+
+def _long_tail(square: Tensor, radius: float, margin: float) -> Tensor:
+    """The suite's tolerance at squared distances."""
+    # Clamp before the root: its gradient stays finite at 0.
+    beyond = square.clamp(min=radius**2).sqrt() - radius
+    return 1 / (1 + (3 * beyond / margin).square())

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards.bodies import Bodies, require_bodies
-from torchrl_gn.rewards.distance import REACHED, Distance
+from torchrl_gn.rewards.distance import REACHED, Distance, Near
 from torchrl_gn.rewards.imitate_pose import ImitatePose
 from torchrl_gn.rewards.reward import Reward
 from torchrl_gn.rewards.suite import Run, RunUpright
@@ -202,12 +202,13 @@ def _component(axis: str) -> int:
 _WALKER_UPRIGHT = ("torso", "right_thigh", "left_thigh", "right_leg", "left_leg")
 _WALKER_FEET = ("right_foot", "left_foot")
 
-# (system, task) -> builder of the reward; one line per row of the paper's table, and the suite's `run`.
+# (system, task) -> builder of the reward; one line per row of the paper's table, and the suite's `run` and `near`.
 _REWARDS: dict[tuple[str, str], Callable[[Scene], Reward]] = {
     ("pendulum", "balance"): lambda scene: Balance(scene, ["pole"]),
     ("cartpole", "balance"): lambda scene: Balance(scene, ["pole_1"]),
     ("acrobot", "swing_up"): lambda scene: Balance(scene, ["upper_arm", "lower_arm"]),
     ("swimmerN", "reach"): lambda scene: Reach(scene, "head"),
+    ("swimmerN", "near"): lambda scene: Near(scene, "head", target=(0.0, 0.0, 0.05), offset=(0.0, -0.06, 0.0)),
     ("cheetah", "forward"): lambda scene: Velocity(scene, "torso", "x"),
     ("cheetah", "height"): lambda scene: Position(scene, "torso", "z"),
     ("cheetah", "vertical_speed"): lambda scene: Velocity(scene, "torso", "z", power=2),
@@ -232,6 +233,7 @@ REWARD_TYPES: dict[str, type[Reward]] = {
         Distance,
         Effort,
         ImitatePose,
+        Near,
         Position,
         Reach,
         Run,

@@ -22,7 +22,7 @@ import torchrl_gn
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.identification import IdentifyingModel
-from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import Scene, scene_from_description
 
@@ -31,15 +31,16 @@ WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")  # the models that come
 FORMAT = 4  # version of the checkpoint format that this package writes and reads
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
-Trained = ForwardModel | IdentifyingModel | Agent | StateValue | StatePolicy  # what a checkpoint can hold
+Trained = ForwardModel | IdentifyingModel | Agent | StateValue | BoundedPolicy  # what a checkpoint can hold
 KINDS: dict[str, type[Trained]] = {
     "forward_model": ForwardModel,
     "identifying_model": IdentifyingModel,
     "agent": Agent,
     "state_value": StateValue,
     "state_policy": StatePolicy,
+    "graph_state_policy": GraphStatePolicy,
 }
-_Kind = TypeVar("_Kind", bound=Trained)
+_Kind = TypeVar("_Kind")
 
 
 class CheckpointError(ValueError):
@@ -77,9 +78,9 @@ class Checkpoint:
         return self._as(StateValue)
 
     @property
-    def policy(self) -> StatePolicy:
+    def policy(self) -> BoundedPolicy:
         """The policy over states; CheckpointError if it is another kind of model."""
-        return self._as(StatePolicy)
+        return self._as(BoundedPolicy)
 
     def _as(self, kind: type[_Kind]) -> _Kind:
         if not isinstance(self.trained, kind):

@@ -1,0 +1,179 @@
+"""Rounds of a short-horizon actor-critic: what learns in them, on one scene or several, and what they leave."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from omegaconf import DictConfig
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
+from torch import Tensor
+
+from _common.actor_critic import ActorCriticOptimizer, TargetSquares, play, played_windows, windows
+from torchrl_gn.atomic import atomic_path
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
+from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.objectives import SHACLoss
+from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue, task_invariances
+from torchrl_gn.rewards import Reward
+from torchrl_gn.scenes import Scene
+from torchrl_gn.training import fit, load_pretrained, plain_config, save_checkpoint
+
+
+class Round:
+    """What a round leaves in its folder; finished once the last file is written, its numbers."""
+
+    def __init__(self, folder: Path, index: int) -> None:
+        self.path = folder / "rounds" / f"{index:03}"
+        self.policy, self.numbers = self.path / "policy.safetensors", self.path / "numbers.json"
+
+    @property
+    def finished(self) -> bool:
+        return self.numbers.exists()
+
+    def of(self, what: str, task: Task) -> Path:
+        """The file of a task's ``model``, ``value`` or ``played`` trajectories."""
+        return self.path / task.folder / f"{what}.safetensors"
+
+
+class Task:
+    """A scene with its reward, and the model and value that learn for it.
+
+    Args:
+        folder: of its files in a run and in a round.
+    """
+
+    model: Predictor
+    value: StateValue
+    loss: SHACLoss
+
+    def __init__(self, cfg: DictConfig, scene: Scene, reward: Reward, judge: Reward, folder: str) -> None:
+        if reward.target_shape is not None:
+            raise ValueError(f"A policy of states does not know the target of {reward}.")
+        self.cfg, self.scene, self.reward, self.judge, self.folder = cfg, scene, reward, judge, folder
+        self.squares = TargetSquares(scene, cfg.target_squares) if cfg.target_squares else None
+        self.invariances = task_invariances(scene, reward)
+        self.data: list[TensorDict] = []
+
+    def collect(self, done: list[Round]) -> None:
+        """Trajectories of random control, and those that finished rounds played."""
+        cfg = self.cfg
+        first = collect_trajectories(self.scene, cfg.first.trajectories, steps=cfg.first.length, seed=cfg.seed)
+        self.data = [windows(first["state"], first["action"])]
+        for each in done:
+            played = load_file(each.of("played", self))
+            self.data.append(TensorDict(played, [len(played["action"])]))
+
+    def begin(self, policy: BoundedPolicy, begun: Round | None) -> None:
+        """Make model, value and loss, or read them from the last round."""
+        cfg, config = self.cfg, plain_config(self.cfg)
+        if begun is None:
+            self.model = ForwardModel.for_scene(self.scene, **config["model"]).bind(self.scene)
+            options = {"discount": cfg.discount, "hidden": cfg.hidden}
+            self.value = StateValue(self.scene, canonicalizer=self.invariances, **options)
+        else:
+            self.model = load_pretrained(begun.of("model", self)).bind(self.scene)
+            self.value = load_pretrained(begun.of("value", self)).value
+        imagined = ModelEnv(specialize(self.model), self.reward)
+        self.loss = SHACLoss(policy, self.value, imagined, steps=cfg.horizon, lmbda=cfg.lmbda)
+
+    def learn_model(self, index: int) -> None:
+        """Train the model on all data, and tell the normalisers of policy and value of the newest."""
+        cfg, first = self.cfg, index == 0
+        steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
+        fit(self.model, cast(TensorDict, torch.cat(cast(Any, self.data))), steps=steps, lr=lr, seed=cfg.seed + index)
+        newest, rewards = self.data[-1]["state"], None
+        if first:
+            before, after = newest[:, :-1], newest[:, 1:]
+            rewards = self.reward(before, self.data[-1]["action"], after, None).flatten(0, 1)
+        seen = newest.flatten(0, 1)
+        self.loss.fit_normalizers(seen if self.squares is None else self.squares.move(seen), rewards)
+
+    def starts(self) -> Callable[[int], Tensor]:
+        """What draws states ``[size, N, 13]`` to imagine from, half of the newest episodes, half of all."""
+        newest, states = self.data[-1:], []
+        for data in self.data, newest:
+            states.append(torch.cat([part["state"][:, :-1].flatten(0, 1) for part in data]))
+
+        def draw(size: int) -> Tensor:
+            counts = size - size // 2, size // 2
+            parts = [of[torch.randint(len(of), (count,))] for of, count in zip(states, counts, strict=True)]
+            if self.squares is not None:
+                parts[0] = self.squares.move(parts[0])
+            return torch.cat(parts)
+
+        return draw
+
+    def env(self, reward: Reward, seed: int) -> SceneEnv:
+        """The task in MuJoCo."""
+        starts = None if self.squares is None else self.squares.start_states
+        return SceneEnv(self.scene, reward, seed=seed, start_states=starts)
+
+    def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
+        """Trajectories of a round's episodes with exploration."""
+        cfg = self.cfg
+        env = self.env(self.reward, seed)
+        return played_windows(play(env, policy, episodes=cfg.episodes, steps=cfg.steps, explore=True))
+
+    def add(self, played: TensorDict, of: Round) -> None:
+        """Keep a round's trajectories, also in its folder."""
+        self.data.append(played)
+        (path := of.of("played", self)).parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            save_file({key: value.contiguous() for key, value in played.items()}, temporary)
+
+
+class ActorCritic:
+    """A policy and its tasks, and how they learn from one round to the next."""
+
+    def __init__(self, cfg: DictConfig, tasks: list[Task], begun: Round | None) -> None:
+        self.cfg, self.tasks, kept = cfg, tasks, None
+        if begun is None:
+            self.policy = self._new_policy()
+        else:
+            kept = load_pretrained(begun.policy)
+            self.policy = kept.policy
+        for task in tasks:
+            task.begin(self.policy_for(task.scene), begun)
+        rates = {name: cfg[name] for name in ("policy_lr", "value_lr", "alpha_lr")}
+        self.optimizer = ActorCriticOptimizer([task.loss for task in tasks], **rates)
+        if kept is not None:
+            self.optimizer.load_state_dict(kept.training)
+
+    def _new_policy(self) -> BoundedPolicy:
+        first = self.tasks[0]
+        if self.cfg.policy == "graph":
+            return GraphStatePolicy(first.scene, canonicalizer=first.invariances, **plain_config(self.cfg)["graph"])
+        if self.cfg.policy != "mlp" or len(self.tasks) > 1:
+            wanted = "mlp or graph" if len(self.tasks) == 1 else "graph to learn on several systems"
+            raise ValueError(f"policy={self.cfg.policy} must be {wanted}.")
+        return StatePolicy(first.scene, hidden=self.cfg.hidden, canonicalizer=first.invariances)
+
+    def policy_for(self, scene: Scene) -> BoundedPolicy:
+        """The policy for a scene, sharing its weights."""
+        if isinstance(self.policy, GraphStatePolicy) and scene is not self.policy.scene:
+            return self.policy.for_scene(scene)
+        return self.policy
+
+    def learn(self, index: int) -> dict[str, float]:
+        """Train the models, then policy and values in them."""
+        for task in self.tasks:
+            task.learn_model(index)
+        batches = [task.starts() for task in self.tasks]
+        sizes = {"updates": self.cfg.updates, "batch_size": self.cfg.batch_size}
+        return self.optimizer.learn(batches, **sizes, desc=f"policy, round {index}")
+
+    def save(self, of: Round) -> None:
+        """Write the networks of a round, with what the next needs."""
+        of.path.mkdir(parents=True, exist_ok=True)
+        config = plain_config(self.cfg)
+        for task in self.tasks:
+            of.of("model", task).parent.mkdir(exist_ok=True)
+            save_checkpoint(of.of("model", task), task.model, scene=task.scene, config=config)
+            save_checkpoint(of.of("value", task), task.value, scene=task.scene, config=config)
+        scenes = [task.scene for task in self.tasks]
+        save_checkpoint(of.policy, self.policy, scene=scenes, config=config, training=self.optimizer.state_dict())

@@ -1,0 +1,105 @@
+"""What every body of a scene perceives in its own frame, as a graph of the bodies."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.maths import BODY_STATE, quaternion
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.networks.graph import Graph, GraphSize
+from torchrl_gn.networks.incidence import Incidence
+from torchrl_gn.rewards.bodies import require_bodies
+from torchrl_gn.scenes import Scene
+
+_FLOOR, _LIMIT = 1e-6, 5.0  # as of StateFeatures
+
+
+class BodyFrameFeatures(Float64Buffers):
+    r"""Graph of a scene's bodies without the world, each seen in its own frame, normalised.
+
+    A node has its velocities :math:`R^T v`, :math:`R^T \omega`, the world's origin :math:`-R^T x` and the world's axes,
+    the rows of :math:`R`; an edge, from body to body of a joint, the sender's pose in the receiver's frame, and as
+    static feature its direction. Position along axes where the task is the same everywhere, and axes that only the yaw
+    distinguishes, are left out. So features have the same meaning in scenes of any number of bodies.
+
+    TypeError for a robot known by its joints alone.
+
+    Args:
+        invariances: the task's, see :func:`task_invariances`.
+    """
+
+    bodies: Tensor
+    visible: Tensor
+
+    def __init__(self, scene: Scene, invariances: Canonicalizer) -> None:
+        super().__init__()
+        require_bodies(scene)
+        self.scene, self.options = scene, invariances
+        bodies = np.flatnonzero(scene.predicted)
+        row = np.full(scene.num_nodes, -1)
+        row[bodies] = np.arange(len(bodies))
+        pairs = np.stack((row[scene.senders], row[scene.receivers]))
+        pairs = pairs[:, (pairs >= 0).all(0)]
+        _, first = np.unique(pairs, axis=1, return_index=True)  # several joints may join the same two bodies
+        first = np.sort(first)
+        edge_index = torch.as_tensor(pairs[:, first]).long()
+        # A joint's edges lead from the parent, then back.
+        within = (row[scene.senders] >= 0) & (row[scene.receivers] >= 0)
+        direction = 1.0 - 2.0 * (np.flatnonzero(within)[first] % 2)
+        frame = scene.yaw_frame if invariances.yaw else None
+        self.axes = slice(0, 3) if frame is None else slice(frame.axis, frame.axis + 1)
+        hidden = np.asarray(scene.translation_invariant) if invariances.recenter else np.zeros(3, bool)
+        self.constants({"bodies": bodies, "visible": 1.0 - hidden, "direction": direction[:, None]})
+        self.incidence = Incidence(edge_index, len(bodies))
+        self.size = GraphSize(9 + 3 * len(range(*self.axes.indices(3))), 12, 0)
+        self.node_normalizer = Normalizer(self.size.nodes, floor=_FLOOR, limit=_LIMIT)
+        self.edge_normalizer = Normalizer(self.size.edges, floor=_FLOOR, limit=_LIMIT)
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the normalisers have data. Waits for the device."""
+        return self.node_normalizer.fitted
+
+    @torch.no_grad()
+    def update(self, state: Tensor) -> None:
+        """Add states ``[*B, N, 13]`` to the normalisers; ValueError if one is not finite."""
+        nodes, edges = self._features(state)
+        self.node_normalizer.update(nodes)
+        self.edge_normalizer.update(edges)
+
+    def forward(self, state: Tensor, dtype: torch.dtype | None = None) -> Graph:
+        """Graphs ``[*B]`` of states ``[*B, N, 13]``; differentiable."""
+        nodes, edges = self._features(state)
+        nodes, edges = self.node_normalizer(nodes, dtype), self.edge_normalizer(edges, dtype)
+        return Graph(nodes, edges, nodes.new_zeros(*nodes.shape[:-2], 0), self.incidence.edge_index)
+
+    def static_graph(self, like: Tensor) -> Graph:
+        """Directions of the edges, equal for every sample."""
+        direction = cast(Tensor, self.direction).to(like)
+        nodes, globals_ = like.new_zeros(self.incidence.num_nodes, 0), like.new_zeros(0)
+        return Graph(nodes, direction, globals_, self.incidence.edge_index)
+
+    def _features(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Features of nodes ``[*B, N', F_n]`` and edges ``[*B, E', F_e]``."""
+        if state.shape[-2:] != (shape := (self.scene.num_nodes, BODY_STATE.size)):
+            raise ValueError(f"States of {self.scene.name!r} must be {['*B', *shape]}, got {list(state.shape)}.")
+        state = state.index_select(-2, self.bodies)
+        position, orientation, velocity, angular = (
+            state[..., BODY_STATE.slices[name]]
+            for name in ("position", "orientation", "linear_velocity", "angular_velocity")
+        )
+        world = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
+        own = world.mT
+        seen = torch.stack((velocity, angular, -position * self.visible.to(state.dtype)), -1)
+        axes = world[..., self.axes, :].flatten(-2)  # of the world, in the body's frame
+        nodes = torch.cat(((own @ seen).mT.flatten(-2), axes), -1)
+        sender, receiver = self.incidence.edge_index
+        frame, offset = own[..., receiver, :, :], position[..., sender, :] - position[..., receiver, :]
+        relative = torch.cat((world[..., sender, :, :], offset.unsqueeze(-1)), -1)
+        return nodes, (frame @ relative).flatten(-2)

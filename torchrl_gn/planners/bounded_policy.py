@@ -1,0 +1,99 @@
+"""What policies over a scene's states share: bounds, exploration and the TensorDict keys."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
+from torchrl_gn.planners.state_features import StateFeatures
+from torchrl_gn.scenes import Scene
+
+_LOG_STD, _LOG_STD_BOUNDS = -1.0, (-5.0, 1.0)  # at first, and where it may get
+
+
+class BoundedPolicy(TensorDictModuleBase):
+    """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]``.
+
+    Explores, with TorchRL's exploration type RANDOM, by Gaussian noise before the tanh that bounds its actions.
+
+    Args:
+        stds: number of learned standard deviations.
+
+    Raises:
+        ValueError: the scene has no actions, or some without bounds.
+    """
+
+    middle: Tensor
+    half_range: Tensor
+    features: StateFeatures | BodyFrameFeatures
+
+    def __init__(self, scene: Scene, stds: int) -> None:
+        super().__init__()
+        self.in_keys: list[NestedKey] = ["state"]
+        self.out_keys: list[NestedKey] = ["action"]
+        self.bound_to(scene)
+        self.log_std = nn.Parameter(torch.full((stds,), _LOG_STD))
+
+    def bound_to(self, scene: Scene) -> None:
+        """Take over the bounds of a scene's actions."""
+        if not scene.num_actions or scene.unbounded:
+            raise ValueError(f"Scene {scene.name!r} must have actions, all with bounds, for a policy to choose.")
+        low, high = torch.as_tensor(scene.action_low), torch.as_tensor(scene.action_high)
+        device = self.log_std.device if hasattr(self, "log_std") else None
+        for name, bound in (("middle", (low + high) / 2), ("half_range", (high - low) / 2)):
+            self.register_buffer(name, bound.float().to(device), persistent=False)
+
+    @abstractmethod
+    def unbounded(self, state: Tensor) -> Tensor:
+        """Actions ``[*B, A]`` before the tanh, without exploration; ValueError for states of another shape."""
+
+    @abstractmethod
+    def description(self) -> dict[str, Any]:
+        """JSON-able values from which :meth:`from_description` rebuilds the policy."""
+
+    @classmethod
+    @abstractmethod
+    def from_description(cls, description: dict[str, Any]) -> BoundedPolicy:
+        """Build the policy of a :meth:`description`, with fresh weights."""
+
+    @property
+    def scene(self) -> Scene:
+        return self.features.scene
+
+    @property
+    def fitted(self) -> bool:
+        """Whether it has learned from data. Waits for the device."""
+        return self.features.fitted
+
+    @property
+    def log_stds(self) -> Tensor:
+        """Logarithm of each action's standard deviation before the tanh, without its limits: one, or ``[A]``."""
+        return self.log_std
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        explores, state = exploration_type() == ExplorationType.RANDOM, tensordict["state"]
+        return tensordict.set("action", self.sample(state)[0] if explores else self.act(state))
+
+    def act(self, state: Tensor) -> Tensor:
+        """Actions ``[*B, A]`` in states ``[*B, N, 13]``; ValueError for another shape."""
+        return self.middle + self.half_range * self.unbounded(state).tanh()
+
+    def sample(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Random actions ``[*B, A]``, reparameterised, and the log densities ``[*B]`` of their scaled ones."""
+        std = self.log_stds.clamp(*_LOG_STD_BOUNDS).exp()
+        noise = torch.randn_like(before := self.unbounded(state))
+        before = before + std * noise
+        # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)), which does not cancel.
+        slope = 2 * (math.log(2) - before - softplus(-2 * before))
+        density = -0.5 * (noise.square() + math.log(2 * math.pi)) - std.log() - slope
+        return self.middle + self.half_range * before.tanh(), density.sum(-1)

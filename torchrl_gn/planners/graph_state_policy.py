@@ -1,0 +1,123 @@
+"""A graph network as policy over states, for robots of any number of bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.networks.gn_core import GNCore
+from torchrl_gn.networks.graph import GraphSize
+from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
+from torchrl_gn.planners.bounded_policy import BoundedPolicy
+from torchrl_gn.planners.state_features import StateFeatures, check_hidden
+from torchrl_gn.policies.observation_network import sharing_weights
+from torchrl_gn.scenes import Scene
+
+
+class GraphStatePolicy(BoundedPolicy):
+    """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]``, by a graph network.
+
+    Two graph networks over :class:`BodyFrameFeatures`; a joint's actions are read at the body that it moves. The same
+    weights drive other scenes (:meth:`for_scene`), which may learn at once: one
+    :class:`~torchrl_gn.objectives.SHACLoss` each, whose gradients add. Otherwise as
+    :class:`~torchrl_gn.planners.StatePolicy`; the learned standard deviations are those of a body's actions.
+
+    Args:
+        hidden, latent: as of the forward model's core.
+        canonicalizer: the task's invariances, see :func:`~torchrl_gn.planners.task_invariances`. Default: none.
+
+    Raises:
+        ValueError: the scene has no actions, some without bounds, or one that is not at exactly one joint.
+
+    Example:
+        >>> from torchrl_gn.scenes import load_scene
+        >>> policy = GraphStatePolicy(load_scene("swimmer3"))
+        >>> longer = policy.for_scene(load_scene("swimmer6"))
+        >>> longer.act(torch.zeros(5, 7, 13)).shape
+        torch.Size([5, 5])
+    """
+
+    features: BodyFrameFeatures  # pyright: ignore[reportIncompatibleVariableOverride]
+    slots: Tensor
+    take: Tensor
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        hidden: Sequence[int] = (64, 64),
+        latent: int = 64,
+        canonicalizer: Canonicalizer | None = None,
+    ) -> None:
+        nodes, slots = _places(scene)
+        super().__init__(scene, count := int(slots.max(initial=-1)) + 1)
+        self.hidden, self.latent = check_hidden(hidden), latent
+        self.features = BodyFrameFeatures(scene, canonicalizer or Canonicalizer(recenter=False, yaw=False))
+        self.network = GNCore(self.features.size, GraphSize(0, 1, 0), count, hidden=self.hidden, latent=latent)
+        self._read_at(nodes, slots)
+
+    def _read_at(self, nodes: np.ndarray, slots: np.ndarray) -> None:
+        device = self.log_std.device
+        for name, value in (("slots", slots), ("take", nodes * len(self.log_std) + slots)):
+            self.register_buffer(name, torch.as_tensor(value, device=device), persistent=False)
+
+    @property
+    def log_stds(self) -> Tensor:
+        return self.log_std[self.slots]
+
+    def for_scene(self, scene: Scene) -> GraphStatePolicy:
+        """The same weights and statistics for another scene; ValueError if a body there has more actions."""
+        nodes, slots = _places(scene)
+        if slots.max(initial=-1) >= len(self.log_std):
+            raise ValueError(
+                f"A body of scene {scene.name!r} has {slots.max() + 1} actions, the policy has {len(self.log_std)}."
+            )
+        features = BodyFrameFeatures(scene, self.features.options).to(self.log_std.device)
+        if features.size != self.features.size:
+            raise ValueError(f"Scene {scene.name!r} has no yaw to leave out, as {self.scene.name!r} has, or only it.")
+        features.node_normalizer, features.edge_normalizer = (
+            self.features.node_normalizer,
+            self.features.edge_normalizer,
+        )
+        policy = sharing_weights(self)
+        policy.features = features
+        policy.bound_to(scene)
+        policy._read_at(nodes, slots)
+        return policy
+
+    def unbounded(self, state: Tensor) -> Tensor:
+        like = self.log_std
+        core = self.network.fold(self.features.incidence, self.features.static_graph(like))
+        return core.predict(self.features(state, like.dtype)).flatten(-2)[..., self.take]
+
+    def description(self) -> dict[str, Any]:
+        given = {"scene": self.scene.description(), "canonicalizer": asdict(self.features.options)}
+        return {**given, "hidden": self.hidden, "latent": self.latent}
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> GraphStatePolicy:
+        return cls(**StateFeatures.arguments_from(description))
+
+
+def _places(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Row among the moving bodies, and place among its body's actions, of every action."""
+    edges = scene.edge_action[::2]  # of every joint, from the parent
+    nodes, slots, taken = [], [], np.zeros(scene.num_nodes, int)
+    row = np.cumsum(scene.predicted) - 1
+    for action in range(scene.num_actions):
+        joints = np.flatnonzero((edges == action).any(1))
+        if len(joints) != 1:
+            raise ValueError(
+                f"A graph policy reads every action at its joint; action {action} of {scene.name!r} has {len(joints)}."
+            )
+        body = scene.receivers[::2][joints[0]]
+        nodes.append(row[body])
+        slots.append(taken[body])
+        taken[body] += 1
+    return np.array(nodes, int), np.array(slots, int)
