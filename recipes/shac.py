@@ -31,7 +31,7 @@ from tensordict import TensorDict
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, open_log, refuse_other_options, scene_options, with_help
-from _common.actor_critic import WINDOW, play
+from _common.actor_critic import WINDOW
 from _common.actor_critic_rounds import ActorCritic, Round, Task
 from _common.planning_task import reward_of
 from torchrl_gn.atomic import atomic_path, write_json
@@ -96,8 +96,7 @@ def judge(cfg: DictConfig, learner: ActorCritic) -> tuple[list[TensorDict], dict
     """Play every task's judged episodes, without exploration; episodes and numbers."""
     episodes, numbers = [], {}
     for task in learner.tasks:
-        policy = learner.policy_for(task.scene)
-        episodes.append(play(task.env(task.judge, 10_000), policy, **cfg.evaluate, explore=False))
+        episodes.append(task.judged(learner.policy_for(task.scene)))
         rewards = episodes[-1]["next", "reward"].squeeze(-1)
         numbers[f"reward {task.folder}"] = rewards.mean().item()
         numbers[f"std {task.folder}"] = rewards.mean(1).std().item()

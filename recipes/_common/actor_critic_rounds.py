@@ -58,6 +58,12 @@ class Task:
         self.squares = TargetSquares(scene, cfg.target_squares) if cfg.target_squares else None
         self.invariances = task_invariances(scene, reward)
         self.data: list[TensorDict] = []
+        self.judged_starts = None if self.squares is None else self.squares.start_states
+        if (suite_seed := cfg.evaluate.suite_seed) is not None:
+            if self.squares is None:
+                raise ValueError("evaluate.suite_seed= is for a target: give target_squares= too.")
+            states = self.squares.suite_states(cfg.evaluate.episodes, suite_seed)
+            self.judged_starts = lambda n, _: states[:n]
 
     def collect(self, done: list[Round]) -> None:
         """Trajectories of random control, and those that finished rounds played."""
@@ -108,16 +114,16 @@ class Task:
 
         return draw
 
-    def env(self, reward: Reward, seed: int) -> SceneEnv:
-        """The task in MuJoCo."""
-        starts = None if self.squares is None else self.squares.start_states
-        return SceneEnv(self.scene, reward, seed=seed, start_states=starts)
-
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
         """Trajectories of a round's episodes with exploration."""
-        cfg = self.cfg
-        env = self.env(self.reward, seed)
+        cfg, starts = self.cfg, None if self.squares is None else self.squares.start_states
+        env = SceneEnv(self.scene, self.reward, seed=seed, start_states=starts)
         return played_windows(play(env, policy, episodes=cfg.episodes, steps=cfg.steps, explore=True))
+
+    def judged(self, policy: BoundedPolicy) -> TensorDict:
+        """Episodes ``[M, T]`` without exploration, from the same starts every round."""
+        env = SceneEnv(self.scene, self.judge, seed=10_000, start_states=self.judged_starts)
+        return play(env, policy, episodes=self.cfg.evaluate.episodes, steps=self.cfg.evaluate.steps, explore=False)
 
     def add(self, played: TensorDict, of: Round) -> None:
         """Keep a round's trajectories, also in its folder."""

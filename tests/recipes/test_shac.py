@@ -19,7 +19,7 @@ SMALL = (
     "first.steps=5",
 )
 SMALL += ("updates=3", "batch_size=8", "horizon=3", "hidden=[8]", "episodes=2", "steps=50", "model_steps=3")
-SMALL += ("model={hidden:8,latent:8}", "evaluate={episodes:2,steps:20}")
+SMALL += ("model={hidden:8,latent:8}", "evaluate.episodes=2", "evaluate.steps=20")
 
 
 def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
@@ -55,6 +55,7 @@ SWIMMERS = (
     "timestep=0.1",
     "reward=near",
     "target_squares=[0.3,2]",
+    "evaluate.suite_seed=10000",
     "action_repeat=1",
 )
 
@@ -107,6 +108,7 @@ def test_refuses_other_options_and_targets(tmp_path, call):
         (("system=[pendulum,pendulum]",), "graph to learn on several systems"),
         (("target_squares=[0.3]",), "slides freely along x and y, not 'pendulum'"),
         (("system=swimmer3", "reward=near", "target_squares=[-1]"), "must be positive half sides"),
+        (("evaluate.suite_seed=0",), "is for a target: give target_squares= too"),
     ],
 )
 def test_refuses_tasks_that_do_not_fit(options, message, tmp_path, call):
