@@ -8,8 +8,9 @@ policy from the suite's observations, whose reward may be learned too, see recip
 same run_dir goes on, with more rounds too. Results: docs/results/short-horizon-actor-critic.md.
 
 Writes config.yaml, metrics.json, table.md, the learning curve (curve.json and curve.png), a video of the last round's
-first judged episode (episode.gif), and the last policy, value and model (policy.safetensors, value.safetensors,
-checkpoint/), which recipes/mpc.py takes as policy=, value= and checkpoint=; every round's own are in rounds/. With
+first judged episode (episode.gif), and the policy, averaged over rounds, and the last value and model
+(policy.safetensors, value.safetensors, checkpoint/), which recipes/mpc.py takes as policy=, value= and checkpoint=;
+every round's own are in rounds/. With
 several systems, a graph network as the policy learns on all at once, and each has its own value, model and video. All
 options: recipes/config/shac.yaml.
 """
@@ -32,11 +33,12 @@ from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, open_log, refuse_other_options, scene_options, with_help
 from _common.actor_critic import WINDOW
-from _common.actor_critic_rounds import ActorCritic, Round, Task
+from _common.actor_critic_rounds import ActorCritic, Round, Task, policy_for
 from _common.planning_task import reward_of
 from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation import evaluate_errors, plot_learning_curves, rollout_video
+from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder
@@ -49,6 +51,7 @@ COLUMNS = {
     "reward": "mean reward",
     "std": "std over starts",
     "return": "return",
+    "median_return_of_last_five": "median of last five",
     "imagined_reward": "imagined",
     "error": "model's error, 20 steps",
     "entropy": "entropy",
@@ -62,6 +65,9 @@ def error_of(model: Predictor, played: TensorDict) -> float:
 
 def report(run: RunFolder, tasks: list[Task], rounds: list[dict[str, Any]], judged: list[TensorDict]) -> dict[str, Any]:
     """Write table, curve and videos; return the metrics."""
+    for index, numbers in enumerate(rounds):
+        last = [each["return"] for each in rounds[max(0, index - 4) : index + 1]]
+        numbers["median_return_of_last_five"] = statistics.median(last)
     several = {f"return {task.folder}": task.folder for task in tasks} if len(tasks) > 1 else {}
     columns = {**COLUMNS, **several}
     rows = [list(columns.values())]
@@ -82,28 +88,26 @@ def report(run: RunFolder, tasks: list[Task], rounds: list[dict[str, Any]], judg
         name = f"{task.folder}.gif" if several else "episode.gif"
         rollout_video(task.scene, episodes["state"][0], None, run.file(name))
     best = max(rounds, key=lambda numbers: numbers["reward"])
-    last = statistics.median(numbers["return"] for numbers in rounds[-5:])
     each = {f"round {index}/{name}": value for index, of in enumerate(rounds) for name, value in of.items()}
     return {
         **rounds[-1],
-        "median_return_of_last_five": last,
         **{f"best_{name}": best[name] for name in ("reward", "return", "frames")},
         **each,
     }
 
 
-def judge(cfg: DictConfig, learner: ActorCritic) -> tuple[list[TensorDict], dict[str, float]]:
+def judge(cfg: DictConfig, tasks: list[Task], policy: BoundedPolicy) -> tuple[list[TensorDict], dict[str, float]]:
     """Play every task's judged episodes, without exploration; episodes and numbers."""
     episodes, numbers = [], {}
-    for task in learner.tasks:
-        episodes.append(task.judged(learner.policy_for(task.scene)))
+    for task in tasks:
+        episodes.append(task.judged(policy_for(policy, task.scene)))
         rewards = episodes[-1]["next", "reward"].squeeze(-1)
         numbers[f"reward {task.folder}"] = rewards.mean().item()
         numbers[f"std {task.folder}"] = rewards.mean(1).std().item()
         numbers[f"return {task.folder}"] = cfg.action_repeat * rewards.sum(1).mean().item()
     for name in ("reward", "std", "return"):
-        numbers[name] = statistics.fmean(numbers[f"{name} {task.folder}"] for task in learner.tasks)
-    if len(learner.tasks) == 1:
+        numbers[name] = statistics.fmean(numbers[f"{name} {task.folder}"] for task in tasks)
+    if len(tasks) == 1:
         numbers = {name: numbers[name] for name in ("reward", "std", "return")}
     return episodes, numbers
 
@@ -112,7 +116,7 @@ def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float
     """Play every task with exploration; trajectories, and the mean error of the models on them."""
     played, errors = [], []
     for task in learner.tasks:
-        played.append(task.play(learner.policy_for(task.scene), seed))
+        played.append(task.play(policy_for(learner.policy, task.scene), seed))
         errors.append(error_of(task.model, played[-1]) if len(played[-1]) else math.nan)
     return played, statistics.fmean(errors)
 
@@ -132,7 +136,7 @@ def make_tasks(cfg: DictConfig) -> list[Task]:
 @hydra.main(version_base=None, config_path="config", config_name="shac")
 @clean_exit
 def main(cfg: DictConfig) -> None:
-    for name in ("action_repeat", "rounds", "horizon", "updates", "episodes", "model_steps"):
+    for name in ("action_repeat", "average", "rounds", "horizon", "updates", "episodes", "model_steps"):
         check_count(name, cfg[name], 1)
     if cfg.steps < 1 or cfg.steps % WINDOW or cfg.first.length < WINDOW:
         raise ValueError(
@@ -162,7 +166,8 @@ def main(cfg: DictConfig) -> None:
             losses, now = learner.learn(index), Round(run.path, index)
             played, error = play_round(learner, seed)
             seconds = time.process_time() - began
-            judged, numbers = judge(cfg, learner)
+            policy = learner.averaged(run.path, index)
+            judged, numbers = judge(cfg, tasks, policy)
             random_steps = len(tasks) * cfg.first.trajectories * cfg.first.length
             before = rounds[-1] if rounds else {"frames": cfg.action_repeat * random_steps, "minutes": 0.0}
             rounds.append(
@@ -178,8 +183,9 @@ def main(cfg: DictConfig) -> None:
             for task, trajectories in zip(tasks, played, strict=True):
                 task.add(trajectories, now)
             write_json(now.numbers, rounds[-1])
-            files = [now.policy, *(now.of(what, task) for what in ("value", "model") for task in tasks)]
-            for source, target in zip(files, latest, strict=True):
+            learner.save_policy(latest[0], policy)
+            files = [now.of(what, task) for what in ("value", "model") for task in tasks]
+            for source, target in zip(files, latest[1:], strict=True):
                 copy_to(source, target)
             tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)

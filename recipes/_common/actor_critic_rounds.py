@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -144,7 +145,7 @@ class ActorCritic:
             kept = load_pretrained(begun.policy)
             self.policy = kept.policy
         for task in tasks:
-            task.begin(self.policy_for(task.scene), begun)
+            task.begin(policy_for(self.policy, task.scene), begun)
         rates = {name: cfg[name] for name in ("policy_lr", "value_lr", "alpha_lr")}
         self.optimizer = ActorCriticOptimizer([task.loss for task in tasks], **rates)
         if kept is not None:
@@ -159,12 +160,6 @@ class ActorCritic:
             raise ValueError(f"policy={self.cfg.policy} must be {wanted}.")
         return StatePolicy(first.scene, hidden=self.cfg.hidden, canonicalizer=first.invariances)
 
-    def policy_for(self, scene: Scene) -> BoundedPolicy:
-        """The policy for a scene, sharing its weights."""
-        if isinstance(self.policy, GraphStatePolicy) and scene is not self.policy.scene:
-            return self.policy.for_scene(scene)
-        return self.policy
-
     def learn(self, index: int) -> dict[str, float]:
         """Train the models, then policy and values in them."""
         for task in self.tasks:
@@ -172,6 +167,16 @@ class ActorCritic:
         batches = [task.starts() for task in self.tasks]
         sizes = {"updates": self.cfg.updates, "batch_size": self.cfg.batch_size}
         return self.optimizer.learn(batches, **sizes, desc=f"policy, round {index}")
+
+    def averaged(self, folder: Path, index: int) -> BoundedPolicy:
+        """The policy with mean weights of the last rounds, a quarter of all or ``average``: steadier than one."""
+        policy = copy.deepcopy(self.policy)
+        first = index + 1 - min(self.cfg.average, 1 + index // 4)
+        before = [load_pretrained(Round(folder, each).policy).policy for each in range(first, index)]
+        with torch.no_grad():
+            for mean, *weights in zip(policy.parameters(), *(each.parameters() for each in before), strict=True):
+                mean.copy_(torch.stack([mean, *weights]).mean(0))
+        return policy
 
     def save(self, of: Round) -> None:
         """Write the networks of a round, with what the next needs."""
@@ -181,5 +186,16 @@ class ActorCritic:
             of.of("model", task).parent.mkdir(exist_ok=True)
             save_checkpoint(of.of("model", task), task.model, scene=task.scene, config=config)
             save_checkpoint(of.of("value", task), task.value, scene=task.scene, config=config)
+        self.save_policy(of.policy, self.policy, training=self.optimizer.state_dict())
+
+    def save_policy(self, path: Path, policy: BoundedPolicy, **options: Any) -> None:
+        """Write a policy of these tasks."""
         scenes = [task.scene for task in self.tasks]
-        save_checkpoint(of.policy, self.policy, scene=scenes, config=config, training=self.optimizer.state_dict())
+        save_checkpoint(path, policy, scene=scenes, config=plain_config(self.cfg), **options)
+
+
+def policy_for(policy: BoundedPolicy, scene: Scene) -> BoundedPolicy:
+    """The policy for a scene, sharing its weights."""
+    if isinstance(policy, GraphStatePolicy) and scene is not policy.scene:
+        return policy.for_scene(scene)
+    return policy

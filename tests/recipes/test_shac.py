@@ -39,6 +39,14 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     one = load_file(whole / "rounds/000/policy.safetensors")
     assert any(not torch.equal(one[name], first[name]) for name in first if name.startswith("model.network"))
 
+    # Of three rounds the last alone is kept, of six the mean of the last two.
+    last = load_file(whole / "rounds/002/policy.safetensors")
+    assert torch.equal(first["model.log_std"], last["model.log_std"])
+    code, _, errors = call(*SMALL, "rounds=6", f"run_dir={whole}", recipe="shac")
+    assert code == 0, errors
+    two = [load_file(whole / f"rounds/{index:03}/policy.safetensors")["model.log_std"] for index in (4, 5)]
+    torch.testing.assert_close(load_file(whole / "policy.safetensors")["model.log_std"], (two[0] + two[1]) / 2)
+
     # The networks are what the planning recipe takes.
     assert load_pretrained(whole).model is not None
     given = (f"checkpoint={whole}", f"policy={whole}", f"value={whole / 'value.safetensors'}")
