@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, open_log, refuse_other_options, scene_options, with_help
 from _common.actor_critic import WINDOW
-from _common.actor_critic_rounds import ActorCritic, Round, Task, policy_for
+from _common.actor_critic_rounds import ActorCritic, Round, Task
 from _common.planning_task import reward_of
 from torchrl_gn.atomic import atomic_path, write_json
 from torchrl_gn.dynamics import Predictor
@@ -100,7 +100,7 @@ def judge(cfg: DictConfig, tasks: list[Task], policy: BoundedPolicy) -> tuple[li
     """Play every task's judged episodes, without exploration; episodes and numbers."""
     episodes, numbers = [], {}
     for task in tasks:
-        episodes.append(task.judged(policy_for(policy, task.scene)))
+        episodes.append(task.judged(policy.for_scene(task.scene)))
         rewards = episodes[-1]["next", "reward"].squeeze(-1)
         numbers[f"reward {task.folder}"] = rewards.mean().item()
         numbers[f"std {task.folder}"] = rewards.mean(1).std().item()
@@ -116,7 +116,7 @@ def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float
     """Play every task with exploration; trajectories, and the mean error of the models on them."""
     played, errors = [], []
     for task in learner.tasks:
-        played.append(task.play(policy_for(learner.policy, task.scene), seed))
+        played.append(task.play(learner.policy.for_scene(task.scene), seed))
         errors.append(error_of(task.model, played[-1]) if len(played[-1]) else math.nan)
     return played, statistics.fmean(errors)
 

@@ -145,7 +145,7 @@ class ActorCritic:
             kept = load_pretrained(begun.policy)
             self.policy = kept.policy
         for task in tasks:
-            task.begin(policy_for(self.policy, task.scene), begun)
+            task.begin(self.policy.for_scene(task.scene), begun)
         rates = {name: cfg[name] for name in ("policy_lr", "value_lr", "alpha_lr")}
         self.optimizer = ActorCriticOptimizer([task.loss for task in tasks], **rates)
         if kept is not None:
@@ -192,10 +192,3 @@ class ActorCritic:
         """Write a policy of these tasks."""
         scenes = [task.scene for task in self.tasks]
         save_checkpoint(path, policy, scene=scenes, config=plain_config(self.cfg), **options)
-
-
-def policy_for(policy: BoundedPolicy, scene: Scene) -> BoundedPolicy:
-    """The policy for a scene, sharing its weights."""
-    if isinstance(policy, GraphStatePolicy) and scene is not policy.scene:
-        return policy.for_scene(scene)
-    return policy

@@ -17,7 +17,7 @@ from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_sta
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
-from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StateValue
+from torchrl_gn.planners import BoundedPolicy, StateValue
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
@@ -103,16 +103,15 @@ def load_value(cfg: DictConfig, reward: Reward) -> StateValue | None:
 
 
 def load_policy(cfg: DictConfig, scene: Scene) -> BoundedPolicy | None:
-    """The policy that proposes plans; ValueError if it is of another scene and no graph network."""
+    """The policy that proposes plans; ValueError if it cannot drive the scene."""
     if cfg.policy is None:
         return None
     path = Path(cfg.policy)
     policy = load_pretrained(path / "policy.safetensors" if path.is_dir() else path).policy
-    if isinstance(policy, GraphStatePolicy):
+    try:
         return policy.for_scene(scene)
-    if policy.scene.node_names != scene.node_names:
-        raise ValueError(f"policy={cfg.policy} is of scene {policy.scene.name!r}, not {scene.name!r}.")
-    return policy
+    except ValueError as error:
+        raise ValueError(f"policy={cfg.policy}: {error}") from None
 
 
 def reward_of(cfg: DictConfig, scene: Scene, key: str = "reward") -> Reward:

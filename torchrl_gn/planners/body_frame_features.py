@@ -14,10 +14,9 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
+from torchrl_gn.planners.state_features import FLOOR, LIMIT, check_states
 from torchrl_gn.rewards.bodies import require_bodies
 from torchrl_gn.scenes import Scene
-
-_FLOOR, _LIMIT = 1e-6, 5.0  # as of StateFeatures
 
 
 class BodyFrameFeatures(Float64Buffers):
@@ -45,21 +44,19 @@ class BodyFrameFeatures(Float64Buffers):
         row = np.full(scene.num_nodes, -1)
         row[bodies] = np.arange(len(bodies))
         pairs = np.stack((row[scene.senders], row[scene.receivers]))
-        pairs = pairs[:, (pairs >= 0).all(0)]
-        _, first = np.unique(pairs, axis=1, return_index=True)  # several joints may join the same two bodies
-        first = np.sort(first)
-        edge_index = torch.as_tensor(pairs[:, first]).long()
-        # A joint's edges lead from the parent, then back.
-        within = (row[scene.senders] >= 0) & (row[scene.receivers] >= 0)
-        direction = 1.0 - 2.0 * (np.flatnonzero(within)[first] % 2)
+        within = np.flatnonzero((pairs >= 0).all(0))
+        _, first = np.unique(pairs[:, within], axis=1, return_index=True)  # several joints may join the same two bodies
+        edges = within[np.sort(first)]
+        edge_index = torch.as_tensor(pairs[:, edges]).long()
+        direction = 1.0 - 2.0 * (edges % 2)  # a joint's edges lead from the parent, then back
         frame = scene.yaw_frame if invariances.yaw else None
         self.axes = slice(0, 3) if frame is None else slice(frame.axis, frame.axis + 1)
         hidden = np.asarray(scene.translation_invariant) if invariances.recenter else np.zeros(3, bool)
         self.constants({"bodies": bodies, "visible": 1.0 - hidden, "direction": direction[:, None]})
         self.incidence = Incidence(edge_index, len(bodies))
         self.size = GraphSize(9 + 3 * len(range(*self.axes.indices(3))), 12, 0)
-        self.node_normalizer = Normalizer(self.size.nodes, floor=_FLOOR, limit=_LIMIT)
-        self.edge_normalizer = Normalizer(self.size.edges, floor=_FLOOR, limit=_LIMIT)
+        self.node_normalizer = Normalizer(self.size.nodes, floor=FLOOR, limit=LIMIT)
+        self.edge_normalizer = Normalizer(self.size.edges, floor=FLOOR, limit=LIMIT)
 
     @property
     def fitted(self) -> bool:
@@ -87,8 +84,7 @@ class BodyFrameFeatures(Float64Buffers):
 
     def _features(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Features of nodes ``[*B, N', F_n]`` and edges ``[*B, E', F_e]``."""
-        if state.shape[-2:] != (shape := (self.scene.num_nodes, BODY_STATE.size)):
-            raise ValueError(f"States of {self.scene.name!r} must be {['*B', *shape]}, got {list(state.shape)}.")
+        check_states(self.scene, state)
         state = state.index_select(-2, self.bodies)
         position, orientation, velocity, angular = (
             state[..., BODY_STATE.slices[name]]

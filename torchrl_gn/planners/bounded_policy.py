@@ -41,17 +41,20 @@ class BoundedPolicy(TensorDictModuleBase):
         super().__init__()
         self.in_keys: list[NestedKey] = ["state"]
         self.out_keys: list[NestedKey] = ["action"]
-        self.bound_to(scene)
         self.log_std = nn.Parameter(torch.full((stds,), _LOG_STD))
+        self.bound_to(scene)
 
     def bound_to(self, scene: Scene) -> None:
         """Take over the bounds of a scene's actions."""
         if not scene.num_actions or scene.unbounded:
             raise ValueError(f"Scene {scene.name!r} must have actions, all with bounds, for a policy to choose.")
         low, high = torch.as_tensor(scene.action_low), torch.as_tensor(scene.action_high)
-        device = self.log_std.device if hasattr(self, "log_std") else None
         for name, bound in (("middle", (low + high) / 2), ("half_range", (high - low) / 2)):
-            self.register_buffer(name, bound.float().to(device), persistent=False)
+            self.register_buffer(name, bound.float().to(self.log_std.device), persistent=False)
+
+    @abstractmethod
+    def for_scene(self, scene: Scene) -> BoundedPolicy:
+        """The policy for a scene, sharing its weights; ValueError if it cannot drive it."""
 
     @abstractmethod
     def unbounded(self, state: Tensor) -> Tensor:

@@ -73,6 +73,8 @@ class GraphStatePolicy(BoundedPolicy):
 
     def for_scene(self, scene: Scene) -> GraphStatePolicy:
         """The same weights and statistics for another scene; ValueError if a body there has more actions."""
+        if scene is self.scene:
+            return self
         nodes, slots = _places(scene)
         if slots.max(initial=-1) >= len(self.log_std):
             raise ValueError(

@@ -18,7 +18,7 @@ from torchrl_gn.rewards.bodies import require_bodies
 from torchrl_gn.scenes import PhysicalParameters, Scene, scene_from_description
 
 _STATES = 16  # to compare rewards at
-_FLOOR, _LIMIT = 1e-6, 5.0  # standard deviations: rounding noise, and where a planner has left the data
+FLOOR, LIMIT = 1e-6, 5.0  # standard deviations: rounding noise, and where a planner has left the data
 
 
 class StateFeatures(Float64Buffers):
@@ -41,7 +41,7 @@ class StateFeatures(Float64Buffers):
         self.physical = PhysicalParameters.of(scene)
         self.constants({"rest": self.physical.rest, "pivot": self.physical.pivot})
         self.size = scene.num_nodes * BODY_STATE.encoded_size()
-        self.normalizer = Normalizer(self.size, floor=_FLOOR, limit=_LIMIT)
+        self.normalizer = Normalizer(self.size, floor=FLOOR, limit=LIMIT)
 
     @property
     def fitted(self) -> bool:
@@ -64,8 +64,7 @@ class StateFeatures(Float64Buffers):
         return self.normalizer(self._encoded(state), dtype)
 
     def _encoded(self, state: Tensor) -> Tensor:
-        if state.shape[-2:] != (shape := (self.scene.num_nodes, BODY_STATE.size)):
-            raise ValueError(f"States of {self.scene.name!r} must be {['*B', *shape]}, got {list(state.shape)}.")
+        check_states(self.scene, state)
         canonical = self.canonicalizer(state, self.physical._replace(rest=self.rest, pivot=self.pivot))
         return BODY_STATE.encode(canonical.state, "matrix", canonical.matrices).flatten(-2)
 
@@ -107,6 +106,12 @@ def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicaliz
         rotation[0], rotation[1 + frame.axis] = 0.8, 0.6
         yaw = keeps(lambda each: BODY_STATE.rotate(each, rotation.expand(_STATES, 4)))
     return Canonicalizer(recenter=keeps(lambda each: each + shift), yaw=yaw)
+
+
+def check_states(scene: Scene, state: Tensor) -> None:
+    """Raise ValueError unless states are ``[*B, N, 13]`` of the scene."""
+    if state.shape[-2:] != (shape := (scene.num_nodes, BODY_STATE.size)):
+        raise ValueError(f"States of {scene.name!r} must be {['*B', *shape]}, got {list(state.shape)}.")
 
 
 def check_hidden(hidden: Sequence[int]) -> list[int]:

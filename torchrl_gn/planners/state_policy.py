@@ -42,6 +42,11 @@ class StatePolicy(BoundedPolicy):
         self.hidden, self.features = check_hidden(hidden), StateFeatures(scene, canonicalizer)
         self.network = LayerNormMLP(self.features.size, scene.num_actions, self.hidden)
 
+    def for_scene(self, scene: Scene) -> StatePolicy:
+        if scene.node_names != self.scene.node_names:
+            raise ValueError(f"The policy is of scene {self.scene.name!r}, not {scene.name!r}.")
+        return self
+
     def unbounded(self, state: Tensor) -> Tensor:
         return self.network(self.features(state, next(self.network.parameters()).dtype))
 
