@@ -17,6 +17,7 @@ from torchrl_gn.dynamics import (
     specialize,
 )
 from torchrl_gn.maths import BODY_STATE
+from torchrl_gn.scenes import load_scene
 
 ALL = ("pendulum", "swimmer6", "cheetah", "joints", "falling")
 QUATERNIONS = (BodyState(encoding="quaternion"), Controls(), JointAxes(), Contacts())
@@ -174,7 +175,31 @@ def test_actions_beyond_the_limits_do_what_those_at_the_limits_do(scenes, make_m
     cut = torch.minimum(torch.maximum(action, low), high)
     assert not torch.equal(action, cut)
     for model in (bound, specialize(bound)):
-        assert torch.equal(model.step(state, action)[0], model.step(state, cut)[0])
+        found, expected = (model.step(state, each)[0] - state for each in (action, cut))
+        assert (found - expected).norm() < 1e-5 * expected.norm()
+
+
+@pytest.mark.parametrize("executor", ["eager", "native"])
+def test_actions_at_their_limits_have_gradients_whatever_their_rounding(
+    make_model, random_states, random_actions, executor
+):
+    """JACO's limits, in single precision, lie a little outside of those in double precision."""
+    scene = load_scene("jaco")
+    predictor = specialize(make_model(scene).float().bind(scene), executor=executor)
+    state, actions = random_states(scene, 5), random_actions(scene, 5, 4).float()
+    limits = [torch.as_tensor(each).float() for each in (scene.action_low, scene.action_high)]
+    rounded = [torch.nextafter(each, to * torch.inf) for each, to in zip(limits, limits, strict=True)]
+    for at in (*limits, *rounded):
+        gradients = []
+        for size in (1.0, 0.9999):
+            action = (size * at).expand_as(actions).clone().requires_grad_()
+            after = predictor.rollout(state, action)[0]
+            gradients += torch.autograd.grad(
+                (after * torch.linspace(-1, 1, after[0].numel()).view_as(after[0])).sum(), action
+            )
+        found, inside = gradients
+        assert (found != 0).all()
+        assert (found - inside).norm() < 0.01 * inside.norm()
 
 
 def test_binds_on_the_meta_device(scenes, make_model):

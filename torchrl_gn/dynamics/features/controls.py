@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,6 +16,8 @@ from torchrl_gn.maths.state_layout import StateLayout
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
     from torchrl_gn.scenes import KinematicTree, Scene
+
+_SLACK = 1e-6  # of the larger bound
 
 
 @dataclass(frozen=True)
@@ -67,16 +70,19 @@ class ControlInputs(Float64Buffers):
         super().__init__()
         self.present = present_actions(scene)
         edge_action = torch.as_tensor(scene.edge_action).long()
+        # Actions in single precision may lie above their bound by rounding: there a planner still needs the gradient.
+        bounds = np.stack((scene.action_low, scene.action_high))
+        slack = _SLACK * np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(0)
         values = {
-            "action_low": torch.as_tensor(scene.action_low),
-            "action_high": torch.as_tensor(scene.action_high),
+            "action_low": torch.as_tensor(scene.action_low - slack),
+            "action_high": torch.as_tensor(scene.action_high + slack),
             # A column of zeros behind the actions stands for edges without actuator.
             "edge_action": torch.where(edge_action < 0, scene.num_actions, edge_action),
         }
         self.constants(values)
 
     def forward(self, action: Tensor) -> Tensor:
-        """Controls ``[*B, E, C]`` of actions ``[*B, A]``, clipped to the actuators' limits as MuJoCo clips them."""
+        """Controls ``[*B, E, C]`` of actions ``[*B, A]``, clipped to the actuators' limits as in MuJoCo."""
         # 0 * action: an infinite action gives NaN and not the limit.
         action = action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype)) + 0 * action
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
