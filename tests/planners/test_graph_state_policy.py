@@ -80,6 +80,28 @@ def test_equals_message_passing() -> None:
     torch.testing.assert_close(policy.unbounded(state), plain[:, 1:, 0], rtol=1e-4, atol=1e-6)
 
 
+def test_prepared_weights_act_and_learn_as_others(monkeypatch) -> None:
+    policy, state = make_policy("swimmer3", NEAR)
+    fold, folds = policy.network.fold, []
+    monkeypatch.setattr(policy.network, "fold", lambda *given: folds.append(1) or fold(*given))
+    weights = list(policy.network.parameters())
+
+    def act() -> list[Tensor]:
+        total = policy.act(state).sum() + policy.act(2 * state).square().sum()
+        return [total.detach(), *torch.autograd.grad(total, weights)]
+
+    expected = act()
+    assert len(folds) == 2
+    with policy.prepared():
+        found = act()
+    assert len(folds) == 3
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+    with torch.no_grad():
+        weights[-1] += 1
+    assert not torch.equal(act()[0], expected[0])
+
+
 def test_drives_other_scenes_with_the_same_weights(tmp_path) -> None:
     policy, _ = make_policy("swimmer3", NEAR)
     longer = policy.for_scene(load_scene("swimmer6"))

@@ -119,7 +119,7 @@ class SHACLoss(LossModule):
         """Steps ``[B, H]`` of the policy in the model, and the mean entropy of its actions."""
         now = self.env.reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
         steps, entropies = [], []
-        with frozen(self.env.world_model), set_exploration_type(ExplorationType.RANDOM):
+        with frozen(self.env.world_model), self.policy.prepared(), set_exploration_type(ExplorationType.RANDOM):
             for _ in range(self.steps):
                 if (state := cast(Tensor, now["state"])).requires_grad:
                     state.register_hook(_finite_rows)

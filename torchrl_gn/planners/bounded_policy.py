@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -82,6 +84,11 @@ class BoundedPolicy(TensorDictModuleBase):
     def log_stds(self) -> Tensor:
         """Logarithm of each action's standard deviation before the tanh, without its limits: one, or ``[A]``."""
         return self.log_std
+
+    @contextmanager
+    def prepared(self) -> Iterator[None]:
+        """Prepare the weights once for all actions inside, where they must not change; gradients still reach them."""
+        yield
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         explores, state = exploration_type() == ExplorationType.RANDOM, tensordict["state"]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.graph import GraphSize
 from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
@@ -46,6 +48,7 @@ class GraphStatePolicy(BoundedPolicy):
     features: BodyFrameFeatures  # pyright: ignore[reportIncompatibleVariableOverride]
     slots: Tensor
     take: Tensor
+    _folded: FoldedGNCore | None = None
 
     def __init__(
         self,
@@ -94,9 +97,19 @@ class GraphStatePolicy(BoundedPolicy):
         return policy
 
     def unbounded(self, state: Tensor) -> Tensor:
-        like = self.log_std
-        core = self.network.fold(self.features.incidence, self.features.static_graph(like))
-        return core.predict(self.features(state, like.dtype)).flatten(-2)[..., self.take]
+        core = self._fold() if self._folded is None else self._folded
+        return core.predict(self.features(state, self.log_std.dtype)).flatten(-2)[..., self.take]
+
+    def _fold(self) -> FoldedGNCore:
+        return self.network.fold(self.features.incidence, self.features.static_graph(self.log_std))
+
+    @contextmanager
+    def prepared(self) -> Iterator[None]:
+        self._folded = self._fold()
+        try:
+            yield
+        finally:
+            self._folded = None
 
     def description(self) -> dict[str, Any]:
         given = {"scene": self.scene.description(), "canonicalizer": asdict(self.features.options)}
