@@ -73,7 +73,7 @@ from torchrl_gn.training import RunFolder
 
 SAVE_SECONDS = 60
 # Options that may differ when a run goes on.
-MAY_CHANGE = ("planner", "steps", "executor", "threads", "simulation_threads", "video", "logger", "run_dir")
+MAY_CHANGE = ("planner", "steps", "executor", "goal", "threads", "simulation_threads", "video", "logger", "run_dir")
 
 
 class RandomControl(TensorDictModuleBase):
@@ -183,7 +183,7 @@ def main(cfg: DictConfig) -> None:
         start["target"] = target
 
     metrics: dict[str, Any] = {"horizon": cfg.horizon, "steps": cfg.steps, "episodes": cfg.episodes}
-    rows = [["planner", "mean reward", "std", "last tenth", "way left", "became unstable", "ms a step"]]
+    rows = [["planner", "mean reward", "std", "last tenth", "way left", "goal", "became unstable", "ms a step"]]
     curves: dict[str, Tensor] = {}
     for name in cfg.planner:
         episodes = Episodes(run.file(f"{name}.safetensors"), start.copy())
@@ -198,12 +198,13 @@ def main(cfg: DictConfig) -> None:
             planner = PlanAhead(cast(Any, planner), cfg.delay)
         policy = planner if target is None else TensorDictSequential([FreezeGoal(reward), planner])
         execute(cfg, name, policy, env, imagined, episodes)
-        of = summarize(episodes, target if reward.target_shape == (3,) else None)
+        of = summarize(episodes, target if reward.target_shape == (3,) else None, cfg.goal)
         metrics |= {f"{name}/{key}": value for key, value in of.items()}
         left_text = f"{100 * of['distance_left']:.0f} %" if "distance_left" in of else ""
         numbers = [f"{of[key]:.4g}" for key in ("mean_reward", "mean_reward_std", "last_tenth_reward")]
+        goal_text = f"reached by {of['reached']}, held by {of['held']}" if "reached" in of else ""
         ended = f"{of['unstable']} of {cfg.episodes} episodes" if of["unstable"] else ""
-        rows.append([name, *numbers, left_text, ended, f"{of['planning_ms']:.0f}"])
+        rows.append([name, *numbers, left_text, goal_text, ended, f"{of['planning_ms']:.0f}"])
         curves[name] = episodes["reward"]
         if cfg.video:
             film(episodes, scenes[0], cfg.horizon, run.file(f"{name}.gif"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import cast
 
@@ -104,13 +105,18 @@ def distance_left(episodes: Episodes, target: Tensor) -> Tensor:
     return away[:, 1] / away[:, 0]
 
 
-def summarize(episodes: Episodes, target: Tensor | None) -> dict[str, float]:
-    """Summarise a planner's episodes; with ``target`` ``[B, 3]``, the distance left to it too."""
+def summarize(episodes: Episodes, target: Tensor | None, goal: float | None = None) -> dict[str, float]:
+    """Summarise a planner's episodes.
+
+    With ``target`` ``[B, 3]``, the distance left to it too; with ``goal``, a step's reward, how many starts reach it
+    and hold it throughout the last tenth.
+    """
     rewards, seconds = episodes["reward"], episodes["seconds"]
+    last = rewards[:, -max(1, rewards.shape[1] // 10) :]
     of = {
         "mean_reward": rewards.nanmean().item(),
         "mean_reward_std": standard_deviation(rewards.nanmean(1)),
-        "last_tenth_reward": rewards[:, -max(1, rewards.shape[1] // 10) :].nanmean().item(),
+        "last_tenth_reward": last.nanmean().item(),
         "unstable": episodes.over.sum().item(),
         "planning_ms": 1e3 * seconds.median().item(),
         "planning_ms_first": 1e3 * seconds[0].item(),
@@ -118,6 +124,10 @@ def summarize(episodes: Episodes, target: Tensor | None) -> dict[str, float]:
     if target is not None:
         left = distance_left(episodes, target)
         of |= {"distance_left": left.nanmean().item(), "distance_left_std": standard_deviation(left)}
+    if goal is not None:
+        reached = rewards >= goal
+        of |= {"reached": reached.any(1).sum().item(), "held": (last >= goal).all(1).sum().item()}
+        of["steps_to_goal"] = 1.0 + max(reached.int().argmax(1)[reached.any(1)].tolist(), default=math.nan)
     return of
 
 

@@ -65,6 +65,23 @@ def test_variants_start_alike_whoever_plans(tmp_path, call):
     assert code == 1 and "random.safetensors began in other states" in errors and "Traceback" not in errors
 
 
+def test_counts_the_starts_that_reach_a_goal_and_hold_it(tmp_path, call):
+    options = ("system=pendulum", "planner=random", "episodes=4", "steps=30", "video=false", f"run_dir={tmp_path}")
+    code, output, errors = call(*options, recipe="mpc")
+    assert code == 0 and "goal" not in output, errors
+    rewards = load_file(tmp_path / "random.safetensors")["reward"]
+    goal = float(rewards[0].max())  # reached by the first start, and by others that do better
+    code, output, errors = call(*options, f"goal={goal}", recipe="mpc")
+    assert code == 0, errors
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    reached = (rewards >= goal).any(1)
+    held = int((rewards[:, -3:] >= goal).all(1).sum())
+    assert metrics["random/reached"] == reached.sum() and metrics["random/held"] == held
+    assert f"reached by {reached.sum()}, held by {held}" in output
+    first = [(row >= goal).nonzero()[0].item() for row in rewards[reached]]
+    assert metrics["random/steps_to_goal"] == 1 + max(first)
+
+
 def test_targets_that_are_poses(tmp_path, call):
     options = ("system=jaco", "planner=nothing", "episodes=2", "video=false", f"run_dir={tmp_path}")
     for steps in (1, 2):  # the second goes on from what the first saved
