@@ -41,10 +41,10 @@ from torchrl_gn.evaluation import evaluate_errors, plot_learning_curves, rollout
 from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import RunFolder
+from torchrl_gn.training import RunFolder, load_pretrained
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
-MAY_CHANGE = ("rounds", "threads", "logger", "run_dir")
+MAY_CHANGE = ("rounds", "zero_shot", "threads", "logger", "run_dir")
 COLUMNS = {
     "frames": "frames",
     "minutes": "processor minutes",
@@ -63,8 +63,10 @@ def error_of(model: Predictor, played: TensorDict) -> float:
     return evaluate_errors(model, played, horizons=(20,), one_step=False).errors["rollout_error_20"].total
 
 
-def report(run: RunFolder, tasks: list[Task], rounds: list[dict[str, Any]], judged: list[TensorDict]) -> dict[str, Any]:
-    """Write table, curve and videos; return the metrics."""
+def report(
+    run: RunFolder, tasks: list[Task], rounds: list[dict[str, Any]], judged: list[TensorDict], others: dict[str, float]
+) -> dict[str, Any]:
+    """Write table, curve and videos, and say what was judged on ``others``; return the metrics."""
     for index, numbers in enumerate(rounds):
         last = [each["return"] for each in rounds[max(0, index - 4) : index + 1]]
         numbers["median_return_of_last_five"] = statistics.median(last)
@@ -80,6 +82,8 @@ def report(run: RunFolder, tasks: list[Task], rounds: list[dict[str, Any]], judg
     with atomic_path(run.file("table.md")) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     tqdm.write("\n".join(lines))
+    for name, value in others.items():
+        tqdm.write(f"{name}: {value:.4g}")
     frames = [numbers["frames"] for numbers in rounds]
     curves = {name: [numbers[key] for numbers in rounds] for key, name in (several or {"return": "SHAC"}).items()}
     write_json(run.file("curve.json"), {"frames": frames, "returns": curves})
@@ -92,24 +96,31 @@ def report(run: RunFolder, tasks: list[Task], rounds: list[dict[str, Any]], judg
     return {
         **rounds[-1],
         **{f"best_{name}": best[name] for name in ("reward", "return", "frames")},
+        **others,
         **each,
     }
 
 
-def judge(cfg: DictConfig, tasks: list[Task], policy: BoundedPolicy) -> tuple[list[TensorDict], dict[str, float]]:
-    """Play every task's judged episodes, without exploration; episodes and numbers."""
-    episodes, numbers = [], {}
-    for task in tasks:
-        episodes.append(task.judged(policy.for_scene(task.scene)))
-        rewards = episodes[-1]["next", "reward"].squeeze(-1)
-        numbers[f"reward {task.folder}"] = rewards.mean().item()
-        numbers[f"std {task.folder}"] = rewards.mean(1).std().item()
-        numbers[f"return {task.folder}"] = cfg.action_repeat * rewards.sum(1).mean().item()
-    for name in ("reward", "std", "return"):
-        numbers[name] = statistics.fmean(numbers[f"{name} {task.folder}"] for task in tasks)
-    if len(tasks) == 1:
-        numbers = {name: numbers[name] for name in ("reward", "std", "return")}
+def judge(cfg: DictConfig, task: Task, policy: BoundedPolicy) -> tuple[TensorDict, dict[str, float]]:
+    """Play a task's judged episodes, without exploration; episodes and numbers."""
+    episodes = task.judged(policy.for_scene(task.scene))
+    rewards = episodes["next", "reward"].squeeze(-1)
+    numbers = {
+        "reward": rewards.mean().item(),
+        "std": rewards.mean(1).std().item(),
+        "return": cfg.action_repeat * rewards.sum(1).mean().item(),
+    }
     return episodes, numbers
+
+
+def judge_all(cfg: DictConfig, tasks: list[Task], policy: BoundedPolicy) -> tuple[list[TensorDict], dict[str, float]]:
+    """Judge every task; episodes, mean numbers and, of several tasks, each one's."""
+    judged = [judge(cfg, task, policy) for task in tasks]
+    numbers = {name: statistics.fmean(of[name] for _, of in judged) for name in judged[0][1]}
+    if len(tasks) > 1:
+        for task, (_, of) in zip(tasks, judged, strict=True):
+            numbers |= {f"{name} {task.folder}": value for name, value in of.items()}
+    return [episodes for episodes, _ in judged], numbers
 
 
 def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float]:
@@ -121,9 +132,9 @@ def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float
     return played, statistics.fmean(errors)
 
 
-def make_tasks(cfg: DictConfig) -> list[Task]:
-    """The task of every system."""
-    systems, tasks = as_list(cfg.system), []
+def make_tasks(cfg: DictConfig, systems: list[str]) -> list[Task]:
+    """The task on every system."""
+    tasks = []
     for system in systems:
         scene = load_scene(system, **scene_options(cfg))
         reward = reward_of(cfg, scene)
@@ -144,7 +155,11 @@ def main(cfg: DictConfig) -> None:
         )
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
-    tasks = make_tasks(cfg)
+    tasks, others = make_tasks(cfg, as_list(cfg.system)), make_tasks(cfg, as_list(cfg.zero_shot))
+    if others and cfg.policy != "graph":
+        raise ValueError(
+            "zero_shot= is for policy=graph: only a graph network drives systems that it did not learn on."
+        )
     run = RunFolder(cfg.run_dir, "shac")
     refuse_other_options(cfg, run, MAY_CHANGE)
     done: list[Round] = []
@@ -167,7 +182,7 @@ def main(cfg: DictConfig) -> None:
             played, error = play_round(learner, seed)
             seconds = time.process_time() - began
             policy = learner.averaged(run.path, index)
-            judged, numbers = judge(cfg, tasks, policy)
+            judged, numbers = judge_all(cfg, tasks, policy)
             random_steps = len(tasks) * cfg.first.trajectories * cfg.first.length
             before = rounds[-1] if rounds else {"frames": cfg.action_repeat * random_steps, "minutes": 0.0}
             rounds.append(
@@ -190,7 +205,9 @@ def main(cfg: DictConfig) -> None:
             tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
-    finish_run(cfg, run, tracker, report(run, tasks, rounds, judged), checkpoints=latest)
+    kept = load_pretrained(latest[0])
+    zero_shot = {f"zero_shot/{task.scene.name}": judge(cfg, task, kept.policy)[1]["return"] for task in others}
+    finish_run(cfg, run, tracker, report(run, tasks, rounds, judged, zero_shot), checkpoints=latest)
 
 
 def copy_to(source: Path, target: Path) -> None:

@@ -84,6 +84,13 @@ def test_one_graph_policy_learns_on_several_systems(tmp_path, call):
     assert away.min() > 0 and away.max() > 0.05 and away.max() < 3  # the target is the origin
     assert load_pretrained(whole / "swimmer4").model is not None
 
+    # A finished run is judged on other systems; one that it learned on scores the same.
+    others = ("rounds=2", "zero_shot=[swimmer4,swimmer5]", f"run_dir={whole}")
+    code, output, errors = call(*SWIMMERS, *others, recipe="shac")
+    assert code == 0 and "zero_shot/swimmer5" in output, errors
+    zero_shot = json.loads((whole / "metrics.json").read_text())
+    assert zero_shot["zero_shot/swimmer4"] == metrics[0]["return swimmer4"] != zero_shot["zero_shot/swimmer5"]
+
     # The policy proposes plans for a length that it has not learned on.
     planning = ("horizon=2", "steps=2", "video=false", "gn.warm_up=1", "gn.samples=3", "gn.iterations=1")
     code, _, errors = call("system=swimmer5", f"policy={whole}", *planning, f"run_dir={tmp_path / 'mpc'}", recipe="mpc")
@@ -114,6 +121,7 @@ def test_refuses_other_options_and_targets(tmp_path, call):
     [
         (("policy=cnn",), "policy=cnn must be mlp or graph"),
         (("system=[pendulum,pendulum]",), "graph to learn on several systems"),
+        (("zero_shot=cartpole",), "zero_shot= is for policy=graph"),
         (("target_squares=[0.3]",), "slides freely along x and y, not 'pendulum'"),
         (("system=swimmer3", "reward=near", "target_squares=[-1]"), "must be positive half sides"),
         (("evaluate.suite_seed=0",), "is for a target: give target_squares= too"),
