@@ -107,13 +107,21 @@ def shown(cell: Any, data: Path) -> str:
 
 
 def _number(cell: Mapping[str, Any], data: Path) -> str:
-    """A run's metric, or the sum of several, times ``times`` and over its metric ``over``; "diverges" if not finite."""
+    """A run's metric, or the sum of several, times ``times`` and over ``over``; "diverges" if not finite.
+
+    ``over`` is a metric of the same run, or ``{"metric", "of"}`` one of another.
+    """
     metrics = read_run(data, cell["of"])["metrics"]
     names = [cell["metric"]] if isinstance(cell["metric"], str) else cell["metric"]
     if any(metrics[name] is None for name in names):
         return "diverges"
     value = sum(metrics[name] for name in names)
-    value *= cell.get("times", 1) / (metrics[cell["over"]] if "over" in cell else 1)
+    over = cell.get("over")
+    if isinstance(over, Mapping):
+        value /= read_run(data, over["of"])["metrics"][over["metric"]]
+    elif over is not None:
+        value /= metrics[over]
+    value *= cell.get("times", 1)
     text = re.sub(r"e([+-])0*(\d)", lambda match: f"e{match[1].strip('+')}{match[2]}", format(value, cell["format"]))
     return f"**{text}**" if cell.get("bold") else text
 
@@ -136,6 +144,7 @@ def _quoted(cells: Any) -> Iterator[str]:
     """Files of the runs that cells quote."""
     if isinstance(cells, Mapping) and "metric" in cells:
         yield cells["of"]
+        yield from _quoted(cells.get("over"))
     elif isinstance(cells, (Mapping, list)):
         for each in cells.values() if isinstance(cells, Mapping) else cells:
             yield from _quoted(each)

@@ -11,7 +11,7 @@ import pytest
 from _common.report_data import add_run, read_run
 from _common.report_drawing import draw_figure
 from _common.report_figures import numbers, read_figures, stale_figures
-from _common.report_pages import make_pages
+from _common.report_pages import make_pages, shown
 
 from .conftest import ROOT
 
@@ -79,6 +79,17 @@ def finished(tmp_path) -> Path:
 
 def write(data: Path, name: str, values) -> None:
     (data / f"{name}.json").write_text(json.dumps(values))
+
+
+def test_a_cell_may_compare_two_runs(report, finished):
+    add_run(report / "data", finished, "errors", {})
+    other = json.loads((finished / "metrics.json").read_text()) | {"seconds": 5.0}
+    (finished / "metrics.json").write_text(json.dumps(other))
+    add_run(report / "data", finished, "errors", {}, "second")
+    over = {"metric": "seconds", "of": "errors.second.metrics.json"}
+    cell = {"metric": "seconds", "of": "errors.first.metrics.json", "format": ".2f", "over": over}
+    assert shown(cell, report / "data") == "0.25"
+    assert shown(cell | {"times": 4}, report / "data") == "1.00"
 
 
 def test_committed_pages_are_those_of_their_data():
