@@ -56,7 +56,7 @@ from _common.planning_task import (
     draw_targets,
     fill_in,
     load_policy,
-    load_value,
+    load_terminal,
     make_scenes,
     reward_of,
     shipped_models,
@@ -168,7 +168,7 @@ def main(cfg: DictConfig) -> None:
     # Identify variants first whoever plans, so that all planners have the same starts.
     needed = set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint or (cfg.variants and shipped_models(cfg))
     bound, inference = bind_model(cfg, scene) if needed else (None, None)
-    value, proposal = load_value(cfg, reward), load_policy(cfg, scene)
+    value, proposal = load_terminal(cfg, reward, scene), load_policy(cfg, scene)
     imagined = None if bound is None else ModelEnv(bound, reward, terminal=value)
     physics = env  # to plan on
     if value is not None:

@@ -17,7 +17,7 @@ from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_sta
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
-from torchrl_gn.planners import BoundedPolicy, StateValue
+from torchrl_gn.planners import BoundedPolicy, StateValue, TerminalReward
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
@@ -89,8 +89,12 @@ def bind_model(cfg: DictConfig, scene: Scene):
     return specialize(bound, executor=cfg.executor), None
 
 
-def load_value(cfg: DictConfig, reward: Reward) -> StateValue | None:
-    """The value that plans end in; ValueError if it was learned for another reward."""
+def load_terminal(cfg: DictConfig, reward: Reward, scene: Scene) -> StateValue | TerminalReward | None:
+    """The value of the state that plans end in; ValueError if it was learned for another reward."""
+    if cfg.terminal_weight is not None:
+        if cfg.value is not None:
+            raise ValueError("Give value= or terminal_weight=, not both.")
+        return TerminalReward(reward, scene, cfg.terminal_weight)
     if cfg.value is None:
         return None
     checkpoint = load_pretrained(cfg.value)

@@ -12,7 +12,7 @@ from torchrl.modules import CEMPlanner, MPPIPlanner
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo, StateValue
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo, StateValue, TerminalReward
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
 from torchrl_gn.planners.linearize import RewardExpansion
 from torchrl_gn.rewards import make_reward
@@ -174,7 +174,52 @@ def test_ilqg_expands_a_learned_value_through_the_learned_model():
     assert solver.improve(trajectory, 3).cost < trajectory.cost
 
 
+@pytest.fixture(scope="module")
+def posing():
+    """A model of JACO with a terminal reward of its whole pose, and starts with targets."""
+    scene = load_scene("jaco")
+    reward = make_reward("full_pose", scene)
+    env = ModelEnv(specialize(trained(scene, **SMALL)), reward, terminal=TerminalReward(reward, scene, 30.0))
+    start = SceneEnv(scene, seed=0).reset(TensorDict(batch_size=[3]))
+    targets = SceneEnv(scene, seed=1).reset(TensorDict(batch_size=[3]))["state"]
+    return env, start.set("task", reward.task_of(start["state"], targets))
+
+
+def test_a_terminal_reward_is_that_of_staying_at_the_target_s_distance(posing):
+    env, start = posing
+    actions = 0.1 * torch.ones(3, 4, 9)
+    states, found = env.imagine(start, actions)
+    plain = ModelEnv(env.predictor, env.reward).imagine(start, actions)[1]
+    rest = torch.zeros(3, 9)
+    staying = [env.reward(states[:, t], rest, states[:, t], start["task"]) for t in (0, -1)]
+    torch.testing.assert_close(found[:, :-1], plain[:, :-1])
+    torch.testing.assert_close(found[:, -1].double(), plain[:, -1].double() + 30 * staying[1])
+    totals, now = 0.0, env.reset(start, set_state=True).update(start.select("task"))
+    for action in actions.unbind(1):
+        stepped = env.step(now.set("action", action))["next"]
+        totals, now = totals + stepped["reward"], stepped.exclude("reward").update(start.select("task"))
+    torch.testing.assert_close(totals.double(), found.sum(1).double() - 30 * staying[0], rtol=1e-4, atol=1e-4)
+
+
+def test_planners_read_the_target_of_a_terminal_reward(posing):
+    """Each row's own; a plan of two rows is that of each alone."""
+    env, start = posing
+    planner = ILQGPlanner(env, 3, iterations=2, seed=0)
+    both = planner.plan(start.clone())
+    solver = ILQGSolver(
+        planner.plant(), RewardExpansion(planner._plan_reward, start["task"][1], None), control_cost=0.0
+    )
+    trajectory = solver.follow(start["state"][1].flatten().numpy(), solver.controls(both[1:2].numpy()))
+    expected = env.imagine(start[1:2], both[1:2])[1].sum()
+    assert trajectory.cost == pytest.approx(-expected.item(), rel=1e-4)
+    planner = GradientPlanner(env, 3, iterations=3, warm_up=20, samples=4, seed=0)
+    actions = planner.decide(start.clone())[1]["plan"]["actions"]
+    assert bool(actions.isfinite().all()) and not torch.equal(actions[0], actions[1])
+
+
 def test_what_does_not_fit_is_refused_by_name():
+    with pytest.raises(ValueError, match="weight must be above 0 and finite, got 0"):
+        TerminalReward(quadratic, load_scene("pendulum"), 0)  # pyright: ignore
     scene = load_scene("pendulum")
     with pytest.raises(ValueError, match="StateValue has learned no value yet"):
         SceneEnv(scene, terminal=StateValue(scene))

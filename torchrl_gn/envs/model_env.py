@@ -206,12 +206,13 @@ class ModelEnv(ModelBasedEnvBase):
         model = self.predictor
         inputs = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
         states, _ = model.rollout(state, self._with_past(tensordict, actions), *inputs)  # pyright: ignore[reportArgumentType]
-        if (task := cast("Tensor | None", tensordict.get("task", None))) is not None:
+        tasks = task = cast("Tensor | None", tensordict.get("task", None))
+        if task is not None:
             batch = tensordict.ndim
-            task = task.unsqueeze(batch).expand(*task.shape[:batch], shape[-2], *task.shape[batch:])
+            tasks = task.unsqueeze(batch).expand(*task.shape[:batch], shape[-2], *task.shape[batch:])
         before, after = states[..., :-1, :, :], states[..., 1:, :, :]
-        rewards = step_reward(self.reward, before, actions, after, task)
-        return states, plan_rewards(self.terminal, rewards, states[..., -1, :, :])
+        rewards = step_reward(self.reward, before, actions, after, tasks)
+        return states, plan_rewards(self.terminal, rewards, states[..., -1, :, :], task)
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
         return False  # rollouts run their full length, without waiting for a GPU

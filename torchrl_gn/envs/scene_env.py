@@ -42,7 +42,8 @@ class SceneEnv(EnvBase):
             ``[*B, 1]``; or a TensorDict module, which reads the step's entries and writes ``terminated``.
         terminal: value ``[*B, 1]`` of the state ``[*B, N, 13]`` that a plan ends in, for environments to plan on; its
             attribute ``discount``, if any, discounts the plan's rewards. Rewards then sum to those of a plan, less a
-            constant, see :func:`~torchrl_gn.envs.terminal.step_entries`. For rewards without a target.
+            constant, see :func:`~torchrl_gn.envs.terminal.step_entries`. For rewards with a target it must read
+            the task, as :class:`~torchrl_gn.planners.TerminalReward` does.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own.
         unstable_reward: of a step that became unstable. Default: -1e6, which no planner takes; under
             :func:`~torchrl_gn.envs.batched`, where policies learn, 100 times the reward of staying in the last good

@@ -14,7 +14,7 @@ from torchrl_gn.envs.specs import DIVERGED, reward_of
 from torchrl_gn.finite import is_traced
 from torchrl_gn.scenes.scene import Scene
 
-TerminalValue = Callable[[Tensor], Tensor]
+TerminalValue = Callable[..., Tensor]  # of states, and of the task if its attribute ``reads_task`` says so
 
 
 def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> TerminalValue | None:
@@ -26,7 +26,7 @@ def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> Termi
     name = type(terminal).__name__
     if not 0 < (discount := discount_of(terminal)) <= 1:
         raise ValueError(f"the discount of terminal= must be above 0 and at most 1, got {discount} of {name}")
-    if getattr(env.reward, "target_shape", None) is not None:
+    if getattr(env.reward, "target_shape", None) is not None and not _reads_task(terminal):
         raise ValueError(f"a value of states does not know the target of {env.reward}: leave terminal= out")
     if not getattr(terminal, "fitted", True):
         raise ValueError(f"{name} has learned no value yet: call fit_value on it, or load one")
@@ -41,9 +41,13 @@ def discount_of(terminal: TerminalValue | None) -> float:
     return float(getattr(terminal, "discount", 1.0))
 
 
-def terminal_value(terminal: TerminalValue, state: Tensor) -> Tensor:
+def _reads_task(terminal: TerminalValue) -> bool:
+    return getattr(terminal, "reads_task", False)
+
+
+def terminal_value(terminal: TerminalValue, state: Tensor, task: Any) -> Tensor:
     """Values ``[*B, 1]`` of states ``[*B, N, 13]``; ValueError for another shape, or NaN of a finite state."""
-    value = terminal(state)
+    value = terminal(state, task) if _reads_task(terminal) else terminal(state)
     if value.shape != (shape := (*state.shape[:-2], 1)):
         raise ValueError(f"the terminal value must be {list(shape)}, {terminal} returned {list(value.shape)}")
     # A GPU would have to be waited for.
@@ -53,7 +57,7 @@ def terminal_value(terminal: TerminalValue, state: Tensor) -> Tensor:
     return value
 
 
-def plan_rewards(terminal: TerminalValue | None, rewards: Tensor, last_state: Tensor) -> Tensor:
+def plan_rewards(terminal: TerminalValue | None, rewards: Tensor, last_state: Tensor, task: Any) -> Tensor:
     r"""Discounted rewards ``[*B, H, 1]`` of a plan's steps, the last with the value of its last state ``[*B, N, 13]``.
 
     Their sum is :math:`\sum_{t<H} \gamma^t r_t + \gamma^H V(s_H)`. Without a value, the rewards as they are.
@@ -61,7 +65,7 @@ def plan_rewards(terminal: TerminalValue | None, rewards: Tensor, last_state: Te
     if terminal is None:
         return rewards
     steps, discount = rewards.shape[-2], discount_of(terminal)
-    value = discount**steps * terminal_value(terminal, last_state).to(rewards.dtype)
+    value = discount**steps * terminal_value(terminal, last_state, task).to(rewards.dtype)
     factors = discount ** torch.arange(steps, dtype=rewards.dtype, device=rewards.device)
     return rewards * factors.unsqueeze(-1) + pad(value.unsqueeze(-2), (0, 0, steps - 1, 0))
 
@@ -78,9 +82,9 @@ def step_entries(env: Any, tensordict: TensorDictBase, state: Tensor, entries: d
     terminal, reward = env.terminal, entries["reward"]
     if terminal is None:
         return {}
-    weight = tensordict.get("discount", None)
+    weight, task = tensordict.get("discount", None), tensordict.get("task", None)
     weight = torch.ones_like(reward) if weight is None else weight
     after = discount_of(terminal) * weight
-    next_value = torch.where(entries["terminated"], 0.0, terminal_value(terminal, entries["state"]).to(reward.dtype))
-    value = terminal_value(terminal, state).to(reward.dtype)
+    value, next_value = (terminal_value(terminal, s, task).to(reward.dtype) for s in (state, entries["state"]))
+    next_value = torch.where(entries["terminated"], 0.0, next_value)
     return {"reward": weight * reward + (after * next_value - weight * value), "discount": after}

@@ -10,3 +10,4 @@ from torchrl_gn.planners.state_features import StateFeatures as StateFeatures
 from torchrl_gn.planners.state_features import task_invariances as task_invariances
 from torchrl_gn.planners.state_policy import StatePolicy as StatePolicy
 from torchrl_gn.planners.state_value import StateValue as StateValue
+from torchrl_gn.planners.terminal_reward import TerminalReward as TerminalReward

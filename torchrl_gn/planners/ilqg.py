@@ -207,7 +207,9 @@ class ILQGPlanner(RecedingHorizonPlanner):
     def _plan_reward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> Tensor:
         """Rewards ``[*B, H, 1]`` of the steps of plans."""
         rewards = cast(Any, self._env.reward)(state, action, next_state, task)
-        return plan_rewards(self._env.terminal, rewards, next_state[..., -1, :, :])
+        last = (..., -1) if isinstance(task, TensorDictBase) else (*[slice(None)] * (action.ndim - 2), -1)
+        task = None if task is None else task[last]
+        return plan_rewards(self._env.terminal, rewards, next_state[..., -1, :, :], task)
 
     @property
     def _env(self) -> SceneEnv | ModelEnv:

@@ -1,0 +1,47 @@
+"""A terminal cost for plans: the reward of the state that they end in, weighted."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor, nn
+
+from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.scenes.scene import Scene
+
+
+class TerminalReward(nn.Module):
+    """Value of a state as if the robot stayed there: ``weight`` times the reward of a step from it to itself.
+
+    For environments to plan on, as their ``terminal``: a plan then passes through low rewards if it ends with a high
+    one, and so gets out of local optima within its horizon. Needs no learning, and knows the task's target. For rewards
+    of places and poses; that of a displacement, as :class:`~torchrl_gn.rewards.Reach`, is 0 for who stays.
+
+    Args:
+        reward: of the environment.
+        weight: control steps that the state counts for.
+
+    Raises:
+        ValueError: ``weight`` is not above 0 and finite.
+
+    Example:
+        >>> from torchrl_gn.rewards import make_reward
+        >>> from torchrl_gn.scenes import load_scene
+        >>> scene = load_scene("cartpole")
+        >>> value = TerminalReward(make_reward("balance", scene), scene, weight=50)
+        >>> value(torch.zeros(5, scene.num_nodes, 13)).shape
+        torch.Size([5, 1])
+    """
+
+    reads_task = True
+
+    def __init__(self, reward: Reward, scene: Scene, weight: float) -> None:
+        super().__init__()
+        if not 0 < weight < math.inf:
+            raise ValueError(f"weight must be above 0 and finite, got {weight}")
+        self.reward, self.scene, self.weight = reward, scene, float(weight)
+
+    def forward(self, state: Tensor, task: Tensor | None = None) -> Tensor:
+        """Values ``[*B, 1]`` of states ``[*B, N, 13]``."""
+        rest = state.new_zeros(*state.shape[:-2], self.scene.num_actions)
+        return self.weight * self.reward(state, rest, state, task)
