@@ -166,6 +166,8 @@ def main(cfg: DictConfig) -> None:
     while (each := Round(run.path, len(done))).finished:
         done.append(each)
     learner = ActorCritic(cfg, tasks, done[-1] if done else None)
+    for task in others:
+        learner.policy.for_scene(task.scene)  # raises if it cannot drive it, before anything is learned
     tracker = open_log(cfg, run, label=f"shac-{tasks[0].scene.name}")
     for task in tasks:
         task.collect(done)

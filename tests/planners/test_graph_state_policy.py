@@ -71,6 +71,9 @@ def test_every_system_within_its_bounds(name: str) -> None:
     low, high = (torch.as_tensor(bound).float() for bound in (policy.scene.action_low, policy.scene.action_high))
     assert action.shape == (16, policy.scene.num_actions) and density.shape == (16,)
     assert bool((action >= low).all() and (action <= high).all() and density.isfinite().all())
+    expected = policy.act(state).detach()
+    with torch.no_grad():  # also of a pendulum, whose graph has no edges
+        torch.testing.assert_close(policy.act(state), expected)
 
 
 def test_equals_message_passing() -> None:

@@ -163,7 +163,7 @@ class FoldedGNCore:
             return [inputs]
         if table.shape[1] > 1:  # every sample has its own
             return [inputs]
-        samples = max(1, _CACHED // (table.shape[0] * table.shape[2]))
+        samples = max(1, _CACHED // max(1, table.shape[0] * table.shape[2]))  # no edges: no elements
         return list(zip(*(part.split(samples, dim=1) for part in inputs), strict=True))
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> FoldedGNCore:
