@@ -25,6 +25,7 @@ class TerminalReward(nn.Module):
         ValueError: ``weight`` is not above 0 and finite.
 
     Example:
+        >>> import torch
         >>> from torchrl_gn.rewards import make_reward
         >>> from torchrl_gn.scenes import load_scene
         >>> scene = load_scene("cartpole")
