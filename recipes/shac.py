@@ -207,8 +207,10 @@ def main(cfg: DictConfig) -> None:
             tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
-    kept = load_pretrained(latest[0])
-    zero_shot = {f"zero_shot/{task.scene.name}": judge(cfg, task, kept.policy)[1]["return"] for task in others}
+    zero_shot: dict[str, float] = {}
+    if others:
+        kept = load_pretrained(latest[0]).policy
+        zero_shot = {f"zero_shot/{task.scene.name}": judge(cfg, task, kept)[1]["return"] for task in others}
     finish_run(cfg, run, tracker, report(run, tasks, rounds, judged, zero_shot), checkpoints=latest)
 
 

@@ -202,7 +202,7 @@ def test_a_terminal_reward_is_that_of_staying_at_the_target_s_distance(posing):
 
 
 def test_planners_read_the_target_of_a_terminal_reward(posing):
-    """Each row's own; a plan of two rows is that of each alone."""
+    """Each row's own: iLQG's costs are the returns that the model imagines for it."""
     env, start = posing
     planner = ILQGPlanner(env, 3, iterations=2, seed=0)
     both = planner.plan(start.clone())

@@ -207,8 +207,8 @@ class ILQGPlanner(RecedingHorizonPlanner):
     def _plan_reward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> Tensor:
         """Rewards ``[*B, H, 1]`` of the steps of plans."""
         rewards = cast(Any, self._env.reward)(state, action, next_state, task)
-        last = (..., -1) if isinstance(task, TensorDictBase) else (*[slice(None)] * (action.ndim - 2), -1)
-        task = None if task is None else task[last]
+        if task is not None:
+            task = task[(*[slice(None)] * (action.ndim - 2), -1)]  # of the last step
         return plan_rewards(self._env.terminal, rewards, next_state[..., -1, :, :], task)
 
     @property
