@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import statistics
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -170,8 +171,7 @@ def _lines(axes: Axes, points: Points, options: Mapping[str, Any]) -> None:
     if options.get("log"):
         axes.set_yscale("log")
         axes.set_xscale("log")
-    axes.set_xticks(list(places.values()), [f"{x:,.0f}" for x in places.values()])
-    axes.set_xticks([], minor=True)
+    _name_places(axes, sorted(set(places.values())))
     if "from" in options:
         axes.set_ylim(bottom=options["from"])
     if len(series) > 1:
@@ -179,6 +179,21 @@ def _lines(axes: Axes, points: Points, options: Mapping[str, Any]) -> None:
     if "at" in options:
         axes.axhline(options["at"], color=INK, linestyle="--", linewidth=1)
     clean(axes)
+
+
+def _name_places(axes: Axes, places: Sequence[float]) -> None:
+    """Ticks at all places, named from the last on where names do not overlap."""
+    grid = axes.get_subplotspec()
+    room = 0.016 * (grid.get_gridspec().ncols if grid else 1)  # of a character, as a share of the panel's width
+    to_fraction = axes.transData + axes.transAxes.inverted()
+    names, before = [], math.inf
+    for place in reversed(places):
+        at, name = float(to_fraction.transform((place, axes.get_ylim()[1]))[0]), f"{place:,.0f}"
+        shown = before - at >= room * len(name)
+        names.append(name if shown else "")
+        before = at if shown else before
+    axes.set_xticks(places, names[::-1])
+    axes.set_xticks([], minor=True)
 
 
 def _name_ends(axes: Axes, last: float, ends: Sequence[tuple[float, str, str]]) -> None:

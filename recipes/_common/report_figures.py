@@ -36,7 +36,7 @@ from _common.report_pages import shown
 
 KINDS = ("dots", "bars", "lines")
 DIGEST = "Digest"  # key of the PNG's text
-_DRAWING = 1  # raise it when report_drawing.py changes: every figure is then drawn anew
+_DRAWING = 2  # raise it when report_drawing.py changes: every figure is then drawn anew
 _KEYS = {"kind", "table", "rows", "row", "until", "labels", "y", "panel", "between", "transpose", "ours", "log", "at"}
 _KEYS |= {"from", "axis", "along", "alt"}
 _NUMBER = re.compile(r"(?<![\w.])-?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?", re.ASCII)

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from _common.report_data import add_run, read_run
-from _common.report_drawing import draw_figure
+from _common.report_drawing import _name_places, draw_figure
 from _common.report_figures import numbers, read_figures, stale_figures
 from _common.report_pages import make_pages, shown
+from torchrl_gn.drawing.canvas import new_figure
 
 from .conftest import ROOT
 
@@ -260,6 +261,20 @@ def test_figures_are_stale_without_being_drawn_again(report, monkeypatch, option
     (images / "old.png").unlink()
     panels_of(report, **FIGURE | options | {"axis": "return"})
     assert stale_figures(read_figures(report / "data"), images) == ["errors.png"]
+
+
+@pytest.mark.parametrize("columns", [1, 3])
+def test_names_of_places_do_not_overlap(columns):
+    """Seven rounds of a run, a few per cent of the panel apart, in panels beside each other."""
+    canvas = new_figure((7, 2.8))
+    axes = canvas.subplots(1, columns, squeeze=False)[0, -1]
+    places = [42_400, 49_600, 59_200, 68_800, 78_400, 88_000, 100_000]
+    axes.plot(places, places)
+    _name_places(axes, places)
+    canvas.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in axes.get_xticklabels() if label.get_text()]
+    assert axes.get_xticklabels()[-1].get_text() == "100,000" and len(axes.get_xticks()) == 7 and len(boxes) >= 3
+    assert all(before.x1 < after.x0 for before, after in zip(boxes, boxes[1:], strict=False))
 
 
 def test_numbers_that_change_make_a_figure_stale(report, finished):
