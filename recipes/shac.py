@@ -9,16 +9,14 @@ same run_dir goes on, with more rounds too. Results: docs/results/short-horizon-
 
 Writes config.yaml, metrics.json, table.md, the learning curve (curve.json and curve.png), a video of the last round's
 first judged episode (episode.gif), and the policy, averaged over rounds, and the last value and model
-(policy.safetensors, value.safetensors, checkpoint/), which recipes/mpc.py takes as policy=, value= and checkpoint=;
-every round's own are in rounds/. With
-several systems, a graph network as the policy learns on all at once, and each has its own value, model and video. All
-options: recipes/config/shac.yaml.
+(policy.safetensors, value.safetensors, checkpoint/): recipes/mpc.py takes the run folder as policy=, value= and
+checkpoint=. Every round's own are in rounds/. With several systems, a graph network as the policy learns on all at
+once, and each has its own value, model and video. All options: recipes/config/shac.yaml.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import statistics
 import time
@@ -63,6 +61,13 @@ def error_of(model: Predictor, played: TensorDict) -> float:
     return evaluate_errors(model, played, horizons=(20,), one_step=False).errors["rollout_error_20"].total
 
 
+def shown(name: str, value: float | None) -> str:
+    """A number of a round in the table."""
+    if value is None:
+        return "-"
+    return f"{value:,}" if name == "frames" else f"{value:,.4g}"
+
+
 def report(
     run: RunFolder, tasks: list[Task], rounds: list[dict[str, Any]], judged: list[TensorDict], others: dict[str, float]
 ) -> dict[str, Any]:
@@ -73,10 +78,7 @@ def report(
     several = {f"return {task.folder}": task.folder for task in tasks} if len(tasks) > 1 else {}
     columns = {**COLUMNS, **several}
     rows = [list(columns.values())]
-    rows += [
-        [f"{numbers[name]:,.4g}" if name != "frames" else f"{numbers[name]:,}" for name in columns]
-        for numbers in rounds
-    ]
+    rows += [[shown(name, numbers[name]) for name in columns] for numbers in rounds]
     lines = [" | ".join(["", *row, ""]).strip() for row in rows]
     lines.insert(1, "|" + "---|" * len(columns))
     with atomic_path(run.file("table.md")) as temporary:
@@ -123,13 +125,11 @@ def judge_all(cfg: DictConfig, tasks: list[Task], policy: BoundedPolicy) -> tupl
     return [episodes for episodes, _ in judged], numbers
 
 
-def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float]:
-    """Play every task with exploration; trajectories, and the mean error of the models on them."""
-    played, errors = [], []
-    for task in learner.tasks:
-        played.append(task.play(learner.policy.for_scene(task.scene), seed))
-        errors.append(error_of(task.model, played[-1]) if len(played[-1]) else math.nan)
-    return played, statistics.fmean(errors)
+def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float | None]:
+    """Play every task with exploration; trajectories, and the models' mean error; None if all became unstable."""
+    played = [task.play(learner.policy.for_scene(task.scene), seed) for task in learner.tasks]
+    errors = [error_of(task.model, new) for task, new in zip(learner.tasks, played, strict=True) if len(new)]
+    return played, statistics.fmean(errors) if errors else None
 
 
 def make_tasks(cfg: DictConfig, systems: list[str]) -> list[Task]:
@@ -204,7 +204,8 @@ def main(cfg: DictConfig) -> None:
             files = [now.of(what, task) for what in ("value", "model") for task in tasks]
             for source, target in zip(files, latest[1:], strict=True):
                 copy_to(source, target)
-            tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
+            known = {f"round/{name}": value for name, value in rounds[-1].items() if value is not None}
+            tracker.log(known, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
     zero_shot: dict[str, float] = {}

@@ -88,22 +88,27 @@ class Task:
         imagined = ModelEnv(specialize(self.model), self.reward)
         self.loss = SHACLoss(policy, self.value, imagined, steps=cfg.horizon, lmbda=cfg.lmbda)
 
+    @property
+    def newest(self) -> TensorDict:
+        """The last trajectories. A round whose episodes all became unstable left none."""
+        return next(played for played in reversed(self.data) if len(played))
+
     def learn_model(self, index: int) -> None:
         """Train the model on all data, and tell the normalisers of policy and value of the newest."""
         cfg, first = self.cfg, index == 0
         steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
         fit(self.model, cast(TensorDict, torch.cat(cast(Any, self.data))), steps=steps, lr=lr, seed=cfg.seed + index)
-        newest, rewards = self.data[-1]["state"], None
+        newest, rewards = self.newest["state"], None
         if first:
             before, after = newest[:, :-1], newest[:, 1:]
-            rewards = self.reward(before, self.data[-1]["action"], after, None).flatten(0, 1)
+            rewards = self.reward(before, self.newest["action"], after, None).flatten(0, 1)
         seen = newest.flatten(0, 1)
         self.loss.fit_normalizers(seen if self.squares is None else self.squares.move(seen), rewards)
 
     def starts(self) -> Callable[[int], Tensor]:
         """What draws states ``[size, N, 13]`` to imagine from, half of the newest episodes, half of all."""
-        newest, states = self.data[-1:], []
-        for data in self.data, newest:
+        states = []
+        for data in self.data, [self.newest]:
             states.append(torch.cat([part["state"][:, :-1].flatten(0, 1) for part in data]))
 
         def draw(size: int) -> Tensor:

@@ -97,7 +97,7 @@ def load_terminal(cfg: DictConfig, reward: Reward, scene: Scene) -> StateValue |
         return TerminalReward(reward, scene, cfg.terminal_weight)
     if cfg.value is None:
         return None
-    checkpoint = load_pretrained(cfg.value)
+    checkpoint = load_pretrained(_file_of(cfg.value, "value"))
     value, learned_for = checkpoint.value, checkpoint.config.get("reward")
     if learned_for is not None and learned_for != plain_config(cfg)["reward"]:
         raise ValueError(f"value={cfg.value} was learned for the reward {learned_for}, not {cfg.reward}.")
@@ -110,12 +110,17 @@ def load_policy(cfg: DictConfig, scene: Scene) -> BoundedPolicy | None:
     """The policy that proposes plans; ValueError if it cannot drive the scene."""
     if cfg.policy is None:
         return None
-    path = Path(cfg.policy)
-    policy = load_pretrained(path / "policy.safetensors" if path.is_dir() else path).policy
+    policy = load_pretrained(_file_of(cfg.policy, "policy")).policy
     try:
         return policy.for_scene(scene)
     except ValueError as error:
         raise ValueError(f"policy={cfg.policy}: {error}") from None
+
+
+def _file_of(given: str, what: str) -> str | Path:
+    """A run folder's file of a network that it keeps beside its checkpoint."""
+    file = Path(given) / f"{what}.safetensors"
+    return file if file.exists() else given
 
 
 def reward_of(cfg: DictConfig, scene: Scene, key: str = "reward") -> Reward:

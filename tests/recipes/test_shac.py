@@ -6,8 +6,9 @@ import json
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
+from torchrl_gn.atomic import write_json
 from torchrl_gn.training import load_pretrained
 
 SMALL = (
@@ -49,7 +50,7 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
 
     # The networks are what the planning recipe takes.
     assert load_pretrained(whole).model is not None
-    given = (f"checkpoint={whole}", f"policy={whole}", f"value={whole / 'value.safetensors'}")
+    given = (f"checkpoint={whole}", f"policy={whole}", f"value={whole}")
     planning = ("horizon=2", "steps=2", "episodes=2", "video=false", "gn.warm_up=1", "gn.samples=3", "gn.iterations=1")
     code, _, errors = call("system=pendulum", *given, *planning, f"run_dir={tmp_path / 'mpc'}", recipe="mpc")
     assert code == 0, errors
@@ -136,3 +137,17 @@ def test_refuses_tasks_that_do_not_fit(options, message, tmp_path, call):
 def test_checks_options_before_data_are_collected(option, tmp_path, call):
     code, _, errors = call(*SMALL, option, f"run_dir={tmp_path / 'x'}", recipe="shac")
     assert code == 1 and option.partition("=")[0] in errors and not (tmp_path / "x/rounds").exists()
+
+
+def test_a_round_whose_episodes_all_became_unstable_does_not_end_the_run(tmp_path, call):
+    code, _, errors = call(*SMALL, "rounds=1", f"run_dir={tmp_path}", recipe="shac")
+    assert code == 0, errors
+    kept = tmp_path / "rounds/000"
+    played = load_file(kept / "played.safetensors")
+    save_file({name: value[:0].clone() for name, value in played.items()}, kept / "played.safetensors")
+    numbers = json.loads((kept / "numbers.json").read_text())
+    write_json(kept / "numbers.json", {**numbers, "error": None})
+    code, output, errors = call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
+    assert code == 0, errors
+    assert len(load_file(tmp_path / "rounds/001/played.safetensors")["action"]) == 2
+    assert json.loads((tmp_path / "metrics.json").read_text())["round 0/error"] is None and "| - |" in output
