@@ -60,7 +60,8 @@ def planning(cfg: DictConfig, folder: Path, index: int, model: str, valued: Run 
         "gn.iterations=3",
         *as_list(cfg.planning),
     )
-    return Run(MPC, folder / f"executed{index}", options, f"planning, round {index}")
+    # What was the last round is not, once there are more.
+    return Run(MPC, folder / f"executed{index}", options, f"planning, round {index}", goes_on=("planner", "video"))
 
 
 def learning(cfg: DictConfig, folder: Path, index: int, model: str | None, executed: list[Run]) -> Run:

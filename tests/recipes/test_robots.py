@@ -74,5 +74,9 @@ def test_a_robot_of_ones_own_learns_from_the_first_model_on(tmp_path, run):
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert {f"{of}/mean_reward" for of in ("round 0", "round 1", "nothing")} <= set(metrics)
     assert "| nothing |" in output and (tmp_path / "run/executed1/gn.gif").exists()
-    code, _, errors = run(*options, recipe="plan_and_learn")
-    assert code == 0, errors
+    before = (tmp_path / "run/executed1/gn.safetensors").read_bytes()
+    for rounds in 1, 2:
+        code, output, errors = run(*options, f"rounds={rounds}", recipe="plan_and_learn")
+        assert code == 0, errors
+    assert (tmp_path / "run/executed1/gn.safetensors").read_bytes() == before  # a finished round is kept
+    assert "| round 2 |" in output and "| nothing |" in output
