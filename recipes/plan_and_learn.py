@@ -60,7 +60,7 @@ def planning(cfg: DictConfig, folder: Path, index: int, model: str, valued: Run 
         "gn.iterations=3",
         *as_list(cfg.planning),
     )
-    # What was the last round is not, once there are more.
+    # The last round has more planners and a video; a run that goes on with more rounds has another last one.
     return Run(MPC, folder / f"executed{index}", options, f"planning, round {index}", goes_on=("planner", "video"))
 
 

@@ -204,8 +204,7 @@ def main(cfg: DictConfig) -> None:
             files = [now.of(what, task) for what in ("value", "model") for task in tasks]
             for source, target in zip(files, latest[1:], strict=True):
                 copy_to(source, target)
-            known = {f"round/{name}": value for name, value in rounds[-1].items() if value is not None}
-            tracker.log(known, rounds[-1]["frames"])
+            tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
     zero_shot: dict[str, float] = {}

@@ -98,11 +98,11 @@ class Task:
         cfg, first = self.cfg, index == 0
         steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
         fit(self.model, cast(TensorDict, torch.cat(cast(Any, self.data))), steps=steps, lr=lr, seed=cfg.seed + index)
-        newest, rewards = self.newest["state"], None
+        newest, rewards = self.newest, None
         if first:
-            before, after = newest[:, :-1], newest[:, 1:]
-            rewards = self.reward(before, self.newest["action"], after, None).flatten(0, 1)
-        seen = newest.flatten(0, 1)
+            before, after = newest["state"][:, :-1], newest["state"][:, 1:]
+            rewards = self.reward(before, newest["action"], after, None).flatten(0, 1)
+        seen = newest["state"].flatten(0, 1)
         self.loss.fit_normalizers(seen if self.squares is None else self.squares.move(seen), rewards)
 
     def starts(self) -> Callable[[int], Tensor]:
