@@ -50,7 +50,7 @@ PUBLIC = {
     "identification": ["IdentifyingModel"],
     "objectives": ["ForwardModelLoss", "IdentificationLoss", "SHACLoss", "SVGLoss"],
     "planners": ["GradientPlanner", "ILQGPlanner", "PlanAhead"],
-    "rewards": ["make_reward"],
+    "rewards": ["available_rewards", "make_reward"],
     "scenes": ["load_scene"],
     "training": ["fit", "load_pretrained", "pretrained_names", "save_checkpoint"],
 }

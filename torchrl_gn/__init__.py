@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from torchrl_gn.planners import GradientPlanner as GradientPlanner
     from torchrl_gn.planners import ILQGPlanner as ILQGPlanner
     from torchrl_gn.planners import PlanAhead as PlanAhead
+    from torchrl_gn.rewards import available_rewards as available_rewards
     from torchrl_gn.rewards import make_reward as make_reward
     from torchrl_gn.scenes import load_scene as load_scene
     from torchrl_gn.training import fit as fit
@@ -52,7 +53,7 @@ _FOLDERS = {
     "identification": ("IdentifyingModel",),
     "objectives": ("ForwardModelLoss", "IdentificationLoss", "SHACLoss", "SVGLoss"),
     "planners": ("GradientPlanner", "ILQGPlanner", "PlanAhead"),
-    "rewards": ("make_reward",),
+    "rewards": ("available_rewards", "make_reward"),
     "scenes": ("load_scene",),
     "training": ("fit", "load_pretrained", "pretrained_names", "save_checkpoint"),
 }

@@ -1,4 +1,4 @@
-"""Docstrings as Markdown: roles become links into the reference where they lead there, formulas become code."""
+"""Docstrings as Markdown: roles become links into the reference where they lead there, formulas MathML."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import textwrap
 from typing import Any
 
 import griffe
+from latex2mathml.converter import convert
 
 ROLE = re.compile(r":(\w+):`([^`]+)`")
 FORMULA = re.compile(r"^( *)\.\. math::(?: (.+)\n|\n((?:\1 +.*\n|\n)+))", re.MULTILINE)
@@ -39,13 +40,15 @@ class Markdown(griffe.Extension):
 
     def _markdown(self, text: str, pkg: griffe.Module, owner: Any, public: dict, defined: dict) -> str:
         def formula(match: re.Match[str]) -> str:
-            lines = textwrap.indent(textwrap.dedent(match[2] or match[3]).strip(), match[1])
-            return f"{match[1]}```latex\n{lines}\n{match[1]}```\n\n"
+            latex = textwrap.dedent(match[2] or match[3]).strip()
+            if r"\\" in latex:  # several lines
+                latex = rf"\begin{{align}}{latex}\end{{align}}"
+            return f"{match[1]}<div>{convert(latex, display='block')}</div>\n\n"
 
         def role(match: re.Match[str]) -> str:
             kind, content = match.groups()
             if kind == "math":
-                return f"`{content}`"
+                return convert(content)
             shown, target = content, content
             if explicit := re.fullmatch(r"(.+?) <(.+)>", content):
                 shown, target = explicit.groups()

@@ -109,6 +109,26 @@ def test_a_core_of_ones_own_is_used_and_described(scenes, fit, random_states, ra
         ForwardModel.for_scene(scene, core="scaled", hidden=8)
 
 
+def test_mistakes_of_a_core_are_named(scenes, fit, random_states, random_actions, monkeypatch):
+    scene = scenes["swimmer6"]
+
+    class Careless(Core):
+        def __init__(self, dynamic, static, out_nodes):
+            nn.Module.__init__(self)
+
+    class Plain(ScaledCore):
+        def forward(self, graph):
+            return super().forward(graph).nodes
+
+    monkeypatch.setitem(CORES, "careless", Careless)
+    with pytest.raises(TypeError, match=r"Careless.__init__ must call super\(\).__init__\(dynamic\)"):
+        ForwardModel.for_scene(scene, core="careless")
+    monkeypatch.setitem(CORES, "plain", Plain)
+    fitted = fit(ForwardModel.for_scene(scene, core="plain"), scene)
+    with pytest.raises(TypeError, match="Plain must return a Graph, not Tensor"):
+        fitted.bind(scene)(random_states(scene, 2), random_actions(scene, 2))
+
+
 def test_unknown_names_are_refused():
     description = ForwardModel(ParameterNames()).description()
     with pytest.raises(ValueError, match=r"feature='smell' is not known; use one of \['body_state'.*FEATURES"):

@@ -35,6 +35,17 @@ def test_rewards_add_and_scale(swimmer):
             wrong()
 
 
+def test_functions_add_to_rewards(swimmer):
+    def squared(state, action, next_state, task=None):
+        return action.square().sum(-1, keepdim=True)
+
+    effort = Effort(swimmer.scene)
+    expected = squared(swimmer.state, swimmer.action, swimmer.next_state), values(effort, swimmer)
+    torch.testing.assert_close(values(squared + 2 * effort, swimmer), expected[0] + 2 * expected[1])
+    torch.testing.assert_close(values(effort - squared, swimmer), expected[1] - expected[0])
+    assert "squared" in repr(effort + squared)
+
+
 def test_one_of_them_may_need_a_target(swimmer):
     reach, effort = Reach(swimmer.scene, "head"), Effort(swimmer.scene)
     total, target = reach + 0.1 * effort, torch.tensor([1.0, 2, 0], dtype=torch.float64).expand(4, 3)

@@ -106,6 +106,25 @@ def test_bad_sources():
         load_scene(3)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "<actuator><motor joint='nope'/></actuator>",
+        "<tendon><fixed><joint joint='nope' coef='1'/></fixed></tendon>",
+        "<equality><weld body1='a' body2='nope'/></equality>",
+        "<sensor><jointpos joint='nope'/></sensor>",
+        "<contact><exclude body1='a' body2='nope'/></contact>",
+        "<contact><pair geom1='g' geom2='nope'/></contact>",
+    ],
+)
+def test_a_name_that_does_not_exist_is_refused(wrong):
+    body = "<worldbody><body name='a'><joint name='j'/><geom name='g' size='1'/></body></worldbody>"
+    spec = mujoco.MjSpec.from_string(f"<mujoco>{body}{wrong}</mujoco>")
+    for source in (f"<mujoco>{body}{wrong}</mujoco>", spec):
+        with pytest.raises(SceneError, match="'nope'"):
+            load_scene(source)
+
+
 def test_broken_file_is_named_with_mujocos_message(tmp_path):
     path = tmp_path / "broken.xml"
     path.write_text("<mujoco><worldbody><bdy/></worldbody></mujoco>")

@@ -96,7 +96,25 @@ def test_what_does_not_fit_is_named_and_changes_nothing(train, make_model, scene
         train(model, steps=0)
     with pytest.raises(ValueError, match="noise=-1"):
         train(model, steps=2, noise=-1)
+    with pytest.raises(TypeError, match=r"optimizer takes a preset or a function: lambda weights: torch.optim.SGD\("):
+        train(model, steps=2, optimizer=torch.optim.SGD(model.parameters(), lr=0.1))
+    other = gn.collect_trajectories("acrobot", 2, steps=3)
+    with pytest.raises(ValueError, match=r"State of scene 'pendulum' must be \[\*B, 2, 13\], got \[.*, 3, 13\]"):
+        train(model, data=other, steps=2)
     assert same(model.model.state_dict(), before)
+
+
+def test_a_model_that_is_not_bound_is_refused(make_model, trajectories):
+    model = make_model()
+    calls = (
+        lambda: gn.fit(model, trajectories, steps=1),
+        lambda: gn.evaluate_errors(model, trajectories),
+        lambda: gn.specialize(model),
+        lambda: gn.ModelEnv(model),
+    )
+    for call in calls:
+        with pytest.raises(TypeError, match=r"ForwardModel is not bound to a scene: use model\.bind\(scene\)"):
+            call()
 
 
 def test_a_specialised_predictor_is_refused(train):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
@@ -15,6 +16,7 @@ from torchrl_gn.data.policy_rollout import Policy, policy_rollout
 from torchrl_gn.data.random_controls import random_controls
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
 from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Scene
 
@@ -31,7 +33,7 @@ _BOUNDS: dict[str, Callable[[Tensor], Tensor]] = {  # of states [..., 13]
 
 
 def collect_trajectories(
-    scene: Scene | Sequence[Scene],
+    scene: Scene | str | os.PathLike | Sequence[Scene],
     num: int,
     steps: int = 100,
     seed: int = 0,
@@ -50,7 +52,7 @@ def collect_trajectories(
     Paper: SM "Datasets". Sequences that become unstable or leave the bounds are drawn again.
 
     Args:
-        scene: the scene, or variants of one, which the sequences take in turn.
+        scene: the scene, its name or path, or variants of one, which the sequences take in turn.
         split: index of an independent split; data sets use 0, 1, 2.
         knot_interval, target_speed: as of :func:`~torchrl_gn.data.random_controls`, which acts without a policy.
         policy: TorchRL policy, or a function of a TensorDict ``[n]`` of ``state``, ``physics``, ``is_init`` and, of
@@ -73,8 +75,9 @@ def collect_trajectories(
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
     check_bounds(bounds)
-    simulator = simulator or Simulator(scene)
-    if simulator.scenes != ((scene,) if isinstance(scene, Scene) else tuple(scene)):
+    given: Scene | Sequence[Scene] = as_scene(scene)
+    simulator = simulator or Simulator(given)
+    if simulator.scenes != ((given,) if isinstance(given, Scene) else tuple(given)):
         raise ValueError(f"simulator is of another {simulator.scene.name!r} than the scene; give both the same.")
     chunks, controls = [], {"knot_interval": knot_interval, "target_speed": target_speed}
     options = {**controls, "policy": policy, "bounds": bounds}
@@ -86,7 +89,7 @@ def collect_trajectories(
         chunk, rejected = collect_chunk(simulator, variant, steps, seed, (split, first // CHUNK), **options)
         for cause, again in rejected.items():
             redrawn[cause] += again
-        if not isinstance(scene, Scene):
+        if not isinstance(given, Scene):
             chunk["parameters"] = variant_parameters(simulator.scenes, variant)
         chunks.append(chunk)
         if progress is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from typing import TYPE_CHECKING
 
@@ -14,11 +15,18 @@ from torchrl_gn.scenes.scene import Scene
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.model import ForwardModel
     from torchrl_gn.dynamics.predictor import Predictor
+    from torchrl_gn.maths.state_layout import StateLayout
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 
 class UnseenParameterWarning(UserWarning):
     """A scene has a physical parameter that the model never saw vary in training."""
+
+
+def require_bound(model: object) -> None:
+    """TypeError for a model of any scene, which predicts only once it is bound to one."""
+    if hasattr(model, "bind"):
+        raise TypeError(f"{type(model).__name__} is not bound to a scene: use model.bind(scene).")
 
 
 def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> None:
@@ -31,12 +39,19 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
     if action.shape != (*batch, scene.num_actions):
         raise ValueError(
             f"Action of scene {scene.name!r} must be {[*batch, scene.num_actions]} to go with a state"
-            f" {list(state.shape)}, got {list(action.shape)}."
+            f" {list(state.shape)}, got {list(action.shape)}.{_past_commands(scene, action)}"
         )
     if parameters is not None and parameters.shape not in ((), batch):
         raise ValueError(
             f"Physical parameters must have no batch or that of the state, {list(batch)}, got {list(parameters.shape)}."
         )
+
+
+def _past_commands(scene: Scene, action: Tensor) -> str:
+    """What to do if an action may hold past commands that the scene does not expect."""
+    history, rest = divmod(action.shape[-1], max(scene.num_actions, 1))
+    more = rest == 0 and history > 1
+    return f" If it holds past commands, give log_tree(..., history={history - 1})." if more else ""
 
 
 def check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
@@ -77,8 +92,8 @@ def warn_of_unseen(predictor: Predictor, values: PhysicalParameters, name: str, 
             unseen.append(getattr(model.parameter_names, part)[index])
     residual = model.residual_normalizer
     if model.physics is None and bool((residual.count > 0).any()):
-        fixed = (predictor.movable & residual.constant).any(0).nonzero().flatten().tolist()
-        unseen += [f"state change {index}" for index in fixed]
+        fixed = (predictor.movable & residual.constant).any(0).tolist()
+        unseen += itertools.compress(_change_names(model.layout), fixed)
     if not unseen:
         return
     message = (
@@ -88,3 +103,13 @@ def warn_of_unseen(predictor: Predictor, values: PhysicalParameters, name: str, 
     if predictor.strict:
         raise ValueError(message)
     warnings.warn(message, UnseenParameterWarning, stacklevel=stacklevel)
+
+
+def _change_names(layout: StateLayout) -> list[str]:
+    """Names of the channels of a state change."""
+    axes = {1: ("",), 3: (" x", " y", " z")}
+    return [
+        f"change of {component.name.replace('_', ' ')}{axis}"
+        for component in layout.components
+        for axis in axes.get(component.delta_size, [f" {index}" for index in range(component.delta_size)])
+    ]

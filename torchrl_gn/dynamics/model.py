@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, Literal, cast, get_args
@@ -31,6 +32,7 @@ from torchrl_gn.networks.core import Core
 from torchrl_gn.networks.cores import core_class
 from torchrl_gn.networks.graph import GraphSize
 from torchrl_gn.scenes import KinematicTree, ParameterNames, PhysicalParameters, Scene
+from torchrl_gn.scenes.load import as_scene
 
 ParameterSource = Literal["none", "scene", "inferred"]
 
@@ -119,17 +121,24 @@ class ForwardModel(nn.Module):
         fixed = {"counts": counts} if kind.fixed_size else {}
         self.casts = 0  # of the weights, which PyTorch counts as no change of them
         self.core: Core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
+        if not hasattr(self.core, "hidden_size"):
+            raise TypeError(f"{kind.__name__}.__init__ must call super().__init__(dynamic), as a Core does.")
 
     @classmethod
     def for_scene(
-        cls, scene: Scene | KinematicTree | Sequence[Scene], *, features: Sequence[Feature] | None = None, **options
+        cls,
+        scene: Scene | KinematicTree | str | os.PathLike | Sequence[Scene],
+        *,
+        features: Sequence[Feature] | None = None,
+        **options,
     ) -> ForwardModel:
-        """A model with fresh weights for a scene, or for several that share it.
+        """A model with fresh weights for a scene, its name or path, or for several scenes that share it.
 
         Layout, controls at each joint, names of the physical parameters and the graph's size are read from the scene;
         ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core.
         """
-        first = cast(Scene, scene if isinstance(scene, (Scene, KinematicTree)) else scene[0])
+        scene = as_scene(scene)
+        first = cast(Scene, scene if isinstance(scene, (Scene, KinematicTree)) else cast(Any, scene)[0])
         layout = layout_of(first)
         if features is None:
             spatial = "orientation" in layout.names
@@ -183,14 +192,14 @@ class ForwardModel(nn.Module):
 
     def bind(
         self,
-        scene: Scene,
+        scene: Scene | str | os.PathLike,
         *,
         strict: bool = False,
         reference: bool = False,
         parameters_key: NestedKey | None = None,
         parameter_names: ParameterNames | None = None,
     ) -> Predictor:
-        """Join these weights to a scene.
+        """Join these weights to a scene, or that of a name or path.
 
         Args:
             strict: refuse, instead of warning, a scene that differs in a parameter that never varied in training.
@@ -205,7 +214,7 @@ class ForwardModel(nn.Module):
         """
         options = {"parameters_key": parameters_key, "parameter_names": parameter_names}
         with torch.device("cpu"):  # the scene's constants have numbers, also where weights are made on the meta device
-            return Predictor(self, scene, strict=strict, reference=reference, **options)
+            return Predictor(self, as_scene(scene), strict=strict, reference=reference, **options)
 
     def description(self) -> dict:
         """Plain, JSON-able values for :meth:`from_description`; ValueError if a feature is not in ``FEATURES``."""

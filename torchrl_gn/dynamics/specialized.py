@@ -15,7 +15,7 @@ from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics import operators
-from torchrl_gn.dynamics.checks import UnseenParameterWarning
+from torchrl_gn.dynamics.checks import UnseenParameterWarning, require_bound
 from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor
 from torchrl_gn.dynamics.executors.native.binding import load_binding, make_plan
 from torchrl_gn.dynamics.normalization import scaled, static_graph
@@ -257,6 +257,7 @@ def specialize(
         TypeError: to compile a core that is evaluated by message passing.
         ValueError: if the executor is not known.
     """
+    require_bound(predictor)
     if executor not in EXECUTORS:
         raise ValueError(f"executor={executor!r} is not known; use one of {list(EXECUTORS)}.")
     if dtype is not None and predictor.movable.device.type == "cpu" and not product_speeds().pays(dtype):

@@ -18,6 +18,7 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.drawing import draw_states
 from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
+from torchrl_gn.dynamics.checks import require_bound
 from torchrl_gn.envs.specs import (
     DoneFunction,
     RewardFunction,
@@ -75,6 +76,7 @@ class ModelEnv(ModelBasedEnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ):
+        require_bound(model)
         inputs, outputs = getattr(model, "in_keys", ()), getattr(model, "out_keys", ())
         if not {"state", "action"} <= set(inputs) or ("next", "state") not in outputs:
             keys = f"{type(model).__name__} has in_keys {list(inputs)} and out_keys {list(outputs)}"

@@ -17,7 +17,7 @@ from torchrl_gn.envs.specs import DoneFunction, RewardFunction, finite_reward, o
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
 from torchrl_gn.finite import require_finite
-from torchrl_gn.scenes.load import load_scene
+from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scene import Scene
 
 
@@ -76,7 +76,7 @@ class SceneEnv(EnvBase):
     ):
         super().__init__(device=device)
         given = (scene,) if isinstance(scene, (Scene, str, os.PathLike)) else scene
-        self.scenes = tuple(each if isinstance(each, Scene) else load_scene(each) for each in given)
+        self.scenes = tuple(map(as_scene, given))
         if not self.scenes:
             raise ValueError("SceneEnv needs at least one scene.")
         self.scene = self.scenes[0]

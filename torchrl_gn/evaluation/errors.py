@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_gn.dynamics import as_predictor
+from torchrl_gn.dynamics.checks import require_bound
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
 from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout
 from torchrl_gn.finite import require_finite
@@ -70,6 +71,7 @@ def evaluate_errors(
         keep: number of predicted rollouts to return in the table.
         scene: which nodes count and which components are movable. Default: ``model.scene``.
     """
+    require_bound(model)
     scene = scene or cast(Scene, model.scene)
     layout: StateLayout = getattr(model, "layout", BODY_STATE)
     horizons = sorted({int(horizon) for horizon in horizons})

@@ -1,6 +1,8 @@
 """Graph networks: the GN block, and the cores built from it."""
 
 from torchrl_gn.networks.core import Core as Core
+from torchrl_gn.networks.core import FoldedCore as FoldedCore
+from torchrl_gn.networks.core import ListedCore as ListedCore
 from torchrl_gn.networks.core import UnfoldedCore as UnfoldedCore
 from torchrl_gn.networks.cores import CORES as CORES
 from torchrl_gn.networks.gn_block import GNBlock as GNBlock

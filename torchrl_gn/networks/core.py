@@ -51,10 +51,11 @@ class Core(nn.Module):
 
     A subclass implements :meth:`forward`, and :meth:`fold` if it can be evaluated faster for one topology and one
     static graph. A recurrent core sets ``hidden_size`` and implements :meth:`update`. Its constructor takes
-    ``(dynamic, static, out_nodes, *, counts, **options)``.
+    ``(dynamic, static, out_nodes, **options)``, with ``fixed_size = True`` also ``counts``, and calls
+    ``super().__init__(dynamic)``.
     """
 
-    fixed_size = False  # whether the core reads graphs of one size only
+    fixed_size = False  # whether the core reads graphs of one size only, of which ``counts`` says (nodes, edges)
 
     def __init__(self, dynamic: GraphSize, *, hidden_size: GraphSize | None = None) -> None:
         super().__init__()
@@ -97,7 +98,10 @@ class UnfoldedCore:
     static: Graph  # normalised static graph
 
     def predict(self, dynamic: Graph) -> Tensor:
-        return self.core(graph_concat(dynamic, self.static)).nodes
+        out = self.core(graph_concat(dynamic, self.static))
+        if not isinstance(out, Graph):
+            raise TypeError(f"{type(self.core).__name__} must return a Graph, not {type(out).__name__}.")
+        return out.nodes
 
 
 def dtype_of(core: nn.Module) -> torch.dtype:

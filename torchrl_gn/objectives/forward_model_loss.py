@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor
+from torchrl_gn.dynamics.checks import check_shapes, require_bound
 from torchrl_gn.dynamics.executors.eager import EagerExecutor
 from torchrl_gn.dynamics.executors.native import NativeDelta
 from torchrl_gn.dynamics.features.controls import present_actions
@@ -89,6 +90,7 @@ class ForwardModelLoss(LossModule):
         residual_noise: float = 0.0,
     ) -> None:
         super().__init__()
+        require_bound(model)
         sizes = {"noise": noise, "residual_weight": residual_weight, "residual_noise": residual_noise}
         for name, size in sizes.items():
             if not 0 <= size < math.inf:
@@ -244,6 +246,7 @@ class ForwardModelLoss(LossModule):
             raise ValueError(
                 f"{self.in_keys[2]!r} must be {list(state.shape)} as {self.in_keys[0]!r}, got {list(next_state.shape)}."
             )
+        check_shapes(self.model.scene, state, action)
         return state, action, next_state
 
     def _read_parameters(self, tensordict: TensorDictBase, *, windows: bool = False) -> TensorDictBase | None:

@@ -262,8 +262,9 @@ class GradientPlanner(RecedingHorizonPlanner):
             gradient = torch.autograd.grad(total, actions, descent, allow_unused=True)[0] if depends else None
             if gradient is None:
                 raise ValueError(
-                    f"The rewards that {self.imagined} imagines do not depend on the actions. Train the model, or"
-                    " lengthen the horizon until actions change the reward."
+                    f"The rewards that {self.imagined} imagines do not depend on the actions. Train the model,"
+                    " lengthen the horizon until actions change the reward, or mend a reward that passes no gradient"
+                    " (detach, NumPy, comparisons)."
                 )
             best, best_return = _keep_better(best, best_return, actions, total)
             initial_return = best_return if iteration == 0 else initial_return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from numbers import Real
 from types import MappingProxyType
 from typing import cast
@@ -20,8 +20,8 @@ class Reward(nn.Module):
 
     When planning starts, :meth:`task_of` makes the ``task``, which :meth:`forward` reads at every step of the plan,
     from the episode's ``target`` (:class:`~torchrl_gn.rewards.FreezeGoal`). Environments accept any callable with the
-    signature of :meth:`forward`. Rewards add and scale: ``forward + 0.1 * upright``. Subclasses raise ValueError for
-    bodies that the scene does not have.
+    signature of :meth:`forward`. Rewards add and scale, ``forward + 0.1 * upright``, and such a callable adds to them.
+    Subclasses raise ValueError for bodies that the scene does not have.
     """
 
     target_shape: tuple[int, ...] | None = None  # of a target without batch; None if the reward needs none
@@ -70,12 +70,15 @@ class Reward(nn.Module):
             raise ValueError(f"the task of {name} must be {[*batch, *shape]}, got {list(task.shape)}")
         return task.to(next_state.dtype)
 
-    def __add__(self, other: Reward) -> Reward:
+    def __add__(self, other: Reward | Callable[..., Tensor]) -> Reward:
         """Sum of two rewards, of which one at most needs a target."""
-        return self._sum((1.0, self), (1.0, other)) if isinstance(other, Reward) else NotImplemented
+        return self._sum((1.0, self), (1.0, _reward(other))) if callable(other) else NotImplemented
 
-    def __sub__(self, other: Reward) -> Reward:
-        return self._sum((1.0, self), (-1.0, other)) if isinstance(other, Reward) else NotImplemented
+    def __radd__(self, other: Callable[..., Tensor]) -> Reward:
+        return self._sum((1.0, _reward(other)), (1.0, self)) if callable(other) else NotImplemented
+
+    def __sub__(self, other: Reward | Callable[..., Tensor]) -> Reward:
+        return self._sum((1.0, self), (-1.0, _reward(other))) if callable(other) else NotImplemented
 
     def __mul__(self, factor: float) -> Reward:
         """The reward times a number."""
@@ -97,6 +100,24 @@ class Reward(nn.Module):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.extra_repr()})"
+
+
+class _Function(Reward):
+    """A callable, as a term of a sum."""
+
+    def __init__(self, function: Callable[..., Tensor]):
+        super().__init__()
+        self.function = function
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return self.function(state, action, next_state, task)
+
+    def __repr__(self) -> str:
+        return getattr(self.function, "__name__", repr(self.function))
+
+
+def _reward(given: Reward | Callable[..., Tensor]) -> Reward:
+    return given if isinstance(given, Reward) else _Function(given)
 
 
 class FreezeGoal(TensorDictModuleBase):

@@ -20,6 +20,7 @@ _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the sta
     mujoco.mjtSensor.mjSENS_FRAMELINVEL,
     mujoco.mjtSensor.mjSENS_FRAMEANGVEL,
 )
+_REFERRING = ("actuators", "tendons", "equalities", "sensors", "excludes", "pairs")  # elements that name others
 _CONTROL_STEP, _LONGEST_CONTROL_STEP = 0.02, 0.025  # seconds, by default
 
 _LARGEST = 1e30  # static feature; networks read float32
@@ -85,13 +86,13 @@ def build_scene(
 
 
 def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
-    spec = spec.copy()
     flags = mujoco.mjtDisableBit
-    spec.option.disableflags |= int(flags.mjDSBL_WARMSTART)
-    spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
     sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)  # MuJoCo before 3.4 has none
-    spec.option.enableflags &= ~int(sleep)
     try:
+        spec = _copy(spec)
+        spec.option.disableflags |= int(flags.mjDSBL_WARMSTART)
+        spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
+        spec.option.enableflags &= ~int(sleep)
         graph = topology(spec.compile())
         for body in spec.bodies:
             if body.id in graph.body:
@@ -104,6 +105,15 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     if model.njnt == 0:
         raise SceneError(f"Scene {name!r} has no joint, so nothing can move. Add one.")
     return model, graph
+
+
+def _copy(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Copy a model; ValueError for an element that refers to a name that does not exist."""
+    copied = spec.copy()
+    # MuJoCo's copy leaves such elements out; compiling the original names them.
+    if any(len(getattr(copied, kind)) != len(getattr(spec, kind)) for kind in _REFERRING):
+        spec.compile()
+    return copied
 
 
 def _refuse_non_finite(static: StaticGraph, name: str, nodes: tuple[str, ...], pairs: tuple[EdgePair, ...]) -> None:

@@ -87,6 +87,11 @@ def load_scene(
     return build_scene(spec, name=name or own_name, timestep=timestep, origin=origin, **chosen)
 
 
+def as_scene(scene: Any) -> Any:
+    """A scene, or several, as they are; that of a name, path or MJCF text."""
+    return load_scene(cast(Any, scene)) if isinstance(scene, (str, os.PathLike)) else scene
+
+
 def scene_from_description(description: dict) -> Scene:
     """Rebuild the scene of a :meth:`Scene.description`; SceneChangedWarning if its physics differ here."""
     if "kinematic_tree" in description:

@@ -155,7 +155,7 @@ class Scene:
         lines = [
             f"Scene {self.name}: " + ", ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts),
             f"  control step {step:g} ms = {self.substeps} x {physics_step:g} ms",
-            f"  after a reset, {self.settle_steps} physics steps without control",
+            *([f"  after a reset, {self.settle_steps} physics steps without control"] * bool(self.settle_steps)),
             f"  translation-invariant along {_axes(self.translation_invariant, 'no axis')},"
             f" rotation-invariant about {rotations}",
         ]
@@ -195,10 +195,16 @@ class Scene:
         return [f"  {what}: {', '.join(names)}" for what, names in notes.items() if names]
 
     def _contacts(self) -> list[str]:
-        """What can meet, for printing; of a large scene only if it is known, as finding it takes seconds."""
+        """What can meet, for printing; of a large scene pairs only if they are known: finding them takes seconds."""
+        points = self.contact_points
+        lines = (
+            []
+            if points is None
+            else ["  touch the plane: " + ", ".join(self.node_names[node] for node in np.unique(points.node))]
+        )
         if "contact_pairs" not in vars(self) and (count := len(possible_contacts(self))) > _MANY_CONTACTS:
-            return [f"  {count:,} pairs of geoms may collide; scene.contact_pairs finds which nodes can meet"]
-        pairs, names, lines = self.contact_pairs, self.node_names, []
+            return [*lines, f"  {count:,} pairs of geoms may collide; scene.contact_pairs finds which nodes can meet"]
+        pairs, names = self.contact_pairs, self.node_names
         if len(pairs.nodes):
             more = f", and {pairs.left_out} less frequent pairs that are left out" * (pairs.left_out > 0)
             lines.append(f"  can meet: {', '.join(f'{names[a]} - {names[b]}' for a, b in pairs.nodes)}{more}")

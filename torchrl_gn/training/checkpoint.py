@@ -63,7 +63,7 @@ class Checkpoint:
         """The forward model; CheckpointError if it is another kind of model."""
         return self._as(ForwardModel)
 
-    def bind(self, scene: Scene, **options) -> Predictor:
+    def bind(self, scene: Scene | str | os.PathLike, **options) -> Predictor:
         """The forward model joined to a scene, see :meth:`ForwardModel.bind`."""
         return self.model.bind(scene, **options)
 

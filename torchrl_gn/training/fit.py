@@ -25,12 +25,12 @@ _NORMALIZER_SAMPLES = 5000
 
 @dataclass
 class History:
-    """Course of a training."""
+    """Course of a training: the loss at 100 times or every step, and the validation errors."""
 
     steps: list[int] = field(default_factory=list)  # number of each recorded step
     seconds: list[float] = field(default_factory=list)  # training time at each recorded step
     losses: list[float] = field(default_factory=list)  # mean loss since the last recorded step
-    validations: list[tuple[int, float]] = field(default_factory=list)  # step and error
+    validations: list[tuple[int, float]] = field(default_factory=list)  # step, and 20-step error on the validation set
 
     def __str__(self) -> str:
         if not self.steps:
@@ -62,7 +62,7 @@ def fit(
     put :class:`Trainer` and the losses together yourself, as ``recipes/forward_model.py`` does.
 
     Args:
-        model: forward model bound to the scene; its weights are trained in place.
+        model: forward model bound to the scene, ``ForwardModel.for_scene(scene).bind(scene)``; trained in place.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``, see
             :func:`~torchrl_gn.data.collect_trajectories`.
         minutes: training time; default: one, if ``steps`` is not given.
@@ -76,12 +76,13 @@ def fit(
 
     Raises:
         FloatingPointError: if the loss or the gradient is not finite; no weight changes at that step.
-        TypeError: for a specialised predictor, which passes no gradient to the weights.
+        TypeError: for a model that is not bound, a specialised one, which passes no gradient to the weights, or an
+            optimiser of other weights.
         ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
-    scheduled = _make_optimizer(model.model, optimizer, lr)
     loss = ForwardModelLoss(model, noise=noise, generator=torch.Generator().manual_seed(seed))
+    scheduled = _make_optimizer(model.model, optimizer, lr)
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
     transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()
     (loss.fit_scales if model.model.fitted else loss.fit_normalizers)(transitions.to(model.movable.device))
@@ -110,6 +111,11 @@ def fit(
 
 
 def _make_optimizer(module: nn.Module, optimizer: Optimizer, lr: float | None) -> ScheduledOptimizer:
+    if isinstance(optimizer, torch.optim.Optimizer):
+        kind = type(optimizer).__name__
+        raise TypeError(
+            f"optimizer takes a preset or a function: lambda weights: torch.optim.{kind}(weights, lr=1e-3)."
+        )
     if not callable(optimizer):
         return make_optimizer(module, optimizer, lr=lr)
     if lr is not None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+import torchrl_gn as gn
 from torchrl_gn.data import DatasetError, RobotLog, load_robot_log, log_trajectories, log_tree, simulate_log
 from torchrl_gn.scenes import KinematicTree, load_scene, scene_from_description
 
@@ -250,6 +251,34 @@ def test_other_bad_input_is_named(tmp_path):
     with pytest.raises(DatasetError, match="has no 'q'"):
         np.savez(tmp_path / "ok.npz", **arrays_of(smooth_log()), timestep=0.01)
         load_robot_log(tmp_path / "ok.npz", names={"angle": "q"})
+
+
+def test_columns_with_names_of_their_own(tmp_path):
+    log, names = smooth_log(), ("q_hip", "q_knee", "dq_hip", "dq_knee", "tau_hip", "tau_knee")
+    rows = np.hstack((log.angle, log.velocity, log.command))
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=",".join(names), comments="")
+    read = load_robot_log(
+        tmp_path / "log.csv",
+        timestep=0.01,
+        names={"angle": ["q_knee", "q_hip"], "velocity": ["dq_knee", "dq_hip"], "command": "tau_*"},
+    )
+    np.testing.assert_allclose(read.angle, log.angle[:, ::-1])
+    np.testing.assert_allclose(read.velocity, log.velocity[:, ::-1])
+    np.testing.assert_allclose(read.command, log.command)
+    assert not read.unread and not read.extra
+    assert repr(read) == "RobotLog(episodes=1, rows=80, joints=2, commands=2, timestep=0.01)"
+    with pytest.raises(DatasetError, match=r"has no 'q' .*take a list, or a pattern such as 'q_\*'"):
+        load_robot_log(tmp_path / "log.csv", timestep=0.01, names={"angle": "q"})
+
+
+def test_a_tree_without_the_past_commands_of_its_data_is_named():
+    log = smooth_log()
+    data, _ = log_trajectories(log, 10, history=2)
+    model = gn.ForwardModel.for_scene(log_tree(log, "arm"), hidden=8).bind(log_tree(log, "arm"))
+    with pytest.raises(
+        ValueError, match=r"got \[.*, 6\]\. If it holds past commands, give log_tree\(\.\.\., history=2\)"
+    ):
+        gn.fit(model, data, steps=1, progress=False)
 
 
 def test_a_chain_is_a_graph_that_comes_back_from_its_description():

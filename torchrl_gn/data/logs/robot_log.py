@@ -13,7 +13,7 @@ _GAP = 1.5  # usual steps; one missing row makes 2
 _EVEN = 0.01  # of a step, tolerance for rounded time stamps
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RobotLog:
     """Joint-space log of a robot, ``R`` rows."""
 
@@ -25,6 +25,12 @@ class RobotLog:
     extra: dict[str, np.ndarray] = field(default_factory=dict)  # further channels by name, [R, J] each
     time: np.ndarray | None = None  # [R] time stamps, seconds; None: rows are evenly spaced and none is missing
     unread: dict[str, str] = field(default_factory=dict)  # reason for each array of the file that was not read
+
+    def __repr__(self) -> str:
+        sizes = {"episodes": len(self.length), "rows": len(self.angle), "joints": self.num_joints}
+        sizes |= {"commands": self.command.shape[1], "timestep": float(f"{self.timestep:.4g}")}
+        sizes |= {"extra": list(self.extra)} if self.extra else {}
+        return f"RobotLog({', '.join(f'{name}={value}' for name, value in sizes.items())})"
 
     @property
     def num_joints(self) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -14,14 +13,14 @@ import numpy as np
 
 from torchrl_gn.data.dataset_files import DatasetError
 from torchrl_gn.data.logs.robot_log import RobotLog, short_way
-from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, read_log_arrays
+from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, Source, read_log_arrays
 
 
 def load_robot_log(
     path: str | os.PathLike,
     *,
     timestep: float | None = None,
-    names: Mapping[str, str] | None = None,
+    names: Names | None = None,
     degrees: bool = False,
 ) -> RobotLog:
     """Read a log of joint angles, velocities and commands.
@@ -30,7 +29,7 @@ def load_robot_log(
     ``[episodes]`` (rows of each) or ``episode`` ``[R]`` (a new one starts where it changes), ``time`` ``[R]`` (seconds)
     or ``timestep``, and extra channels of any other name ``[R, J]``, or ``[R, k J]`` with the ``k`` numbers of a joint
     side by side, which become ``name0``, ``name1``, ... ``.csv`` has a header and columns ``angle0``, ``angle1``, ...,
-    ``.parquet`` such columns or lists, ``.hdf5`` (``.h5``) datasets of these names.
+    or others that ``names`` lists; ``.parquet`` such columns or lists, ``.hdf5`` (``.h5``) datasets of these names.
 
     LeRobot dataset folders (version 2 or 3) need ``names`` only where ``observation.state`` is more than angles: an
     array's columns are ``"observation.state[:7]"``, or by their names in ``info.json`` ``"observation.state.*pos"``. In
@@ -39,9 +38,10 @@ def load_robot_log(
 
     Args:
         timestep: time between rows, seconds, if the file does not have it.
-        names: name in the file of each array, as ``{"angle": "q", "velocity": "dq"}``; ``""`` leaves an array out.
-            ``{"command": ""}`` means a robot without motors; ``{"velocity": ""}`` takes backward differences of the
-            angles, which lose the first row of each episode and hide jumps.
+        names: name in the file of each array, as ``{"angle": "q", "velocity": "dq"}``; a list of its columns in the
+            order of the joints, ``["q_hip", "q_knee"]``, or a pattern that they match in the file's order, ``"q_*"``;
+            ``""`` leaves an array out. ``{"command": ""}`` means a robot without motors; ``{"velocity": ""}`` takes
+            backward differences of the angles, which lose the first row of each episode and hide jumps.
         degrees: the file has degrees and degrees/s.
 
     Raises:
@@ -92,8 +92,8 @@ def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dic
     arrays, picked, used = found.arrays, {}, set()
     for name, source in names.items():
         if source:
-            used_name, picked[name] = _picked(found, name, source)
-            used.add(used_name)
+            sources, picked[name] = _picked(found, name, source)
+            used |= sources
     rest = {name: values for name, values in arrays.items() if name not in used and name not in names.values()}
     unread = {name: f"{names[name]!r} was named for it" for name in rest if names.get(name)}
     if found.only_named:
@@ -102,20 +102,28 @@ def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dic
     return {name: values for name, values in rest.items() if name not in names} | picked, unread
 
 
-def _picked(found: LogArrays, name: str, source: str) -> tuple[str, np.ndarray]:
-    """The name of an array and its values, or those of its columns that ``source`` chooses."""
+def _picked(found: LogArrays, name: str, source: Source) -> tuple[set[str], np.ndarray]:
+    """The arrays, or the columns of one, that ``source`` chooses, and their values side by side."""
     arrays = found.arrays
+    if not isinstance(source, str):
+        parts = [_picked(found, name, each) for each in source]
+        return set().union(*(used for used, _ in parts)), np.hstack([_columns(values) for _, values in parts])
     if source in arrays:
-        return source, arrays[source]
+        return {source}, arrays[source]
     if (chosen := re.fullmatch(r"(.+)\[(-?\d*):(-?\d*)\]", source)) and chosen[1] in arrays:
         where = slice(*(int(bound) if bound else None for bound in chosen.groups()[1:]))
-        return chosen[1], np.atleast_2d(arrays[chosen[1]].T).T[:, where]
+        return {chosen[1]}, np.atleast_2d(arrays[chosen[1]].T).T[:, where]
     for array, labels in found.columns.items():
         columns = [index for index, label in enumerate(labels) if fnmatchcase(f"{array}.{label}", source)]
         if columns:
-            return array, arrays[array][:, columns]
+            return {array}, arrays[array][:, columns]
+    if matching := [array for array in arrays if "*" in source and fnmatchcase(array, source)]:
+        return _picked(found, name, matching)
     labelled = "".join(f"; {array!r} has columns {labels}" for array, labels in found.columns.items())
-    raise ValueError(f"it has no {source!r} (for {name!r}), only {sorted(arrays)}{labelled}.")
+    raise ValueError(
+        f"it has no {source!r} (for {name!r}), only {sorted(arrays)}{labelled}. Columns with names of their own take a"
+        f" list, or a pattern such as 'q_*'."
+    )
 
 
 def _columns(values: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-Names = dict[str, str]
+Source = str | Sequence[str]  # an array of a file, columns of one by a pattern, or several
+Names = Mapping[str, Source]
 _DEMO = re.compile(r"demo_?(\d+)")
 
 
@@ -22,7 +23,7 @@ class LogArrays:
 
     arrays: dict[str, np.ndarray]
     columns: dict[str, list[str]] = field(default_factory=dict)
-    names: Names = field(default_factory=dict)  # default of ``names=`` of :func:`load_robot_log`
+    names: dict[str, str] = field(default_factory=dict)  # default of ``names=`` of :func:`load_robot_log`
     unread: dict[str, str] = field(default_factory=dict)
     only_named: bool = False  # what has no name is no channel of the joints
 

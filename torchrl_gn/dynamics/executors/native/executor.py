@@ -184,9 +184,10 @@ def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
         return None, f"on {program.movable.device.type}, it runs by torch operations"
     if program.dtype not in (*library.DTYPES, torch.bfloat16):
         return None, f"{str(program.dtype).removeprefix('torch.')} products run by torch operations"
-    layers = core.layers() if isinstance(core, ListedCore) else None
-    if layers is None:
-        return None, "a core without a list of layers, or parameters of each sample, run by torch operations"
+    if not isinstance(core, ListedCore):
+        return None, "a core without fold() and layers() runs by torch operations"
+    if (layers := core.layers()) is None:
+        return None, "with parameters of each sample, it runs by torch operations"
     return layers, None
 
 
