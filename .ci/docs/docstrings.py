@@ -11,6 +11,7 @@ from latex2mathml.converter import convert
 
 ROLE = re.compile(r":(\w+):`([^`]+)`")
 FORMULA = re.compile(r"^( *)\.\. math::(?: (.+)\n|\n((?:\1 +.*\n|\n)+))", re.MULTILINE)
+COMMENT = re.compile(r"  # (?!noqa|pyright|type:)(.+)$")
 EXAMPLE = re.compile(r"^( *)Example:$", re.MULTILINE)
 
 
@@ -34,9 +35,20 @@ class Markdown(griffe.Extension):
         if object_.docstring:
             owner = object_ if object_.is_class else object_.parent
             object_.docstring.value = self._markdown(object_.docstring.value, pkg, owner, public, defined)
+        if object_.is_class and "dataclass" in object_.labels:
+            self._describe(object_)
         for member in object_.members.values():
             if not isinstance(member, griffe.Alias):
                 self._rewrite(pkg, member, public, defined)
+
+    @staticmethod
+    def _describe(class_: griffe.Object) -> None:
+        """Describe the fields of a dataclass by the comments behind them."""
+        for field in class_.attributes.values():
+            if not field.docstring and (comment := COMMENT.search(field.source)):
+                first, _, rest = comment[1].partition(" ")
+                first = first.capitalize() if first.isalpha() and first.islower() else first  # no units, no names
+                field.docstring = griffe.Docstring(f"{first} {rest}", parent=field)
 
     def _markdown(self, text: str, pkg: griffe.Module, owner: Any, public: dict, defined: dict) -> str:
         def formula(match: re.Match[str]) -> str:
