@@ -82,3 +82,8 @@ def test_systems():
     assert set(walker.contact_points.node) == set(cheetah.contact_points.node) == set(range(1, 8))
     assert load_scene("swimmer6").contact_points is None
     np.testing.assert_allclose(walker.contact_points.normal, [0, 0, 1])
+
+
+def test_print_shows_what_touches_the_plane():
+    assert "  touch the plane: torso, bthigh, " in str(load_scene("cheetah"))
+    assert "touch the plane" not in str(load_scene("swimmer3"))

@@ -197,11 +197,8 @@ class Scene:
     def _contacts(self) -> list[str]:
         """What can meet, for printing; of a large scene pairs only if they are known: finding them takes seconds."""
         points = self.contact_points
-        lines = (
-            []
-            if points is None
-            else ["  touch the plane: " + ", ".join(self.node_names[node] for node in np.unique(points.node))]
-        )
+        touching = [] if points is None else [self.node_names[node] for node in np.unique(points.node)]
+        lines = [f"  touch the plane: {', '.join(touching)}"] * bool(touching)
         if "contact_pairs" not in vars(self) and (count := len(possible_contacts(self))) > _MANY_CONTACTS:
             return [*lines, f"  {count:,} pairs of geoms may collide; scene.contact_pairs finds which nodes can meet"]
         pairs, names = self.contact_pairs, self.node_names
