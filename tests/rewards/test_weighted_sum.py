@@ -30,7 +30,7 @@ def test_rewards_add_and_scale(swimmer):
     assert isinstance(total, WeightedSum) and len(total.terms) == 3
     assert repr(total).count("Velocity") == 2
     plain = cast(Any, forward)
-    for wrong in (lambda: plain + 1, lambda: plain * "2", lambda: plain - None):
+    for wrong in (lambda: plain + 1, lambda: plain * "2", lambda: plain - None, lambda: plain + Effort):
         with pytest.raises(TypeError):
             wrong()
 

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.dynamics.features.feature import graph_edges
+from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -48,10 +49,11 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
 
 
 def _past_commands(scene: Scene, action: Tensor) -> str:
-    """What to do if an action may hold past commands that the scene does not expect."""
-    history, rest = divmod(action.shape[-1], max(scene.num_actions, 1))
-    more = rest == 0 and history > 1
-    return f" If it holds past commands, give log_tree(..., history={history - 1})." if more else ""
+    """What to do if an action may hold other numbers of past commands than a robot's tree."""
+    commands = scene.num_actions // (scene.history + 1) if isinstance(scene, KinematicTree) else 0
+    if not commands or action.shape[-1] % commands:
+        return ""
+    return f" If it holds past commands, give log_tree(..., history={action.shape[-1] // commands - 1})."
 
 
 def check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:

@@ -137,8 +137,8 @@ class ForwardModel(nn.Module):
         Layout, controls at each joint, names of the physical parameters and the graph's size are read from the scene;
         ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core.
         """
-        scene = as_scene(scene)
-        first = cast(Scene, scene if isinstance(scene, (Scene, KinematicTree)) else cast(Any, scene)[0])
+        given = as_scene(scene)
+        first = cast(Scene, given if isinstance(given, (Scene, KinematicTree)) else given[0])
         layout = layout_of(first)
         if features is None:
             spatial = "orientation" in layout.names

@@ -72,13 +72,13 @@ class Reward(nn.Module):
 
     def __add__(self, other: Reward | Callable[..., Tensor]) -> Reward:
         """Sum of two rewards, of which one at most needs a target."""
-        return self._sum((1.0, self), (1.0, _reward(other))) if callable(other) else NotImplemented
+        return self._sum((1.0, self), (1.0, other))
 
     def __radd__(self, other: Callable[..., Tensor]) -> Reward:
-        return self._sum((1.0, _reward(other)), (1.0, self)) if callable(other) else NotImplemented
+        return self._sum((1.0, other), (1.0, self))
 
     def __sub__(self, other: Reward | Callable[..., Tensor]) -> Reward:
-        return self._sum((1.0, self), (-1.0, _reward(other))) if callable(other) else NotImplemented
+        return self._sum((1.0, self), (-1.0, other))
 
     def __mul__(self, factor: float) -> Reward:
         """The reward times a number."""
@@ -90,10 +90,12 @@ class Reward(nn.Module):
         return self._sum((-1.0, self))
 
     @staticmethod
-    def _sum(*terms: tuple[float, Reward]) -> Reward:
+    def _sum(*terms: tuple[float, Reward | Callable[..., Tensor]]) -> Reward:
         from torchrl_gn.rewards.weighted_sum import WeightedSum  # which is a reward
 
-        return WeightedSum(terms)
+        if any(isinstance(term, type) or not callable(term) for _, term in terms):
+            return NotImplemented
+        return WeightedSum([(weight, term if isinstance(term, Reward) else _Function(term)) for weight, term in terms])
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={value!r}" for name, value in self.shown.items())
@@ -114,10 +116,6 @@ class _Function(Reward):
 
     def __repr__(self) -> str:
         return getattr(self.function, "__name__", repr(self.function))
-
-
-def _reward(given: Reward | Callable[..., Tensor]) -> Reward:
-    return given if isinstance(given, Reward) else _Function(given)
 
 
 class FreezeGoal(TensorDictModuleBase):

@@ -24,7 +24,7 @@ from torchrl_gn.scenes.variants import build_system, make_variant
 
 
 def load_scene(
-    source: str | Path | mujoco.MjSpec,
+    source: str | os.PathLike | mujoco.MjSpec,
     *,
     timestep: float | None = None,
     name: str | None = None,
@@ -89,7 +89,7 @@ def load_scene(
 
 def as_scene(scene: Any) -> Any:
     """A scene, or several, as they are; that of a name, path or MJCF text."""
-    return load_scene(cast(Any, scene)) if isinstance(scene, (str, os.PathLike)) else scene
+    return load_scene(scene) if isinstance(scene, (str, os.PathLike)) else scene
 
 
 def scene_from_description(description: dict) -> Scene:

@@ -274,11 +274,13 @@ def test_columns_with_names_of_their_own(tmp_path):
 def test_a_tree_without_the_past_commands_of_its_data_is_named():
     log = smooth_log()
     data, _ = log_trajectories(log, 10, history=2)
-    model = gn.ForwardModel.for_scene(log_tree(log, "arm"), hidden=8).bind(log_tree(log, "arm"))
-    with pytest.raises(
-        ValueError, match=r"got \[.*, 6\]\. If it holds past commands, give log_tree\(\.\.\., history=2\)"
-    ):
-        gn.fit(model, data, steps=1, progress=False)
+    for history in (0, 1):
+        tree = log_tree(log, "arm", history=history)
+        model = gn.ForwardModel.for_scene(tree, hidden=8).bind(tree)
+        with pytest.raises(
+            ValueError, match=r"got \[.*, 6\]\. If it holds past commands, give log_tree\(\.\.\., history=2\)"
+        ):
+            gn.fit(model, data, steps=1, progress=False)
 
 
 def test_a_chain_is_a_graph_that_comes_back_from_its_description():

@@ -122,7 +122,7 @@ def _picked(found: LogArrays, name: str, source: Source) -> tuple[set[str], np.n
     labelled = "".join(f"; {array!r} has columns {labels}" for array, labels in found.columns.items())
     raise ValueError(
         f"it has no {source!r} (for {name!r}), only {sorted(arrays)}{labelled}. Columns with names of their own take a"
-        f" list, or a pattern such as 'q_*'."
+        " list, or a pattern such as 'q_*'."
     )
 
 
