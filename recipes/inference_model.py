@@ -5,8 +5,9 @@
 Reproduces the paper's Figures "System identification performance" and "System identification analysis in Pendulum".
 Trains both models on random variants of the system whose parameters they never see (paper, "Inference models"; SM
 "End-to-end training algorithm for System ID"). On new variants, every system is identified once, from `context_length`
-steps of one trajectory, and another of its trajectories is predicted: with its own estimate, and with that of another
-system. `baselines=true` also trains models without identification and with the true parameters for the same time.
+steps of one trajectory, and another of its trajectories is predicted: with its own estimate, with that of another
+system, and with one from steps without control. `baselines=true` also trains models without identification and with
+the true parameters for the same time.
 Ctrl-C saves everything; the same `run_dir` goes on.
 
 Writes config.yaml, metrics.json, the checkpoint, and figures to its run folder: errors as bars (errors.png), error

@@ -20,7 +20,7 @@ from torchrl_gn.scenes import Scene, make_variants, parameter_ranges, sample_par
 
 
 class TestSystems:
-    """New variants with two trajectories each: one to identify the system from, one to predict."""
+    """New variants with trajectories each: to identify the system from, with control and without, and to predict."""
 
     def __init__(self, cfg: DictConfig, scene: Scene) -> None:
         system = scene.origin["system"]
@@ -31,6 +31,9 @@ class TestSystems:
         count = cfg.test.systems
         both = collect_trajectories(self.scenes, 2 * count, cfg.data.length, cfg.data.seed, split=4)
         self.observed, self.predicted = (cast(TensorDictBase, half) for half in (both[:count], both[count:]))
+        none = torch.zeros_like(cast(Tensor, self.observed.get("action"))[:, : cfg.context_length])
+        start = cast(Tensor, self.observed.get("physics"))[:, 0]
+        self.uncontrolled = Simulator(self.scenes).rollout(start, none).set("action", none)
 
 
 def identified_errors(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestSystems):
@@ -40,6 +43,7 @@ def identified_errors(cfg: DictConfig, model: IdentifyingModel, scene: Scene, sy
     tables = {
         "identified": identification_errors(*pairs, steps=cfg.context_length),
         "identified from another system": identification_errors(*pairs, steps=cfg.context_length, wrong=True),
+        "identified without control": identification_errors(bound, inference, systems.uncontrolled, systems.predicted),
     }
     curve = {}
     for steps in tqdm([steps for steps in cfg.test.steps if steps <= cfg.data.length], desc="evaluating", leave=False):
