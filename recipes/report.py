@@ -1,4 +1,4 @@
-"""Write the report of results, docs/results, from its data, docs/results/data.
+"""Write the report of results, docs/results, and README's table of results from their data, docs/results/data.
 
     python recipes/report.py
     python recipes/report.py check=true
@@ -8,8 +8,8 @@ Every claim has a JSON file: what is claimed, the verdict, tables, commands, see
 is a string; a number of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, or the
 sum of a list of them, that may be multiplied ("times": 1000) and divided ("over": another metric); or a list of cells,
 shown with slashes between. Text quotes numbers that the claim's "values" name, as {NAME}. "figure" draws numbers of a
-table (recipes/_common/report_figures.py) into docs/images/results. `check=true` writes nothing and fails if a page or
-figure differs from what its data give.
+table (recipes/_common/report_figures.py) into docs/images/results. README's table is "headlines" of index.json.
+`check=true` writes nothing and fails if a page or figure differs from what its data give.
 
 `add=` puts the metrics of a finished run, with its command, date, processor and versions, beside the claim `to` as
 CLAIM.NAME.metrics.json, named `as` (default: the run folder's name), and prints the names of its metrics. No figure of
@@ -27,7 +27,7 @@ from _common import clean_exit, with_help
 from _common.report_data import add_run, read_run, recipe_of
 from _common.report_drawing import draw_figure
 from _common.report_figures import read_figures, stale_figures
-from _common.report_pages import make_pages
+from _common.report_pages import fill_readme, make_pages
 
 REPORT = Path(__file__).parents[1] / "docs" / "results"
 
@@ -47,16 +47,20 @@ def main(cfg: DictConfig) -> None:
         print("\n".join(read_run(data, file.name)["metrics"]))
         print(file)
         return
-    pages, figures, images = make_pages(data), read_figures(data), report.parent / "images" / "results"
-    there = {file.name: file.read_text() for file in report.glob("*.md")}
-    changed = sorted(name for name in pages.keys() | there.keys() if pages.get(name) != there.get(name))
+    figures, images = read_figures(data), report.parent / "images" / "results"
+    pages = {report / name: text for name, text in make_pages(data).items()}
+    there = {file: file.read_text() for file in report.glob("*.md")}
+    readme = report.parents[1] / "README.md"
+    if readme.exists():
+        there[readme] = readme.read_text()
+        pages[readme] = fill_readme(there[readme], data)
+    changed = sorted(file for file in pages.keys() | there.keys() if pages.get(file) != there.get(file))
     stale = stale_figures(figures, images)
     if cfg.check and changed + stale:
-        files = f"{changed + stale} of {report} and {images}"
+        files = ", ".join(map(str, [*changed, *(images / name for name in stale)]))
         raise ValueError(f"{files} differ from the data; run python recipes/report.py and commit them.")
-    for name in changed:
-        file = report / name
-        file.write_text(pages[name]) if name in pages else file.unlink()
+    for file in changed:
+        file.write_text(pages[file]) if file in pages else file.unlink()
         print(file)
     for name in stale:
         file = images / name

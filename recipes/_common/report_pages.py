@@ -36,6 +36,21 @@ def make_pages(data: Path) -> dict[str, str]:
     }
 
 
+def fill_readme(text: str, data: Path) -> str:
+    """README's text with the table of its section "Results" made of the index's ``headlines``.
+
+    Raises:
+        ValueError: if that section does not begin with a table, or a quoted run is not there.
+    """
+    headlines = read(data, INDEX)["headlines"]
+    rows = [[_filled(cell, headlines, data) for cell in row] for row in headlines["rows"]]
+    table = _lines([headlines["columns"], *rows])
+    filled, found = re.subn(r"(?<=\n## Results\n\n)(\|.*\n)+", lambda _: f"{table}\n", text)
+    if not found:
+        raise ValueError('README.md has no table at the beginning of its section "## Results".')
+    return filled
+
+
 def _index_page(index: Mapping[str, Any], rows: Sequence[Sequence[str]]) -> str:
     parts = [
         f"# {index['title']}",
@@ -95,8 +110,13 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         for cell in row:
             if len(re.sub(r"\]\([^)]*\)|[*`\[]", "", cell)) > LONGEST_CELL:
                 raise ValueError(f"the cell {cell!r} has more than {LONGEST_CELL} characters.")
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return _lines([columns, *rows])
+
+
+def _lines(rows: Sequence[Sequence[str]]) -> str:
+    """Rows as Markdown, the first as head."""
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([lines[0], f"| {' | '.join(['---'] * len(rows[0]))} |", *lines[1:]])
 
 
 def shown(cell: Any, data: Path) -> str:

@@ -11,7 +11,7 @@ import pytest
 from _common.report_data import add_run, read_run
 from _common.report_drawing import _name_places, draw_figure
 from _common.report_figures import numbers, read_figures, stale_figures
-from _common.report_pages import make_pages, shown
+from _common.report_pages import fill_readme, make_pages, shown
 from torchrl_gn.drawing.canvas import new_figure
 
 from .conftest import ROOT
@@ -96,6 +96,20 @@ def test_a_cell_may_compare_two_runs(report, finished):
 def test_committed_pages_are_those_of_their_data():
     pages = make_pages(REPORT / "data")
     assert pages == {file.name: file.read_text() for file in REPORT.glob("*.md")}
+    readme = (ROOT / "README.md").read_text()
+    assert fill_readme(readme, REPORT / "data") == readme
+
+
+def test_readmes_table_quotes_runs(report, finished):
+    add_run(report / "data", finished, "errors", {})
+    index = json.loads((report / "data" / "index.json").read_text())
+    headlines = {"columns": ["what", "ours"], "rows": [["error", "**{best}**"]], "values": CLAIM["values"]}
+    write(report / "data", "index", index | {"headlines": headlines})
+    before = "# Some\n\n## Results\n\n| old |\n| --- |\n| 1 |\n\nAfter.\n"
+    after = "# Some\n\n## Results\n\n| what | ours |\n| --- | --- |\n| error | **1.2e-3** |\n\nAfter.\n"
+    assert fill_readme(before, report / "data") == fill_readme(after, report / "data") == after
+    with pytest.raises(ValueError, match="README.md has no table"):
+        fill_readme("# Some\n\n## Results\n\nNone.\n", report / "data")
 
 
 def test_committed_figures_are_those_of_their_data():
