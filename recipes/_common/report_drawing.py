@@ -34,7 +34,7 @@ def draw_figure(figure: ReportFigure, file: Path) -> Path:
     rows = -(-count // columns)
     tall = 2.1 if lines else max(_height(points, options) for points in panels)
     canvas = new_figure((_WIDE, 3.3 if lines and count == 1 else 0.7 + rows * (tall + 0.3 * (count > 1))))
-    places = list(canvas.subplots(rows, columns, squeeze=False).flat)
+    places = list(canvas.subplots(rows, columns, squeeze=False, sharey=options.get("share", False)).flat)
     for number, (axes, (title, points)) in enumerate(zip(places, figure.panels.items(), strict=False)):
         (_lines if lines else _rows)(axes, points, options)
         if count > 1 and not options.get("log"):

@@ -8,7 +8,8 @@ A claim's ``figure`` names what is drawn:
   the same label are drawn as one, a dot each;
 - ``y``: columns, by name or index, or ``{"column", "take", "spread", "name"}``: the number of a cell to draw (an index
   or "all", default 0), the number or column that is its half-range, and the column's name in the figure;
-- ``panel``: a label as ``row`` is; rows of different panels are drawn on axes of their own;
+- ``panel``: a label as ``row`` is; rows of different panels are drawn on axes of their own, or with ``share`` panels of
+  lines on one vertical axis;
 - ``between``: two columns; a number is drawn as its share of the way from the first to the second, in per cent;
 - ``transpose``: columns are drawn as rows, and rows as colours;
 - ``ours``: rows in colour among grey ones; ``log``; ``from``: where the axis of the numbers begins; ``at``: a dashed
@@ -38,7 +39,7 @@ KINDS = ("dots", "bars", "lines")
 DIGEST = "Digest"  # key of the PNG's text
 _DRAWING = 2  # raise it when report_drawing.py changes: every figure is then drawn anew
 _KEYS = {"kind", "table", "rows", "row", "until", "labels", "y", "panel", "between", "transpose", "ours", "log", "at"}
-_KEYS |= {"from", "axis", "along", "alt"}
+_KEYS |= {"from", "axis", "along", "alt", "share"}
 _NUMBER = re.compile(r"(?<![\w.])-?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?", re.ASCII)
 
 Points = dict[str, dict[str, list[tuple[float, float]]]]  # (value, half-range), by row, by series

@@ -153,11 +153,10 @@ def _filled(text: str, claim: Mapping[str, Any], data: Path) -> str:
 
 
 def _source(claim: Mapping[str, Any]) -> str:
-    """Where the numbers are from: the runs that the claim quotes, and what was transcribed."""
+    """Where the numbers are from: the runs that the claim quotes, and what its tables say themselves."""
     files = list(dict.fromkeys(_quoted([claim["tables"], claim.get("values", {})])))
     runs = [f"[{file.split('.')[1]}](data/{file})" for file in files]
-    transcribed = {table["date"] for table in claim["tables"] if table.get("source") == "transcribed"}
-    return ", ".join(runs + [f"transcribed, {' and '.join(sorted(transcribed))}"] * bool(transcribed))
+    return ", ".join(runs + sorted({table["source"] for table in claim["tables"] if "source" in table}))
 
 
 def _quoted(cells: Any) -> Iterator[str]:

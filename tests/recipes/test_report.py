@@ -42,7 +42,7 @@ CLAIM = {
                 ]
             ],
         },
-        {"title": "Before.", "columns": ["error"], "rows": [["0.2"]], "source": "transcribed", "date": "May 2026"},
+        {"title": "Before.", "columns": ["error"], "rows": [["0.2"]], "source": "published"},
     ],
     "command": ["python recipes/evaluate.py checkpoint=swimmer6"],
     "seeds": "0",
@@ -144,7 +144,7 @@ def test_tables_quote_runs(report, finished):
     assert "| GN | **1.2e-3** / diverges | 1,250 | 1016.3 |" in pages["errors.md"]
     assert "![The best of 1.2e-3](../images/results/errors.png)" in pages["errors.md"]
     assert "- The best is 1.2e-3." in pages["errors.md"]
-    assert "Source: [first](data/errors.first.metrics.json), transcribed, May 2026." in pages["errors.md"]
+    assert "Source: [first](data/errors.first.metrics.json), published." in pages["errors.md"]
     assert "| *errors are low* | holds | 1.2e-3 of 1 | [Errors](errors.md) |" in pages["README.md"]
 
 
