@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, ForwardModel, JointAxes, PairContacts
+from torchrl_gn.dynamics import (
+    BodyState,
+    Canonicalizer,
+    Contacts,
+    Controls,
+    ForwardModel,
+    JointAxes,
+    PairContacts,
+    Wrenches,
+)
 from torchrl_gn.scenes import KinematicTree, Scene
 from torchrl_gn.training import plain_config
 
@@ -25,7 +34,8 @@ def build_model(
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
     optional = {"joint_axes": JointAxes(), "contacts": Contacts(), "contact_pairs": PairContacts()}
     chosen = [feature for name, feature in optional.items() if shown.pop(name)]
-    features = (BodyState(**shown), Controls(), *chosen)
+    first = scenes[0] if isinstance(scenes, Sequence) else scenes
+    features = (BodyState(**shown), Controls(), *chosen, *(Wrenches(),) * Wrenches.suits(first))
     return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
 
 

@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from _common.models import build_model, model_overrides
-from torchrl_gn.dynamics import BodyState, Canonicalizer, Controls, JointAxes
+from torchrl_gn.dynamics import BodyState, Canonicalizer, Controls, ForwardModel, JointAxes, Wrenches
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, plain_config, save_checkpoint
+
+from .conftest import ROOT
 
 
 def test_the_block_says_what_the_model_is(compose):
@@ -19,6 +21,14 @@ def test_the_block_says_what_the_model_is(compose):
     assert model.canonicalizer == Canonicalizer(yaw=False) and model.parameter_source == "none"
     assert model.core_options == {"hidden": 8, "activation": "silu"} and model.core_name == "gn"
     assert build_model(scene, compose("forward_model").model, core="mlp", hidden=[4]).core_options["hidden"] == [4]
+
+
+def test_rotors_are_features_without_an_option(compose):
+    options = compose("forward_model").model
+    quadrotor = load_scene(ROOT / "tests" / "zoo" / "quadrotor.xml", timestep=0.02)
+    model = build_model(quadrotor, options)
+    assert set(model.features) == set(ForwardModel.for_scene(quadrotor).features) and Wrenches() in model.features
+    assert Wrenches() not in build_model([load_scene("pendulum")], options).features
 
 
 def test_the_papers_preset_shows_and_builds_in_what_the_paper_does(compose):

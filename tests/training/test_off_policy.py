@@ -17,7 +17,7 @@ from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.policies import Agent
-from torchrl_gn.training import load_pretrained, mean_return, save_checkpoint
+from torchrl_gn.training import load_pretrained, mean_return, off_policy, save_checkpoint
 
 
 def spend(trainer) -> list:
@@ -83,6 +83,19 @@ def test_compiled_updates_are_the_same(make_learner, monkeypatch):
         found.append((losses, start))
     for plain, quick in zip(found[0][0], found[1][0], strict=True):
         assert plain == pytest.approx(quick, rel=1e-4)
+
+
+def test_updates_are_compiled_only_where_there_is_a_compiler(make_learner, monkeypatch):
+    def none(device):
+        raise FileNotFoundError("compiling needs a C++ compiler")
+
+    monkeypatch.setattr(off_policy, "check_compiling", none)
+    assert spend(make_learner(frames=100, random_frames=60, compile=None))[-1].updates
+    with pytest.raises(FileNotFoundError, match="needs a C"):
+        make_learner(compile=True)
+    monkeypatch.setattr(off_policy, "check_compiling", lambda device: None)
+    monkeypatch.setattr(off_policy.OffPolicyTrainer, "_first_loss", "compiled", raising=True)
+    assert make_learner(compile=None)._loss == make_learner(compile=True)._loss == "compiled"
 
 
 def test_targets_are_copied_after_their_interval(make_learner):

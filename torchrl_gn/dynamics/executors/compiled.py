@@ -34,9 +34,7 @@ class CompiledExecutor:
     fixed_batch, runs_all = True, False
 
     def __init__(self, program: StepProgram) -> None:
-        check_torch()
-        if program.movable.device.type == "cpu":
-            check_compiler()
+        check_compiling(program.movable.device)
         if isinstance(program.core, UnfoldedCore):
             kind = type(program.core.core).__name__
             raise TypeError(f"{kind} has no fold() and is evaluated by message passing: use executor='eager'.")
@@ -145,11 +143,13 @@ def _is_worth_showing(record: logging.LogRecord) -> bool:
     return "missing a c-shim implementation" not in record.getMessage()
 
 
-def check_torch() -> None:
-    """RuntimeError if torch is too old to compile."""
+def check_compiling(device: torch.device) -> None:
+    """RuntimeError if torch is too old to compile, FileNotFoundError without a C++ compiler on a CPU."""
     # Only inputs are guarded, so two programs of equal shapes must not share compiled code.
     if "isolate_recompiles" not in inspect.signature(torch.compile).parameters:
-        raise RuntimeError(f"compiling needs torch 2.13 or newer, not {torch.__version__}: use executor='eager'.")
+        raise RuntimeError(f"compiling needs torch 2.13 or newer, not {torch.__version__}: run eagerly.")
+    if device.type == "cpu":
+        check_compiler()
 
 
 def check_compiler() -> None:
@@ -160,4 +160,4 @@ def check_compiler() -> None:
     try:
         get_cpp_compiler()
     except InvalidCxxCompiler as error:
-        raise FileNotFoundError("compiling needs a C++ compiler: install g++, or use executor='eager'.") from error
+        raise FileNotFoundError("compiling needs a C++ compiler: install g++, or run eagerly.") from error
