@@ -15,6 +15,7 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
+from statistics import mean
 
 import hydra
 import numpy as np
@@ -47,6 +48,13 @@ def quartiles(values: list[float]) -> tuple[float, float, float]:
     return float(low), float(middle), float(high)
 
 
+def second_half(curve: dict[str, list[float]]) -> float:
+    """Mean return of the evaluations after half of the frames."""
+    half = curve["frames"][-1] / 2
+    late = [value for at, value in zip(curve["frames"], curve["returns"], strict=True) if at > half]
+    return mean(late or curve["returns"])
+
+
 @with_help
 @hydra.main(config_path="config", config_name="learning_curves", version_base="1.3")
 @clean_exit
@@ -60,22 +68,29 @@ def main(cfg: DictConfig) -> None:
 
     curves, metrics = {}, {}
     lines = [
-        "| agent | seeds | last tenth of the returns | best | frames | updates | minutes | updates/s |",
-        "|---" * 8 + "|",
+        "| agent | seeds | second half of the returns | last tenth | best | frames | updates | minutes | updates/s |",
+        "|---" * 9 + "|",
     ]
     for name, of in runs.items():
-        found = [(run, run.metrics) for run in of]
-        done = [(json.loads((run.folder / "curve.json").read_text()), values) for run, values in found if values]
+        found = {seed: (run, run.metrics) for seed, run in zip(as_list(cfg.seeds), of, strict=True)}
+        done = {seed: values for seed, (_, values) in found.items() if values}
         if not done:
             continue
-        curves[name] = (done[0][0]["frames"], [curve["returns"] for curve, _ in done])
+        of_seed = {seed: json.loads((found[seed][0].folder / "curve.json").read_text()) for seed in done}
+        frames, returns = next(iter(of_seed.values()))["frames"], [curve["returns"] for curve in of_seed.values()]
+        curves[name] = (frames, returns)
         cells = [name, str(len(done))]
-        for key in ("last_tenth_return", "best_return"):
-            low, middle, high = quartiles([values[key] for _, values in done])
+        halves = {seed: second_half(curve) for seed, curve in of_seed.items()}
+        metrics |= {f"{name}/return/{at}": quartiles(list(each))[1] for at, *each in zip(frames, *returns, strict=True)}
+        metrics |= {f"{name}/second_half_return/seed {seed}": half for seed, half in halves.items()}
+        summed_up = {"second_half_return": list(halves.values())}
+        summed_up |= {key: [values[key] for values in done.values()] for key in ("last_tenth_return", "best_return")}
+        for key, values in summed_up.items():
+            low, middle, high = quartiles(values)
             metrics |= {f"{name}/{key}": middle, f"{name}/{key}/low": low, f"{name}/{key}/high": high}
             cells.append(f"{middle:.0f} ({low:.0f} to {high:.0f})")
         for key, scale in (("frames", 1), ("updates", 1), ("learning_seconds", 1 / 60), ("updates_per_second", 1)):
-            metrics[f"{name}/{key}"] = quartiles([values[key] for _, values in done])[1]
+            metrics[f"{name}/{key}"] = quartiles([values[key] for values in done.values()])[1]
             cells.append(f"{scale * metrics[f'{name}/{key}']:,.0f}")
         lines.append("| " + " | ".join(cells) + " |")
     if curves:

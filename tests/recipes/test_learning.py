@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from _common.progress import learn_with_progress, report_learning
+from learning_curves import second_half
 from torchrl_gn.training import (
     RunFolder,
     Tracker,
@@ -57,3 +58,8 @@ def test_a_report_holds_the_curve_and_its_last_tenth(make_learner, tracker, tmp_
     assert json.loads((tmp_path / "run" / "curve.json").read_text())["returns"] == trainer.curve.returns
     printed = capsys.readouterr().out.split()
     assert all(str(path) in printed for path in (*run.written, run.checkpoint))
+
+
+def test_the_second_half_of_a_curve_begins_after_half_of_the_frames():
+    curve = {"frames": [0, 100, 200, 300, 400], "returns": [1.0, 2.0, 4.0, 8.0, 16.0]}
+    assert second_half(curve) == 12.0 and second_half({"frames": [0], "returns": [3.0]}) == 3.0
