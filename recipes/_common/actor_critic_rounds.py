@@ -9,12 +9,11 @@ from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
-from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 from torch import Tensor
 
 from _common.actor_critic import ActorCriticOptimizer, TargetSquares, play, played_windows, windows
-from torchrl_gn.atomic import atomic_path
+from _common.tensor_files import load_tensors, save_tensors
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
@@ -72,7 +71,7 @@ class Task:
         first = collect_trajectories(self.scene, cfg.first.trajectories, steps=cfg.first.length, seed=cfg.seed)
         self.data = [windows(first["state"], first["action"])]
         for each in done:
-            played = load_file(each.of("played", self))
+            played = load_tensors(each.of("played", self))
             self.data.append(TensorDict(played, [len(played["action"])]))
 
     def begin(self, policy: BoundedPolicy, begun: Round | None) -> None:
@@ -134,9 +133,7 @@ class Task:
     def add(self, played: TensorDict, of: Round) -> None:
         """Keep a round's trajectories, also in its folder."""
         self.data.append(played)
-        (path := of.of("played", self)).parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary:
-            save_file({key: value.contiguous() for key, value in played.items()}, temporary)
+        save_tensors(of.of("played", self), dict(played.items()))
 
 
 class ActorCritic:

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import cast
 
 import torch
-from safetensors.torch import load_file, save_file
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.atomic import atomic_path
+from _common.tensor_files import load_tensors, save_tensors
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import rollout_video
 from torchrl_gn.scenes import Scene
@@ -32,7 +31,7 @@ class Episodes:
         self.records: dict[str, list[Tensor]] = {name: [] for name in ("state", "action", "reward", *TIME_FIRST)}
         self.records["state"].append(start["state"])
         if path.exists():
-            saved = load_file(path)
+            saved = load_tensors(path)
             flat = {key.removeprefix("now."): value for key, value in saved.items() if key.startswith("now.")}
             batch = start.batch_size
             self.now = cast(TensorDictBase, TensorDict(flat, batch_size=batch).unflatten_keys("."))
@@ -60,11 +59,7 @@ class Episodes:
         if not len(self):
             return
         now = {f"now.{key}": value for key, value in self.now.flatten_keys(".").items()}
-        values = {name: self[name] for name in self.records}
-        # Copies: a target is also the task, and safetensors refuses what shares memory.
-        apart = {key: value.clone(memory_format=torch.contiguous_format) for key, value in (now | values).items()}
-        with atomic_path(self.path) as temporary:
-            save_file(apart, temporary)
+        save_tensors(self.path, now | {name: self[name] for name in self.records})
 
 
 def transitions(path: Path) -> list[TensorDict]:
@@ -72,7 +67,7 @@ def transitions(path: Path) -> list[TensorDict]:
 
     An episode that became unstable ends before. ValueError if none has a stable step.
     """
-    kept = load_file(path)
+    kept = load_tensors(path)
     lengths = kept["state"].isfinite().flatten(2).all(-1).sum(1) - 1
     found = []
     for length in lengths[lengths > 0].unique().tolist():

@@ -8,12 +8,12 @@ from typing import cast
 
 import torch
 from omegaconf import DictConfig
-from safetensors.torch import load_file
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
 
 from _common import as_list
 from _common.progress import dataset_with_progress
+from _common.tensor_files import load_tensors
 from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.scenes import Scene, has_variants
@@ -82,7 +82,7 @@ def extra_trajectories(source: str, length: int) -> TensorDict:
     """Trajectories ``[M]`` of a folder, or of a file of recipes/mpc.py's episodes, in pieces of `length` steps."""
     if not source.endswith(".safetensors"):
         return cast(TensorDict, TensorDict.load_memmap(source)).select("state", "action")
-    kept = load_file(source)
+    kept = load_tensors(source)
     episodes, steps = kept["action"].shape[:2]
     if steps < length:
         raise ValueError(f"data.extra={source} has episodes of {steps} steps, fewer than data.length={length}.")

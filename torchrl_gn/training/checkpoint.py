@@ -157,7 +157,7 @@ def save_checkpoint(
         "training": plain,
     }
     text = json.dumps(description)  # in their order: that of an observation is where its numbers are
-    digest = _digest(tensors, text)
+    digest = digest_of(tensors, text)
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"format": str(FORMAT), "description": text, "sha256": digest})
 
@@ -193,7 +193,7 @@ def read_checkpoint(
             f"Checkpoint {path} has format {metadata['format']}, this version reads format {FORMAT}; {what}."
         )
     text = metadata["description"]
-    if _digest(tensors, text) != metadata["sha256"]:
+    if digest_of(tensors, text) != metadata["sha256"]:
         raise CheckpointError(f"Checkpoint {path} is damaged (checksum differs); use another or train again.")
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
@@ -250,7 +250,8 @@ def load_pretrained(
     return read_checkpoint(source, physics=physics)
 
 
-def _digest(tensors: Mapping[str, Tensor], text: str) -> str:
+def digest_of(tensors: Mapping[str, Tensor], text: str = "") -> str:
+    """Checksum of tensors on the CPU, by name, dtype and shape, and of a text."""
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         value = tensors[name].contiguous()
