@@ -24,7 +24,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from _common import clean_exit, with_help
-from _common.report_data import add_run, read_run, recipe_of
+from _common.report_data import INDEX, add_run, read, read_run, recipe_of
 from _common.report_drawing import draw_figure
 from _common.report_figures import read_figures, stale_figures
 from _common.report_pages import fill_readme, make_pages
@@ -50,8 +50,8 @@ def main(cfg: DictConfig) -> None:
     figures, images = read_figures(data), report.parent / "images" / "results"
     pages = {report / name: text for name, text in make_pages(data).items()}
     there = {file: file.read_text() for file in report.glob("*.md")}
-    readme = report.parents[1] / "README.md"
-    if readme.exists():
+    readme = report.absolute().parents[1] / "README.md"
+    if "headlines" in read(data, INDEX):
         there[readme] = readme.read_text()
         pages[readme] = fill_readme(there[readme], data)
     changed = sorted(file for file in pages.keys() | there.keys() if pages.get(file) != there.get(file))
