@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
+import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.training.checkpoint import digest_of
+from torchrl_gn.training.checkpoint import DAMAGE, digest_of, read_tensors
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
     """Write tensors to a safetensors file."""
     # Copies: safetensors refuses what shares memory.
-    apart = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    apart = {name: value.detach().cpu().clone(memory_format=torch.contiguous_format) for name, value in tensors.items()}
     with atomic_path(path) as temporary:
         save_file(apart, temporary, metadata={"sha256": digest_of(apart)})
 
@@ -31,10 +30,9 @@ def load_tensors(path: str | Path) -> dict[str, Tensor]:
     if not Path(path).is_file():
         raise ValueError(f"There is no file {path}.")
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata, tensors = file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError, struct.error) as error:
+        tensors, metadata = read_tensors(path)
+    except DAMAGE as error:
         raise ValueError(f"{path} is damaged ({error}); delete it, or name another.") from error
-    if metadata.get("sha256", written := digest_of(tensors)) != written:
+    if "sha256" in metadata and digest_of(tensors) != metadata["sha256"]:
         raise ValueError(f"{path} is damaged (checksum differs); delete it, or name another.")
     return tensors

@@ -29,6 +29,7 @@ from torchrl_gn.scenes import Scene, scene_from_description
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"  # of a run folder
 WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")  # the models that come with the package
 FORMAT = 4  # version of the checkpoint format that this package writes and reads
+DAMAGE = (SafetensorError, OSError, struct.error)  # what reading a damaged file raises
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
 Trained = ForwardModel | IdentifyingModel | Agent | StateValue | BoundedPolicy  # what a checkpoint can hold
@@ -180,10 +181,8 @@ def read_checkpoint(
     if not path.is_file():
         raise CheckpointError(f"No checkpoint at {path}.")
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError, struct.error) as error:
+        tensors, metadata = read_tensors(path)
+    except DAMAGE as error:
         raise CheckpointError(f"Checkpoint {path} is damaged ({error}); use another or train again.") from error
     if not {"format", "description", "sha256"} <= metadata.keys():
         raise CheckpointError(f"{path} is a safetensors file, but no checkpoint of torchrl_gn.")
@@ -248,6 +247,12 @@ def load_pretrained(
             f" do are {names}.{hint}"
         )
     return read_checkpoint(source, physics=physics)
+
+
+def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file; raises what :data:`DAMAGE` lists if it cannot be read."""
+    with safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
 
 
 def digest_of(tensors: Mapping[str, Tensor], text: str = "") -> str:
