@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
-from torchrl_gn.dynamics.executors import EXECUTORS
+from torchrl_gn.dynamics.executors import EXECUTORS, NativeExecutor
 from torchrl_gn.networks import CORES, Core, Graph, GraphSize
 from torchrl_gn.scenes import SYSTEMS
 
@@ -52,7 +52,7 @@ def cases() -> list:
             continue
         for dtype in BOUNDS:
             found += [(executor, *each, batches, False, dtype) for executor in ("eager", "native")]
-            found.append(("eager", *each, [(5,)], True, dtype))
+            found += [(executor, *each, [(5,), (2, 1)], True, dtype) for executor in ("eager", "native")]
     # A gradient takes up to minutes to compile.
     few = [
         ("pendulum", "gn", [()], False, torch.float64),
@@ -90,7 +90,7 @@ def own_parameters(predictor: Predictor, batch: tuple[int, ...]) -> TensorDictBa
     """Physical parameters of every sample, up to 10 % from the scene's."""
     parameters = predictor.own_parameters().expand(batch).clone()
     generator = torch.Generator().manual_seed(4)
-    for part in ("nodes", "edges", "globals_", "child_anchor"):
+    for part in ("nodes", "edges", "globals_", "parent_anchor", "child_anchor", "contact_offset", "contact_radius"):
         shape = parameters[part].shape
         parameters[part] *= 1 + 0.1 * torch.rand(shape, generator=generator, dtype=torch.float64)
     return parameters
@@ -115,3 +115,6 @@ def test_every_executor_is_the_reference(
         for wanted, got in zip(expected, found, strict=True):
             assert got.dtype == wanted.dtype and got.shape == wanted.shape
             assert (got - wanted).norm() <= BOUNDS[dtype] * wanted.norm()
+        if executor == "native":
+            running = predictor.executor(parameters)
+            assert isinstance(running, NativeExecutor) and (running.reason is None) == (kind in ("gn", "mlp"))

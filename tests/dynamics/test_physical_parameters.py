@@ -75,8 +75,11 @@ def test_every_sample_is_predicted_as_its_own_scene(variants, samples, model, wa
     assert (ours - bound.step(state, action, parameters[0])[0]).abs().max() > 1e-4
     weight = torch.randn(ours.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     gradients = [torch.autograd.grad((out * weight).sum(), (state, action)) for out in (ours, theirs)]
-    for got, expected in zip(*gradients, strict=True):
-        assert (got - expected).norm() <= 1e-10 * expected.norm()
+    # A specialised model may take channels that cannot move for constants.
+    moves = ((samples["state"] - samples["state"][:, :1, :1]).abs() > 1e-9).flatten(0, 2).any(0)
+    varies = moves if way == "specialised" else torch.ones_like(moves)
+    for (got, expected), kept in zip(zip(*gradients, strict=True), (varies, torch.ones_like(action[0])), strict=True):
+        assert ((got - expected) * kept).norm() <= 1e-10 * expected.norm()
     written = module(TensorDict({"state": state, "action": action, "parameters": parameters}, [3]))["next", "state"]
     assert torch.equal(written, ours)
 

@@ -29,7 +29,7 @@ def evaluate(network: LayerList, nodes: Tensor, edges: Tensor) -> Tensor:
     for layer in network.layers:
         out = torch.cat([rows(gather) for gather in layer.inputs], -1) @ layer.weight.T
         if layer.table is not None:
-            out = out + layer.table[:, None]
+            out = out + (layer.table[:, None] if layer.table.ndim == 2 else layer.table)
         for gather in layer.added:
             out = out + rows(gather)
         buffers.append(out if layer.activation is None else ACTIVATIONS[layer.activation]()(out))
@@ -44,13 +44,15 @@ def core(kind: str, sizes: tuple[GraphSize, GraphSize], counts: tuple[int, int],
     return GNCore(sizes[0], sizes[1], 5, latent=3, **hidden).double()
 
 
+@pytest.mark.parametrize("own", [False, True])
 @pytest.mark.parametrize("depth", [1, 3])
 @pytest.mark.parametrize("kind", ["gn", "mlp"])
 @pytest.mark.parametrize(("edges", "predicted"), [(RING, [0, 1, 2]), (TREE, [3, 1]), (NO_EDGES, [1])])
-def test_predicts_the_same(random_graph, kind, edges, predicted, depth):
+def test_predicts_the_same(random_graph, kind, edges, predicted, depth, own):
     sizes, num_nodes = (GraphSize(3, 2, 0), GraphSize(4, 1, 3)), 4
-    dynamic, static = (random_graph(size, edges, num_nodes, batch) for size, batch in zip(sizes, (6, 1), strict=True))
-    static = type(static)(*(part[0] for part in static.features), edges)
+    dynamic, static = (random_graph(size, edges, num_nodes, 6) for size in sizes)
+    if not own:  # one static graph for all samples
+        static = type(static)(*(part[0] for part in static.features), edges)
     folded = core(kind, sizes, (num_nodes, edges.shape[1]), depth).fold(
         Incidence(edges, num_nodes, torch.tensor(predicted)), static
     )
@@ -62,10 +64,9 @@ def test_predicts_the_same(random_graph, kind, edges, predicted, depth):
 
 
 @pytest.mark.parametrize("kind", ["gn", "mlp"])
-@pytest.mark.parametrize(("globals_", "batch"), [(2, 1), (0, 6)])
-def test_refuses_globals_and_parameters_of_samples(random_graph, kind, globals_, batch):
-    sizes = GraphSize(3, 2, globals_), GraphSize(4, 1, 3)
-    static = random_graph(sizes[1], RING, 3, batch)
+def test_refuses_globals(random_graph, kind):
+    sizes = GraphSize(3, 2, 2), GraphSize(4, 1, 3)
+    static = random_graph(sizes[1], RING, 3, 1)
     folded = core(kind, sizes, (3, 3), 2).fold(Incidence(RING, 3), static)
     assert folded.layers() is None
 

@@ -19,6 +19,7 @@ from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import source
 from torchrl_gn.dynamics.executors.native.executor import list_layers
 from torchrl_gn.dynamics.executors.native.library import DTYPES
+from torchrl_gn.dynamics.executors.native.samples import ParameterInputs
 from torchrl_gn.dynamics.executors.native.state_maths import may_be_constant
 from torchrl_gn.dynamics.executors.native.traced_program import trace_states
 from torchrl_gn.dynamics.predictor import Predictor
@@ -106,7 +107,7 @@ def export_c(predictor: Predictor, folder: str | os.PathLike, states: Tensor | N
     flat = states.reshape(-1, *shape).double().numpy()
     rest = flat[0]
     constant = may_be_constant(program, rest) & (np.abs(flat - rest) <= 1e-10 * (1 + np.abs(rest))).all(0)
-    maths = trace_states(program, layers, rest, constant)
+    maths = trace_states(program, layers, rest, constant, ParameterInputs.of(program.parameters, None))
     names = getattr(scene, "actuator_names", [f"command {index}" for index in range(scene.num_actions)])
     about = source.Description(
         name=folder.name,

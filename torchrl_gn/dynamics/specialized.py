@@ -243,10 +243,10 @@ def specialize(
 
     Args:
         executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"native"`` runs steps, rollouts and their
-            gradients in C++ that is built once, 20 s, and kept; where it cannot (a GPU, a recurrent core, parameters of
-            each sample, float16, no compiler), as ``"eager"``, and ``print`` says why. ``"eager"`` runs torch
-            operations anywhere. ``"compiled"``, for GPUs and what native cannot run, compiles at the first call with
-            every new shape: half a minute, minutes for a gradient.
+            gradients in C++ that is built once, 20 s, and kept; where it cannot (a GPU, a recurrent core, float16, no
+            compiler), as ``"eager"``, and ``print`` says why. ``"eager"`` runs torch operations anywhere.
+            ``"compiled"``, for GPUs and what native cannot run, compiles at the first call with every new shape: half a
+            minute, minutes for a gradient.
         dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster where the processor
             multiplies it (``torchrl-gn doctor`` tells) and many times slower elsewhere, which warns
             (:class:`~torchrl_gn.processor.SlowDtypeWarning`). States keep their dtype.

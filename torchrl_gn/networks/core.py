@@ -42,7 +42,7 @@ class ListedCore(FoldedCore, Protocol):
     predicted: Rows  # nodes that are predicted
 
     def layers(self) -> LayerList | None:
-        """Its layers; None if they cannot be listed."""
+        """Its layers, with tables of each sample if it was folded for many; None if they cannot be listed."""
         ...
 
 

@@ -113,9 +113,8 @@ class FoldedGNCore:
         return full.transpose(0, 1).reshape(*batch, *full.shape[::2])
 
     def layers(self) -> LayerList | None:
-        """The same network as a list; None with dynamic globals or tables for every sample."""
-        factors = (self.first_edge, self.first_node, self.first_global, self.second_edge, self.second_node)
-        if self.second_globals[1].shape[1] or any(each.table.shape[1] > 1 for each in factors):
+        """The same network as a list; None with dynamic globals."""
+        if self.second_globals[1].shape[1]:
             return None
         count_n, count_e = self.reduce.shape[0] - 1, self.reduce.shape[1]
         width = self.first_node.weights[1].shape[1]

@@ -40,7 +40,7 @@ class LinearLayer:
 
     inputs: tuple[Gather, ...]  # side by side
     weight: Tensor  # [out, K], K the sum of the inputs' widths
-    table: Tensor | None = None  # [I, out]
+    table: Tensor | None = None  # [I, out], or of each sample [I, B, out]
     added: tuple[Gather, ...] = ()  # from buffers of width out
     activation: str | None = None  # one of ACTIVATIONS
 

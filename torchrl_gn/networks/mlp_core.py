@@ -114,15 +114,15 @@ class FoldedMLP:
         return full.index_copy(-2, self.predicted, out)
 
     def layers(self) -> LayerList | None:
-        """The same network as a list; None with dynamic globals or a table for every sample."""
-        if self.weights[2].shape[1] or self.table[..., 0].numel() > 1:
+        """The same network as a list; None with dynamic globals."""
+        if self.weights[2].shape[1]:
             return None
         device = self.table.device
         items = [torch.tensor([i], device=device) for i in range(max(self.counts))]
         sizes = zip((NODES, EDGES), self.counts, strict=True)
         inputs = [Gather.picks(source, item) for source, count in sizes for item in items[:count]]
         builder = LayerBuilder(self.activation)
-        weight, table = torch.cat(self.weights, 1), self.table.reshape(1, -1)
+        weight, table = torch.cat(self.weights, 1), self.table.reshape(1, -1, self.table.shape[-1]).squeeze(1)
         first = builder.add(inputs, weight, table, activation=self.activation)
         weight, bias = self.out
         builder.linear(builder.hidden(first, self.hidden), items[0], weight.flatten(0, 1), bias.flatten())

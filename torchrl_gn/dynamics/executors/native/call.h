@@ -32,6 +32,9 @@ struct Call {
   int64_t train;           // of one step all is stored, and the adjoint adds gradients of the weights
   void* const* grad_weights;  // of every layer [out, K]
   void* const* grad_tables;   // and [I, out], or null
+  const void* const* sample_tables;  // of every layer [I, B, out padded to 16], or null; null: none has one
+  const double* parameters;          // [B, P] physical parameters that the tapes read, sample stride below
+  int64_t parameter_stride;
 };
 
 }  // namespace gn

@@ -12,6 +12,7 @@ from torchrl_gn.dynamics.executors.eager import EagerExecutor, rollout_by_steps
 from torchrl_gn.dynamics.executors.native import library
 from torchrl_gn.dynamics.executors.native.build import NoCompilerError
 from torchrl_gn.dynamics.executors.native.pool import Pool
+from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, Samples, batch_of
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
 from torchrl_gn.dynamics.executors.native.traced_program import MixedStatesError, TracedProgram
 from torchrl_gn.dynamics.program import StepProgram
@@ -31,7 +32,8 @@ class NativeExecutor:
 
     State maths in float64, the network in the program's float32 or float64. Differentiable once, in state and action;
     the gradient in a component of the state that cannot move is that of copying it. Results depend neither on the batch
-    that a sample is in nor on the number of threads. Several threads may run it at once.
+    that a sample is in nor on the number of threads; with parameters of each sample, which torch folds, they do by
+    rounding. Several threads may run it at once.
     """
 
     fixed_batch, runs_all = False, True
@@ -43,6 +45,7 @@ class NativeExecutor:
         self.version, self.pool = 0, Pool()
         self._reason: str | None = None
         self._maths: tuple = ()
+        self._parameters: ParameterInputs | None = None
         self.update(program)
 
     @property
@@ -52,11 +55,17 @@ class NativeExecutor:
 
     def update(self, program: StepProgram) -> None:
         """Take another program of the same scene: its state maths are traced again only if they differ."""
-        before, self.version = self.native, self.version + 1
+        before = self.native
         maths = _maths_of(program)
         same_maths, self._maths = same(self._maths, maths), maths
         self.program, self.eager = program, EagerExecutor(program)
-        layers, self._reason = list_layers(program)
+        batch = batch_of(program.parameters)
+        if self.change and batch:
+            layers, self._reason = None, "with parameters of each sample, training runs by torch operations"
+        elif not batch.numel():
+            layers, self._reason = None, "there is no sample"
+        else:
+            layers, self._reason = list_layers(program)
         if layers is None:
             self.native = None
             return
@@ -66,9 +75,14 @@ class NativeExecutor:
         except (NoCompilerError, TypeError) as error:
             self.native, self._reason = None, str(error)
             return
-        kept = before is not None and same_maths and before.network.equals(network)
-        traced = before.traced if before is not None and kept else TracedProgram(program, layers, self.change)
-        self.native = Native(network, layers, traced, self.version)
+        inputs = ParameterInputs.of(program.parameters, self._parameters if same_maths else None)
+        kept = before is not None and same_maths and before.network.equals(network) and inputs is self._parameters
+        traced = before.traced if before is not None and kept else TracedProgram(program, layers, inputs, self.change)
+        self._parameters = inputs
+        if before is None or not before.network.same_weights(network):
+            self.version += 1
+        samples = Samples.of(layers, inputs.read(program.parameters), network.number)
+        self.native = Native(network, layers, traced, samples, self.version)
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         if (native := self.running(state, action)) is not None:
@@ -97,6 +111,7 @@ class NativeExecutor:
             and state.is_cpu
             and action.is_cpu
             and state.numel() > 0
+            and native.samples.count in (None, state.shape[:-2].numel())
             and not needs_plain_operations()
             and not torch._C._len_torch_dispatch_stack()  # a mode that must see every operation
             and torch._C._get_tracing_state() is None  # of torch.jit.trace
@@ -119,8 +134,13 @@ class NativeExecutor:
         states = state.reshape(-1, *state.shape[-2:])
         actions = actions.reshape(len(groups), *actions.shape[state.ndim - 2 :])
         places = [(groups == group).nonzero().flatten() for group in groups.unique().tolist()]
-        run = self.rollout if many else self.step
-        parts = [run(states[at], actions[at])[0] for at in places]
+        parts: list[Tensor] = []
+        for at in places:
+            of_group = native._replace(samples=native.samples.part(at))
+            part = self._rollout(of_group, states[at], actions[at], many)
+            if part is None:
+                return None
+            parts.append(part)
         out = torch.cat(parts)[torch.cat(places).argsort()]
         return out.view(*state.shape[:-2], *out.shape[1:])
 
@@ -131,6 +151,7 @@ class Native(NamedTuple):
     network: library.NativeNetwork
     layers: LayerList
     traced: TracedProgram
+    samples: Samples
     version: int  # of the weights
 
 
@@ -144,6 +165,7 @@ def _run(
         UntraceableError: if torch operations must run it.
     """
     call, out = library.forward_call(state, actions, many, stored)
+    native.samples.bring(call)
     return out, call, native.traced.run(native.network, call, state, actions)
 
 
@@ -187,12 +209,12 @@ def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     if not isinstance(core, ListedCore):
         return None, "a core without fold() and layers() runs by torch operations"
     if (layers := core.layers()) is None:
-        return None, "with parameters of each sample, it runs by torch operations"
+        return None, "a core with dynamic globals runs by torch operations"
     return layers, None
 
 
 def _maths_of(program: StepProgram) -> tuple:
-    """All parts of a program but its network, and how often the physics' tensors were changed."""
-    parts = tuple(getattr(program, field.name) for field in fields(program) if field.name != "core")
+    """Parts of a program beside network and physical parameters, and how often the physics' tensors were changed."""
+    parts = tuple(getattr(program, field.name) for field in fields(program) if field.name not in ("core", "parameters"))
     known = () if program.physics is None else (*program.physics.parameters(), *program.physics.buffers())
     return *parts, *map(version_of, known)

@@ -39,7 +39,8 @@ class _Tape(ctypes.Structure):
 
 class _Maths(ctypes.Structure):
     _fields_ = (
-        *((name, _I) for name in ("size", "varying_count", "result_size", "result_count", "is_state", "actions")),
+        *((name, _I) for name in ("size", "varying_count", "result_size", "result_count", "is_state")),
+        *((name, _I) for name in ("actions", "parameters")),
         *((name, _I) for name in ("outputs", "node_inputs", "edge_inputs", "node_width", "edge_width", "output_width")),
         *((name, _P) for name in ("varying", "constant", "values", "results")),
         ("forward", _Tape),
@@ -63,6 +64,9 @@ class Call(ctypes.Structure):
         ("train", _I),
         ("grad_weights", _P),
         ("grad_tables", _P),
+        ("sample_tables", _P),
+        ("parameters", _P),
+        ("parameter_stride", _I),
     )
 
 
@@ -98,7 +102,8 @@ class NativeNetwork:
         self.code, number = layers.code().contiguous(), self.number
         weights, tables = layers.tensors()
         self.weights = [each.detach().to(number) for each in weights]
-        self.tables = [None if each is None else each.detach().to(number) for each in tables]
+        # Tables of each sample come with a call.
+        self.tables = [None if each is None or each.ndim == 3 else each.detach().to(number) for each in tables]
         addresses = pointers(self.weights), pointers(self.tables)
         self.pointer = self.library.gn_network_new(self.kind, self.code.data_ptr(), *addresses)
         # Numbers of a sample and step that its gradient needs: slopes of the activations, and the output.
@@ -114,6 +119,10 @@ class NativeNetwork:
     def equals(self, other: NativeNetwork) -> bool:
         """Whether both are the same but for their weights."""
         return self.dtype == other.dtype and torch.equal(self.code, other.code)
+
+    def same_weights(self, other: NativeNetwork) -> bool:
+        """Whether both have the same weights, whatever the tables of their scenes."""
+        return self.equals(other) and all(map(torch.equal, self.weights, other.weights))
 
     def __del__(self) -> None:
         if (pointer := getattr(self, "pointer", None)) is not None:
@@ -139,6 +148,7 @@ class NativeMaths:
             result_count=len(maths.results),
             is_state=not maths.change,
             actions=maths.actions,
+            parameters=maths.parameters,
             outputs=last.count * len(last.weight),
             node_inputs=layers.nodes[0] * layers.nodes[1],
             edge_inputs=layers.edges[0] * layers.edges[1],
@@ -210,7 +220,10 @@ def adjoint_call(
     of_actions = torch.empty_like(actions)
     sizes, stride = (forward.batch, forward.steps, forward.tile, forward.threads), size * (forward.steps * many + 1)
     fields = (_array(states), stride, _array(actions), _array(gradient), many, _array(of_state), _array(of_actions))
-    return Call(*sizes, *fields, None if stored is None else stored.data_ptr(), forward.train), of_state, of_actions
+    call = Call(*sizes, *fields, None if stored is None else stored.data_ptr(), forward.train)
+    for name in ("sample_tables", "parameters", "parameter_stride"):
+        setattr(call, name, getattr(forward, name))
+    return call, of_state, of_actions
 
 
 _NOTHING = (None, 0)  # no array

@@ -93,13 +93,20 @@ class Network {
   T* grad_edges(T* ws, int S) const { return gradients(ws, S, 1); }
   T* grad_output(T* ws, int S) const { return gradients(ws, S, layers_.size() + 1); }
 
+  // Tables of each sample beside the network's own: [I, batch, width padded to 16] of every layer, or nullptr.
+  struct SampleTables {
+    const void* const* tables;
+    int64_t batch, first;  // first: the tile's first sample
+  };
+
   // Reads nodes and edges, writes output and, if it is given, the block of S * stored() numbers.
-  void forward(T* ws, int S, T* stored) const {
+  void forward(T* ws, int S, T* stored, const SampleTables& samples) const {
     for (size_t i = 0; i < layers_.size(); i++) {
       const Layer& layer = layers_[i];
       T* out = values(ws, S, i + 2);
       chunks(layer.items * S, [&](int64_t start, int rows) {
-        run(layer, ws, S, start, rows, out + start * layer.width);
+        const void* own = samples.tables ? samples.tables[i] : nullptr;
+        run(layer, ws, S, start, rows, static_cast<const T*>(own), samples, out + start * layer.width);
         if (layer.activation == kNone) return;
         T* slopes = stored ? stored + layer.slopes * S + start * layer.width : nullptr;
         activate(layer.activation, out + start * layer.width, slopes, rows * layer.width);
@@ -307,13 +314,15 @@ class Network {
   }
 
   // Pre-activations of a chunk.
-  void run(const Layer& layer, T* ws, int S, int64_t start, int rows, T* out) const {
-    int64_t width = padded(layer.width);
+  void run(const Layer& layer, T* ws, int S, int64_t start, int rows, const T* own, const SampleTables& samples,
+           T* out) const {
+    int64_t width = padded(layer.width), own_width = (layer.width + 15) / 16 * 16;
     const T* init[kChunk];
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
       const T* base = layer.table.get() + (layer.has_table ? item * width : 0);
       T* sum = sums(ws) + row * width;
       int64_t step = 0;
+      if (own) base = own + (item * samples.batch + samples.first + sample) * own_width, step = own_width;
       for (const Gather& g : layer.added)
         for (int64_t j = g.offsets[item]; j < g.offsets[item + 1]; j++, base = sum, step = width)
           add_rows(sum, width, base, step, rows_of(g, j, ws, S, sample), g.width, now, width);

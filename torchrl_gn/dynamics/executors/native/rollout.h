@@ -26,6 +26,7 @@ struct Maths {
   int64_t result_count;    // of them are computed
   int64_t is_state;        // a result is a state: its other channels are copied, and steps follow each other
   int64_t actions;
+  int64_t parameters;      // physical parameters that differ between samples
   int64_t outputs;         // P * F_out
   int64_t node_inputs, edge_inputs;  // N * F_n, E * F_e
   int64_t node_width, edge_width, output_width;
@@ -108,6 +109,10 @@ struct Runner {
     }
   }
 
+  void load_parameters(const Tape& tape) const {
+    load(tape, 3, m.parameters, [&](int64_t s, int, int64_t i) { return call.parameters[s * call.parameter_stride + i]; });
+  }
+
   T* stored(int64_t step) const {
     if (!call.stored || whole) return whole;
     const int64_t block = network.stored() + m.outputs;
@@ -119,7 +124,7 @@ struct Runner {
     run_tape<W, C>(tape, 0, r);
     to_network(tape, 0, 0, m.node_inputs, m.node_width, network.nodes(ws, count));
     to_network(tape, 0, m.node_inputs, m.edge_inputs, m.edge_width, network.edges(ws, count));
-    network.forward(ws, count, derivatives);
+    network.forward(ws, count, derivatives, {call.sample_tables, call.batch, first});
   }
 
   void forward() const {
@@ -128,6 +133,7 @@ struct Runner {
       for (int lane = 0; lane < count; ++lane)
         for (int64_t i = 0; i < m.size; ++i)
           call.out.set((first + lane) * rows * m.size + i, call.states.get((first + lane) * call.state_stride + i));
+    load_parameters(m.forward);
     load(m.forward, 0, m.varying_count,
          [&](int64_t s, int, int64_t i) { return call.states.get(s * call.state_stride + m.varying[i]); });
     for (int64_t t = 0; t < call.steps; ++t) {
@@ -165,6 +171,7 @@ struct Runner {
   void adjoint(double* again, T* derivatives, double* gradient, T* const* of_weights, T* const* of_tables) const {
     const int64_t rows = call.steps + call.with_start, A = m.actions, n = m.varying_count;
     std::fill_n(gradient, n * L, 0.0);
+    load_parameters(m.adjoint);
     auto incoming = [&](int64_t s, int64_t row, int64_t channel) {
       return call.out.get((s * rows + row) * m.result_size + channel);
     };
@@ -181,6 +188,7 @@ struct Runner {
         output = kept + count * network.stored();
       } else {
         Runner forward{m, network, call, first, count, again, ws, nullptr};
+        forward.load_parameters(m.forward);
         forward.load(m.forward, 0, n, state);
         forward.load(m.forward, 1, A, action);
         forward.predict(m.forward, derivatives);
@@ -189,15 +197,15 @@ struct Runner {
       load(m.adjoint, 0, n, state);
       load(m.adjoint, 1, A, action);
       from_network(m.adjoint, 2, 0, m.outputs, m.output_width, output);
-      load(m.adjoint, 3, m.result_count, [&](int64_t s, int lane, int64_t i) {
+      load(m.adjoint, 4, m.result_count, [&](int64_t s, int lane, int64_t i) {
         return incoming(s, t + call.with_start, m.results[i]) + (m.is_state ? gradient[i * L + lane] : 0.0);
       });
       run_tape<W, C>(m.adjoint, 0, r);
       to_network(m.adjoint, 0, 0, m.outputs, m.output_width, network.grad_output(ws, count));
       network.backward(ws, count, kept);
       if (of_weights) network.weight_gradients(ws, count, kept, of_weights, of_tables);
-      from_network(m.adjoint, 4, 0, m.node_inputs, m.node_width, network.grad_nodes(ws, count));
-      from_network(m.adjoint, 4, m.node_inputs, m.edge_inputs, m.edge_width, network.grad_edges(ws, count));
+      from_network(m.adjoint, 5, 0, m.node_inputs, m.node_width, network.grad_nodes(ws, count));
+      from_network(m.adjoint, 5, m.node_inputs, m.edge_inputs, m.edge_width, network.grad_edges(ws, count));
       run_tape<W, C>(m.adjoint, 1, r);
       for (int64_t i = 0; i < n; ++i) std::memcpy(&gradient[i * L], result(m.adjoint, 1, i), sizeof(double) * L);
       for (int64_t i = 0; i < A; ++i)

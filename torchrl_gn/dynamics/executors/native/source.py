@@ -66,7 +66,7 @@ def source(about: Description, layers: LayerList, maths: StateMaths, rest: np.nd
     arrays += [_tape("FORWARD", maths.forward), _tape("ADJOINT", maths.adjoint)]
     outputs = last.count * len(last.weight)
     inputs = (layers.nodes[0] * layers.nodes[1], layers.edges[0] * layers.edges[1])
-    sizes = (maths.is_constant.size, len(maths.varying), maths.result_size, len(maths.results), 1, maths.actions)
+    sizes = (maths.is_constant.size, len(maths.varying), maths.result_size, len(maths.results), 1, maths.actions, 0)
     widths = (layers.nodes[1], layers.edges[1], len(last.weight))
     numbers = ", ".join(map(str, (*sizes, outputs, *inputs, *widths)))
     includes, engine = _engine()
@@ -263,20 +263,21 @@ extern const double @NAME@_rest[@UPPER@_STATE] = {
 
 int @NAME@_step(const double* state, const double* action, double* next) {
   return run({1, 1, 1, 1, array(state), @UPPER@_STATE, array(action), array(next), 0, {}, {}, nullptr, 0, nullptr,
-              nullptr},
+              nullptr, nullptr, nullptr, 0},
              false);
 }
 
 int @NAME@_rollout(int batch, int steps, int threads, const double* start, const double* actions, double* states) {
   return run({batch, steps, 1, threads, array(start), @UPPER@_STATE, array(actions), array(states), 1, {}, {}, nullptr,
-              0, nullptr, nullptr},
+              0, nullptr, nullptr, nullptr, nullptr, 0},
              false);
 }
 
 int @NAME@_rollout_gradient(int batch, int steps, int threads, const double* states, const double* actions,
                             const double* grad_states, double* grad_start, double* grad_actions) {
   return run({batch, steps, 1, threads, array(states), (steps + int64_t{1}) * @UPPER@_STATE, array(actions),
-              array(grad_states), 1, array(grad_start), array(grad_actions), nullptr, 0, nullptr, nullptr},
+              array(grad_states), 1, array(grad_start), array(grad_actions), nullptr, 0, nullptr, nullptr,
+              nullptr, nullptr, 0},
              true);
 }
 }

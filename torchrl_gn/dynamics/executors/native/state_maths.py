@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native.expressions import Expressions, Scalar, gradient
+from torchrl_gn.dynamics.executors.native.samples import ParameterInputs
 from torchrl_gn.dynamics.executors.native.tape import Tape, assemble
 from torchrl_gn.dynamics.executors.native.trace import Array, trace
 from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 
 class StateMaths:
@@ -25,6 +28,7 @@ class StateMaths:
         constant: ``[N, C]`` which channels may be taken for constant; those that the step changes are not.
         predicted: ``[P]`` nodes that the network predicts.
         width: components of each, ``F_out``.
+        parameters: which physical parameters are inputs.
         change: whether the result is the change ``[N, 12]`` instead of the next state.
 
     Raises:
@@ -38,19 +42,19 @@ class StateMaths:
         constant: np.ndarray,
         predicted: np.ndarray,
         width: int,
+        parameters: ParameterInputs,
         change: bool = False,
     ) -> None:
         while True:
             graph = Expressions()
-            symbols, actions, outputs, inputs, (after, delta) = _forward(
-                program, graph, state, constant, predicted, width
-            )
+            groups, inputs, (after, delta) = _forward(program, graph, state, constant, predicted, width, parameters)
             stays = np.frompyfunc(lambda a, b: not isinstance(a, Scalar) and abs(a - b) <= 1e-12 * (1 + abs(b)), 2, 1)
             changed = constant & ~np.asarray(stays(after, state), dtype=bool)
             if not changed.any():
                 break
             constant = constant & ~changed
-        self.actions, self.is_constant, self.state = len(actions), constant, state
+        self.is_constant, self.state = constant, state
+        self.actions, self.parameters = len(groups[1]), len(parameters)
         flat = constant.ravel()
         self.varying = np.flatnonzero(~flat).astype(np.int32)  # [L] channels of the flat state [N * C] that change
         self.constant = np.flatnonzero(flat).astype(np.int32)  # [N * C - L] the others
@@ -63,7 +67,8 @@ class StateMaths:
             changes = np.array([isinstance(each, Scalar) or each != 0 for each in delta.ravel()], dtype=bool)
             self.results, self.result_size = np.flatnonzero(changes).astype(np.int32), delta.size
             self._after = delta.ravel()[changes].tolist()
-        self._groups: list[list[Scalar]] = [symbols[~constant].tolist(), actions.tolist(), outputs.tolist()]
+        # Varying channels, action, the network's output, parameters.
+        self._groups = groups
         # Phase 0: network inputs from the varying channels and the action; phase 1: the result from the network's
         # output.
         self.forward = assemble(graph, self._groups, [self._inputs, self._after])
@@ -75,8 +80,8 @@ class StateMaths:
         Phase 0: gradient of the network's output from that of the result. Phase 1: gradients of state and action
         from those of the network's inputs.
         """
-        graph, (varying, actions, outputs) = self._graph, self._groups
-        of_after, of_inputs = graph.inputs(3, len(self._after)), graph.inputs(4, len(self._inputs))
+        graph, (varying, actions, outputs, _) = self._graph, self._groups
+        of_after, of_inputs = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
         last = gradient(graph, self._after, of_after, [*outputs, *varying, *actions])
         first = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
         both = [a + b for a, b in zip(last[len(outputs) :], first, strict=True)]
@@ -98,8 +103,15 @@ def may_be_constant(program: StepProgram, state: np.ndarray) -> np.ndarray:
 
 
 def _forward(
-    program: StepProgram, graph: Expressions, state: np.ndarray, constant: np.ndarray, predicted: np.ndarray, width: int
-) -> tuple[Array, Array, Array, list[Any], list[Array]]:
+    program: StepProgram,
+    graph: Expressions,
+    state: np.ndarray,
+    constant: np.ndarray,
+    predicted: np.ndarray,
+    width: int,
+    parameters: ParameterInputs,
+) -> tuple[list[list[Scalar]], list[Any], list[Array]]:
+    """Groups of inputs, the network's inputs, and the next state and change."""
     symbols = np.empty(state.shape, dtype=object)
     symbols[...] = state.astype(float).astype(object)
     varying = np.flatnonzero(~constant.ravel())
@@ -108,16 +120,20 @@ def _forward(
     outputs = np.array(graph.inputs(2, len(predicted) * width), dtype=object)
     full = np.full((len(state), width), 0.0, dtype=object)
     full[predicted] = outputs.reshape(len(predicted), width)
+    read, arrays = parameters.symbols(graph)
 
-    def before(state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-        canonical = eager.canonical_state(program, state, action)
-        nodes, edges = eager.features(program, canonical, action)
+    def before(state: Tensor, action: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
+        own = replace(program, parameters=PhysicalParameters(*parameters))
+        canonical = eager.canonical_state(own, state, action)
+        nodes, edges = eager.features(own, canonical, action)
         return program.nodes(nodes, torch.float64), program.edges(edges, torch.float64)
 
-    def after(state: Tensor, action: Tensor, predicted: Tensor) -> tuple[Tensor, ...]:
-        canonical = eager.canonical_state(program, state, action)
-        change = eager.change(program, state, canonical, predicted)
+    def after(state: Tensor, action: Tensor, predicted: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
+        own = replace(program, parameters=PhysicalParameters(*parameters))
+        canonical = eager.canonical_state(own, state, action)
+        change = eager.change(own, state, canonical, predicted)
         return program.layout.apply(state, change), change
 
-    inputs = [each for part in trace(before, symbols, actions) for each in part.ravel().tolist()]
-    return symbols, actions, outputs, inputs, trace(after, symbols, actions, full)
+    inputs = [each for part in trace(before, symbols, actions, *arrays) for each in part.ravel().tolist()]
+    groups = [symbols[~constant].tolist(), actions.tolist(), outputs.tolist(), read]
+    return groups, inputs, trace(after, symbols, actions, full, *arrays)

@@ -39,7 +39,9 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
     order, ends = _schedule(graph.nodes, results, inputs)
     order, ends, nodes = _fused(graph.nodes, order, ends, results)
 
-    # Registers: inputs keep theirs, as a group may be written between phases; others are reused after their last use.
+    # Registers: inputs that are read keep theirs, as a group may be written between phases; others are reused after
+    # their last use.
+    is_read = {operand for index in order for operand in nodes[index][1]} | {i for outputs in results for i in outputs}
     last = {operand: position for position, index in enumerate(order) for operand in nodes[index][1]}
     released: dict[int, list[int]] = {}  # before an instruction: outputs that were read after the phase before it
     expiring: dict[int, list[int]] = {}  # with an instruction: its operands
@@ -47,7 +49,8 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
     for index in order:
         read, until = last.get(index, -1), kept_until.get(index, -1)
         (released if until > read else expiring).setdefault(max(read, until), []).append(index)
-    where = {each.index: register for register, each in enumerate(each for group in groups for each in group)}
+    used = (each.index for group in groups for each in group if each.index in is_read)
+    where = {index: register for register, index in enumerate(used)}
     count, free = len(where), []
     instructions: list[tuple[int, ...]] = []
     constants: dict[float, int] = {}
@@ -64,15 +67,11 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
         instructions.append((CODES[operation], where[index], a, b, c, 0, k))
     if count > _MOST_REGISTERS:
         raise UntraceableError(f"The state maths of this scene needs {count} registers.")
-    read = {operand for index in order for operand in nodes[index][1]} | {i for outputs in results for i in outputs}
     return Tape(
         instructions=np.array(instructions, dtype=INSTRUCTION),
         constants=np.array(list(constants) or [0.0]),
         phases=tuple(ends),
-        inputs=tuple(
-            np.array([where[each.index] if each.index in read else -1 for each in group], dtype=np.int32)
-            for group in groups
-        ),
+        inputs=tuple(np.array([where.get(each.index, -1) for each in group], dtype=np.int32) for group in groups),
         outputs=tuple(np.array([where[index] for index in outputs], dtype=np.int32) for outputs in results),
         registers=max(count, 1),
     )

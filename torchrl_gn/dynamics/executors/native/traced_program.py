@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import library
+from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, Samples, batch_of
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths, may_be_constant
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
 from torchrl_gn.dynamics.program import StepProgram
@@ -35,16 +36,18 @@ class TracedProgram:
     """Native state maths of a program: special ones for states with the same constant channels, and a general one.
 
     A special one is traced for the first state that fits no other, up to ``_MOST_SPECIAL``. A sample is computed by the
-    first that fits, whatever the other samples are.
+    first that fits, whatever the other samples are. ``parameters`` says which physical parameters are inputs.
     """
 
-    def __init__(self, program: StepProgram, layers: LayerList, change: bool = False) -> None:
-        self.program, self.layers, self.change = program, layers, change
+    def __init__(
+        self, program: StepProgram, layers: LayerList, parameters: ParameterInputs, change: bool = False
+    ) -> None:
+        self.program, self.layers, self.parameters, self.change = program, layers, parameters, change
         self.reason: str | None = None  # why torch operations must run it
         self.special: list[library.NativeMaths] = []
         self.general: library.NativeMaths | None = None
         self._tried_general = False
-        self._example: tuple[np.ndarray, Tensor] | None = None  # a finite state and action
+        self._example: tuple[Tensor, Tensor] | None = None  # a finite state and action
         self._lock = threading.Lock()
 
     def run(
@@ -78,7 +81,7 @@ class TracedProgram:
                     break
                 sample = int((left & finite).argmax())
                 state = flat[sample].reshape(states.shape[-2:])
-                self._example = state, actions[sample]
+                self._example = torch.from_numpy(state), actions[sample]
                 try:
                     self.special.append(self._traced(state, may_be_constant(self.program, state)))
                 except UntraceableError as error:
@@ -87,7 +90,7 @@ class TracedProgram:
             fits = left & self.special[index].fits(flat)
             groups[fits], left = index, left & ~fits
         if left.any() and not self._tried_general and self._example is not None:
-            state, self._tried_general = self._example[0], True
+            state, self._tried_general = self._example[0].numpy(), True
             with contextlib.suppress(UntraceableError):  # torch runs states that need it
                 self.general = self._traced(state, np.zeros_like(state, dtype=bool))
         return groups
@@ -95,7 +98,7 @@ class TracedProgram:
     def _traced(self, state: np.ndarray, constant: np.ndarray) -> library.NativeMaths:
         """State maths that agree with torch's on the example; else UntraceableError."""
         with torch.device("cpu"), torch.no_grad():
-            maths = trace_states(self.program, self.layers, state, constant, self.change)
+            maths = trace_states(self.program, self.layers, state, constant, self.parameters, self.change)
             native = library.NativeMaths(maths, self.layers)
             self._compare(native)
         return native
@@ -103,14 +106,16 @@ class TracedProgram:
     def _compare(self, maths: library.NativeMaths) -> None:
         """UntraceableError unless the example's next state is that of torch, both in float64."""
         assert self._example is not None
-        state, action = torch.from_numpy(self._example[0]).clone(), self._example[1].clone()
-        program, network = self._in_float64
+        program, network, samples = self._in_float64
+        batch = batch_of(program.parameters)  # the example with the parameters of every sample
+        state, action = (each.expand(*batch, *each.shape).clone() for each in self._example)
         change = (
             eager.delta(program, state, action)[0]
             if self.change
             else eager.step(program, state, action, None)[0] - state
         )
         call, found = library.forward_call(state, action, False, shape=change.shape)
+        samples.bring(call)
         if not library.rollout(network, maths, call):
             raise UntraceableError("The state maths do not fit the state that they were traced for.")
         found = found if self.change else found - state
@@ -121,14 +126,20 @@ class TracedProgram:
             )
 
     @functools.cached_property
-    def _in_float64(self) -> tuple[StepProgram, library.NativeNetwork]:
+    def _in_float64(self) -> tuple[StepProgram, library.NativeNetwork, Samples]:
         core = snapshot(self.program.core, torch.float64)
-        network = library.NativeNetwork(core.layers(), torch.float64)
-        return replace(self.program, core=core, dtype=torch.float64), network
+        layers, parameters = core.layers(), self.parameters.read(self.program.parameters)
+        network, samples = library.NativeNetwork(layers, torch.float64), Samples.of(layers, parameters, torch.float64)
+        return replace(self.program, core=core, dtype=torch.float64), network, samples
 
 
 def trace_states(
-    program: StepProgram, layers: LayerList, state: np.ndarray, constant: np.ndarray, change: bool = False
+    program: StepProgram,
+    layers: LayerList,
+    state: np.ndarray,
+    constant: np.ndarray,
+    parameters: ParameterInputs,
+    change: bool = False,
 ) -> StateMaths:
     """State maths of a program for states whose channels ``constant`` ``[N, C]`` are those of ``state``.
 
@@ -139,4 +150,4 @@ def trace_states(
     assert isinstance(core, ListedCore)
     predicted = torch.arange(layers.nodes[0], device="cpu")[core.predicted].numpy()
     width = last.count * len(last.weight) // max(len(predicted), 1)
-    return StateMaths(program, np.where(constant, state, 0.0), constant, predicted, width, change)
+    return StateMaths(program, np.where(constant, state, 0.0), constant, predicted, width, parameters, change)

@@ -49,15 +49,16 @@ class _Trained(torch.autograd.Function):
         call.train, call.tile = True, min(library.TILE, call.batch)  # a tile, and so the sums, whatever the threads
         ctx.stored = executor.pool.take(library.trained_count(network, call), network.number)
         call.stored = ctx.stored.tensor.data_ptr()
+        native.samples.bring(call)
         ctx.maths = native.traced.run(network, call, state, action)
         ctx.save_for_backward(state, action)
-        ctx.network, ctx.call = network, call
+        ctx.native, ctx.call = native, call
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        network, (state, action) = ctx.network, ctx.saved_tensors
+        network, (state, action) = ctx.native.network, ctx.saved_tensors
         packed = network.weights, network.tables
         weights, tables = ([None if each is None else torch.empty_like(each) for each in part] for part in packed)
         addresses = library.pointers(weights), library.pointers(tables)
