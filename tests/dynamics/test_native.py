@@ -905,6 +905,16 @@ for name in ("swimmer6", "joints"):
                         predictor.rollout(state, actions)[0].sum().backward()
                         predictor.step(state, actions[:, 0])[0].sum().backward()
             assert predictor.executor().reason is None, predictor.executor().reason
+            of_samples = specialize(model.bind(scene, parameters_key="parameters"), dtype=products)
+            for count in (2, 25, 50):
+                torch.set_num_threads(3)
+                parameters = of_samples.own_parameters().expand(count).clone()
+                parameters["child_anchor"] *= 1 + 0.1 * torch.rand(count, 1, 1, dtype=torch.float64)
+                state = torch.eye(13, dtype=torch.float64)[3].repeat(count, scene.num_nodes, 1).requires_grad_()
+                actions = torch.zeros(count, 3, scene.num_actions, dtype=torch.float64, requires_grad=True)
+                for executor.STORED_BYTES in (2**28, 0):
+                    of_samples.rollout(state, actions, parameters)[0].sum().backward()
+            assert of_samples.executor(parameters).native.samples.count == 50
             for count in (1, 5, 130):
                 torch.set_num_threads(2)
                 trained = model.bind(scene).training_executor()
