@@ -4,7 +4,8 @@
 
 Reproduces the paper's Figure "Learning curves for Swimmer6 SVG agents": the median return over seeds with quartiles, of
 every agent that recipes/config/learning_curves.yaml names. Each is a run of recipes/svg.py or recipes/ddpg.py. Finished
-runs are kept and interrupted ones go on with the same run_dir. Results: docs/results/svg.md.
+runs are kept and interrupted ones go on with the same run_dir; with more `trainer.frames` all do. Results:
+docs/results/svg.md.
 
 Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
 folder.
@@ -38,7 +39,8 @@ def make_runs(cfg: DictConfig, folder: Path) -> dict[str, list[Run]]:
         agent = cfg.agents[name]
         overrides = (f"seed={seed}", f"threads={cfg.threads}", *as_list(cfg.overrides), *agent.overrides)
         recipe = RECIPES / f"{agent.recipe}.py"
-        runs[name].append(Run(recipe, folder / folder_name(name) / f"seed{seed}", overrides, f"{name}, seed {seed}"))
+        place, label = folder / folder_name(name) / f"seed{seed}", f"{name}, seed {seed}"
+        runs[name].append(Run(recipe, place, overrides, label, goes_on=("trainer.frames",)))
     return runs
 
 

@@ -7,9 +7,10 @@ import math
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from _common.progress import learn_with_progress, report_learning
-from learning_curves import second_half
+from learning_curves import make_runs, second_half
 from torchrl_gn.training import (
     RunFolder,
     Tracker,
@@ -63,3 +64,18 @@ def test_a_report_holds_the_curve_and_its_last_tenth(make_learner, tracker, tmp_
 def test_the_second_half_of_a_curve_begins_after_half_of_the_frames():
     curve = {"frames": [0, 100, 200, 300, 400], "returns": [1.0, 2.0, 4.0, 8.0, 16.0]}
     assert second_half(curve) == 12.0 and second_half({"frames": [0], "returns": [3.0]}) == 3.0
+
+
+def test_finished_curves_go_on_with_more_frames(tmp_path):
+    def run(*overrides: str):
+        agents = {"DDPG": {"recipe": "ddpg", "overrides": []}}
+        options = {"agents": agents, "only": ["DDPG"], "seeds": [0], "threads": 1, "overrides": list(overrides)}
+        return make_runs(OmegaConf.create(options), tmp_path)["DDPG"][0]
+
+    finished = run("trainer.frames=100")
+    finished.folder.mkdir(parents=True)
+    (finished.folder / "metrics.json").write_text("{}")
+    (finished.folder / "options.json").write_text(json.dumps(finished.overrides))
+    assert finished.is_done() and not run("trainer.frames=200").is_done()
+    with pytest.raises(ValueError, match=r"finished run with none of these, not agent\.policy=graph"):
+        run("trainer.frames=100", "agent.policy=graph").is_done()
