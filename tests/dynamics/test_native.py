@@ -915,6 +915,8 @@ for name in ("swimmer6", "joints"):
                 for executor.STORED_BYTES in (2**28, 0):
                     of_samples.rollout(state, actions, parameters)[0].sum().backward()
             assert of_samples.executor(parameters).native.samples.count == 50
+            for _ in range(3):
+                of_samples.step(state, actions[:, 0])
             for count in (1, 5, 130):
                 torch.set_num_threads(2)
                 trained = model.bind(scene).training_executor()

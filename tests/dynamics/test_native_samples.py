@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import threading
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.dynamics import ForwardModel, SpecializedPredictor, specialize
+from torchrl_gn.dynamics import BodyState, Controls, ForwardModel, JointAxes, SpecializedPredictor, specialize
 from torchrl_gn.dynamics.executors import NativeExecutor
 from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, batch_of
+from torchrl_gn.dynamics.features import Feature
 from torchrl_gn.dynamics.normalization import update_parameter_normalizers
 from torchrl_gn.scenes import sample_variants
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
+from ..sizes import SMALL
 from .test_native import equal, pytestmark  # noqa: F401  which skips without a compiler
 
 
@@ -152,6 +158,106 @@ def test_no_samples(of_variants):
     state, actions = variants.inputs
     assert variants.predictor.rollout(state[:0], actions[:0], variants.parameters[:0])[0].shape[0] == 0
     assert variants.native.traced.reason is None
+
+
+def test_an_empty_batch_between_changes_no_weights(of_variants):
+    variants = of_variants(count=4)
+    (state, actions), predictor = variants.inputs, variants.predictor
+    leaf, traced = actions.clone().requires_grad_(), variants.native.traced
+    first = predictor.rollout(state[:2], leaf[:2], variants.parameters[:2])[0]
+    predictor.rollout(state[:0], leaf[:0], variants.parameters[:0])
+    second = predictor.rollout(state[2:], leaf[2:], variants.parameters[2:])[0]
+    (first.sum() + second.sum()).backward()
+    assert variants.native.traced is traced
+
+
+def test_the_scenes_own_parameters_after_those_of_samples(of_variants):
+    variants = of_variants(count=4)
+    (state, actions), predictor = variants.inputs, variants.predictor
+    expected = specialize(predictor, executor="eager").step(state, actions[:, 0])[0]
+    predictor.step(state, actions[:, 0], variants.parameters)
+    for _ in range(4):  # single steps are called without ctypes once they can be
+        torch.testing.assert_close(predictor.step(state, actions[:, 0])[0], expected, rtol=0, atol=1e-10)
+    fresh = specialize(predictor)
+    for _ in range(3):
+        torch.testing.assert_close(fresh.step(state, actions[:, 0])[0], expected, rtol=0, atol=1e-10)
+    variants.native  # noqa: B018  runs natively
+
+
+def test_parameters_that_change_in_place(of_variants):
+    variants = of_variants(count=1)
+    (state, actions), predictor = variants.inputs, variants.predictor
+    own = variants.parameters[0].clone()
+    predictor.rollout(state, actions, own)
+    own["child_anchor"].mul_(1.1)
+    expected = specialize(predictor, executor="eager").rollout(state, actions, own)[0]
+    torch.testing.assert_close(predictor.rollout(state, actions, own)[0], expected, rtol=0, atol=1e-10)
+
+
+def test_samples_may_bring_some_parameters(of_variants):
+    variants = of_variants(count=4)
+    state, actions = variants.inputs
+    some = variants.parameters.select("child_anchor")
+    expected = specialize(variants.predictor, executor="eager").rollout(state, actions, some)[0]
+    found = specialize(variants.predictor).rollout(state, actions, some)[0]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
+
+
+def test_threads_with_parameters_of_their_own(of_variants):
+    variants = of_variants(count=8)
+    (state, actions), predictor = variants.inputs, variants.predictor
+    variants.pull()  # so that all that differs is an input
+    halves = [slice(0, 4), slice(4, 8)]
+    expected = [predictor.rollout(state[at], actions[at], variants.parameters[at])[0] for at in halves]
+    wrong = []
+
+    def work(index: int) -> None:
+        at, parameters = halves[index], variants.parameters[halves[index]]
+        for _ in range(150):
+            states = predictor.rollout(state[at], actions[at], parameters)[0]
+            if not torch.equal(states, expected[index]):
+                wrong.append(index)
+
+    threads = [threading.Thread(target=work, args=(index,)) for index in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+@dataclass(frozen=True)
+class LogOfAnchors(Feature):
+    """Reads a parameter by an operation that has no scalar form."""
+
+    part: ClassVar[Literal["nodes", "edges"]] = "nodes"
+
+    def size(self, layout) -> int:
+        return 1
+
+    def bind(self, scene, layout, canonicalizer):
+        return LogOfAnchor()
+
+
+class LogOfAnchor(torch.nn.Module):
+    def forward(self, inputs):
+        logs = inputs.parameters.child_anchor.abs().sum(-1, keepdim=True).add(1e-3).log()
+        return logs.expand(*inputs.canonical.state.shape[:-1], 1)
+
+
+def test_constants_may_be_read_by_any_operation(fit, scenes, random_states, random_actions):
+    scene = scenes["swimmer6"]
+    features = (BodyState(), Controls(), JointAxes(), LogOfAnchors())
+    model = fit(ForwardModel.for_scene(scene, features=features, **SMALL), scene).requires_grad_(False)
+    state, action = random_states(scene, 3), random_actions(scene, 3)
+    fast, eager = (specialize(model.bind(scene), executor=name) for name in ("native", "eager"))
+    torch.testing.assert_close(fast.step(state, action)[0], eager.step(state, action)[0], rtol=1e-5, atol=1e-6)
+    assert fast.executor().reason is None
+    varied = specialize(model.bind(scene, parameters_key="parameters"))
+    parameters = varied.own_parameters().expand(3).clone()
+    parameters["child_anchor"][1] *= 1.1
+    varied.step(state, action, parameters)
+    assert "no scalar form" in varied.executor(parameters).reason
 
 
 def test_another_number_of_samples_is_refused(of_variants):

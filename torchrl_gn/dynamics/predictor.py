@@ -224,7 +224,7 @@ class Predictor(TensorDictModuleBase):
         if self.trainer is None:
             self.trainer = NativeDelta(program)
         else:
-            self.trainer.update(program)
+            self.trainer = self.trainer.update(program)
         return self.trainer
 
     def step(

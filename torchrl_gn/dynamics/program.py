@@ -112,8 +112,8 @@ class Executor(Protocol):
     fixed_batch: bool  # whether another batch size costs a compilation
     runs_all: bool  # whether its constructor refuses no program
 
-    def update(self, program: StepProgram) -> None:
-        """Take another program of the same scene."""
+    def update(self, program: StepProgram) -> Executor:
+        """What runs another program of the same scene: this executor, or one that shares with it what it can."""
         ...
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:

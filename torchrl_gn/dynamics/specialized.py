@@ -6,7 +6,7 @@ import copy
 import itertools
 import threading
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -31,6 +31,15 @@ from torchrl_gn.processor import SlowDtypeWarning, product_speeds
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 _TAKING = threading.Lock()  # one thread takes a snapshot, others wait for it
+
+
+class _Snapshot(NamedTuple):
+    """What runs the step, and what it was made of."""
+
+    executor: Executor
+    weights: Watched
+    casts: int  # of the model, before them
+    given: dict[str, tuple[Tensor, int]]  # parameters of samples, and how often each was changed
 
 
 class SpecializedPredictor(Predictor):
@@ -61,9 +70,7 @@ class SpecializedPredictor(Predictor):
             )
         self.strict, self.executor_name = predictor.strict, executor
         self._dtype = dtype
-        self._executor: Executor | None = None
-        self._weights, self._casts = Watched([]), 0
-        self._given: dict[str, tuple[Tensor, int]] = {}
+        self._taken: _Snapshot | None = None
         self._plan: Any = None  # of a single step, if it can be called without ctypes
         self.number = operators.register(self)
         # Refuse now what the executor cannot run, not at the first step.
@@ -72,7 +79,7 @@ class SpecializedPredictor(Predictor):
 
     def __getstate__(self) -> dict:
         # A copy folds and compiles for itself.
-        return {**super().__getstate__(), "_executor": None, "_weights": Watched([]), "_given": {}, "_plan": None}
+        return {**super().__getstate__(), "_taken": None, "_plan": None}
 
     def __setstate__(self, state: dict) -> None:
         super().__setstate__(state)
@@ -89,7 +96,9 @@ class SpecializedPredictor(Predictor):
 
     def refresh(self) -> None:
         """Take a new snapshot of the weights at the next step."""
-        self._weights, self._plan = Watched([]), None
+        if self._taken is not None:
+            self._taken = self._taken._replace(weights=Watched([]))
+        self._plan = None
 
     def step(
         self,
@@ -103,10 +112,9 @@ class SpecializedPredictor(Predictor):
         if self._plan is not None and (after := load_binding().step(self._plan, state, action)) is not None:
             return after, None
         out = super().step(state, action)
-        if self._plan is None and not self._given:
-            # Weights before what was made of them: another thread may take a snapshot meanwhile.
-            watched, casts = self._weights, self._casts
-            self._plan = make_plan(self._executor, self.scene, watched, casts, vars(self.model))
+        taken = self._taken
+        if self._plan is None and taken is not None and not taken.given:
+            self._plan = make_plan(taken.executor, self.scene, taken.weights, taken.casts, vars(self.model))
         return out
 
     def executor(self, parameters: TensorDictBase | None = None) -> Executor:
@@ -120,15 +128,16 @@ class SpecializedPredictor(Predictor):
                 return operators.OperatorExecutor(self)  # pyright: ignore[reportReturnType]
             with torch.no_grad():
                 return EagerExecutor(super().program(parameters))
-        if self._executor is None or not self._is_current(parameters):
+        taken = self._taken  # once: another thread may take a snapshot for other weights or parameters
+        if taken is None or not self._is_current(taken, parameters):
             with _TAKING:
-                if self._executor is None or not self._is_current(parameters):
-                    self._take(parameters)
-        assert self._executor is not None
-        return self._executor
+                taken = self._taken
+                if taken is None or not self._is_current(taken, parameters):
+                    self._taken = taken = self._take(parameters)
+        return taken.executor
 
-    def _take(self, parameters: TensorDictBase | None) -> None:
-        """Take a snapshot of the weights."""
+    def _take(self, parameters: TensorDictBase | None) -> _Snapshot:
+        """A snapshot of the weights as they are now."""
         modules = list(self.model.modules())
         owners: list[dict[str, Any]] = [module._parameters for module in modules]
         owners += [module._buffers for module in modules]
@@ -142,25 +151,25 @@ class SpecializedPredictor(Predictor):
         # Tensors made in inference mode could be neither overwritten nor differentiated outside.
         with torch.inference_mode(False), torch.no_grad():
             program = self.program(parameters)
-            if self._executor is None:
-                self._executor = EXECUTORS[self.executor_name](program)
+            if self._taken is None:
+                executor = EXECUTORS[self.executor_name](program)
             else:
-                self._executor.update(program)
-        self._weights, self._casts = watched, casts
+                executor = self._taken.executor.update(program)
         self._plan = None
         # Views that share the storage keep it alive: no other tensor can come to lie at its address.
         given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
-        self._given = {name: (value.detach(), version_of(value)) for name, value in given.items()}
+        kept = {name: (value.detach(), version_of(value)) for name, value in given.items()}
+        return _Snapshot(executor, watched, casts, kept)
 
-    def _is_current(self, parameters: TensorDictBase | None) -> bool:
+    def _is_current(self, taken: _Snapshot, parameters: TensorDictBase | None) -> bool:
         model = self._modules["model"]  # not self.model: torch looks that up in a microsecond
-        if not self._weights.unchanged() or model.casts != self._casts:  # pyright: ignore[reportOptionalMemberAccess]
+        if not taken.weights.unchanged() or model.casts != taken.casts:  # pyright: ignore[reportOptionalMemberAccess]
             return False
         if parameters is None:
-            return not self._given
+            return not taken.given
         given = dict(parameters.items())
-        return given.keys() == self._given.keys() and all(
-            is_same(given[str(name)], *kept) for name, kept in self._given.items()
+        return given.keys() == taken.given.keys() and all(
+            is_same(given[str(name)], *kept) for name, kept in taken.given.items()
         )
 
     def program(

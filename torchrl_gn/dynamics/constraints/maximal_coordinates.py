@@ -104,7 +104,9 @@ class MaximalProjection(Float64Buffers):
 
     def offsets(self, matrices: Tensor, parameters: PhysicalParameters) -> Tensor:
         """Offsets of each joint anchor from its parent and its child, ``[*B, 2, N, 3]``, in the world frame."""
-        offsets = torch.stack((parameters.parent_anchor, parameters.child_anchor), dim=-3).to(matrices.dtype)
+        # Samples may bring one of them.
+        anchors = torch.broadcast_tensors(parameters.parent_anchor, parameters.child_anchor)
+        offsets = torch.stack(anchors, dim=-3).to(matrices.dtype)
         both = torch.stack((matrices[..., self.parent, :, :], matrices), dim=-4)
         return (both @ offsets.unsqueeze(-1)).squeeze(-1)
 

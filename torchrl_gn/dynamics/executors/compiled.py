@@ -48,11 +48,12 @@ class CompiledExecutor:
         run, pull = _functions(program) if program.recurrent is None else _recurrent_functions(program)
         self.run, self.pull = _compile(run), _compile(pull)
 
-    def update(self, program: StepProgram) -> None:
+    def update(self, program: StepProgram) -> CompiledExecutor:
         """Take another program: without compiling again if only its numbers differ."""
         self.version += 1
         if not copy_into(self.program, program):
             self._load(program)
+        return self
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         inputs = [state, action]

@@ -21,8 +21,8 @@ class EagerExecutor:
     def __init__(self, program: StepProgram) -> None:
         self.program = program
 
-    def update(self, program: StepProgram) -> None:
-        self.program = program
+    def update(self, program: StepProgram) -> EagerExecutor:
+        return type(self)(program)
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         return step(self.program, state, action, hidden)

@@ -54,8 +54,12 @@ def make_plan(executor: Executor | None, scene: Scene, watched: Watched, casts: 
 
     The step gives None, and the general way must predict, once a ``watched`` tensor or ``attributes["casts"]`` changes.
     """
-    native = executor.native if isinstance(executor, NativeExecutor) else None
+    if not isinstance(executor, NativeExecutor):
+        return None
+    native = executor.native
     if native is None or native.traced.reason is not None or not native.traced.special or not watched.tensors:
+        return None
+    if not native.samples.empty:  # a plan brings nothing beside state and action
         return None
     if (binding := load_binding()) is None:
         return None
@@ -65,7 +69,7 @@ def make_plan(executor: Executor | None, scene: Scene, watched: Watched, casts: 
     return binding.make_plan(
         (native, maths),
         maths.add_adjoint,
-        vars(executor),
+        executor.shared,
         native.version,
         attributes,
         casts,

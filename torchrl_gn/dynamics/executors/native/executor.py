@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import fields
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -40,25 +42,29 @@ class NativeExecutor:
     change = False  # whether the result is a change instead of the next state
 
     def __init__(self, program: StepProgram) -> None:
-        self.program, self.eager = program, EagerExecutor(program)
-        self.native: Native | None = None
-        self.version, self.pool = 0, Pool()
-        self._reason: str | None = None
+        self.pool = Pool()
+        self.shared = {"version": 0}  # of the weights; with executors that update() made
+        self._last: Native | None = None  # and the state maths and physical parameters that it was traced for
         self._maths: tuple = ()
         self._parameters: ParameterInputs | None = None
-        self.update(program)
+        self._load(program)
 
     @property
     def reason(self) -> str | None:
         """Why it runs by torch operations; None if it runs natively."""
         return self._reason if self.native is None else self.native.traced.reason
 
-    def update(self, program: StepProgram) -> None:
-        """Take another program of the same scene: its state maths are traced again only if they differ."""
-        before = self.native
-        maths = _maths_of(program)
-        same_maths, self._maths = same(self._maths, maths), maths
-        self.program, self.eager = program, EagerExecutor(program)
+    def update(self, program: StepProgram) -> Self:
+        """What runs another program of the same scene: its state maths are traced again only if they differ.
+
+        This executor still runs its own, for other threads.
+        """
+        other = copy.copy(self)
+        other._load(program)
+        return other
+
+    def _load(self, program: StepProgram) -> None:
+        self.program, self.eager, self.native = program, EagerExecutor(program), None
         batch = batch_of(program.parameters)
         if self.change and batch:
             layers, self._reason = None, "with parameters of each sample, training runs by torch operations"
@@ -67,22 +73,22 @@ class NativeExecutor:
         else:
             layers, self._reason = list_layers(program)
         if layers is None:
-            self.native = None
             return
         try:
-            # A new one: other threads may still read the one before.
             network = library.NativeNetwork(layers, program.dtype)
         except (NoCompilerError, TypeError) as error:
-            self.native, self._reason = None, str(error)
+            self._reason = str(error)
             return
+        before, maths = self._last, _maths_of(program)
+        same_maths = same(self._maths, maths)
         inputs = ParameterInputs.of(program.parameters, self._parameters if same_maths else None)
         kept = before is not None and same_maths and before.network.equals(network) and inputs is self._parameters
         traced = before.traced if before is not None and kept else TracedProgram(program, layers, inputs, self.change)
-        self._parameters = inputs
         if before is None or not before.network.same_weights(network):
-            self.version += 1
+            self.shared["version"] += 1
         samples = Samples.of(layers, inputs.read(program.parameters), network.number)
-        self.native = Native(network, layers, traced, samples, self.version)
+        self._maths, self._parameters = maths, inputs
+        self.native = self._last = Native(network, layers, traced, samples, self.shared["version"])
 
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         if (native := self.running(state, action)) is not None:
@@ -138,11 +144,15 @@ class NativeExecutor:
         for at in places:
             of_group = native._replace(samples=native.samples.part(at))
             part = self._rollout(of_group, states[at], actions[at], many)
-            if part is None:
+            if part is None and native.samples.count is not None:
                 return None
-            parts.append(part)
+            parts.append(self._by_torch(states[at], actions[at], many) if part is None else part)
         out = torch.cat(parts)[torch.cat(places).argsort()]
         return out.view(*state.shape[:-2], *out.shape[1:])
+
+    def _by_torch(self, state: Tensor, actions: Tensor, many: bool) -> Tensor:
+        run = partial(rollout_by_steps, self.eager) if many else self.eager.step
+        return run(state, actions, None)[0]
 
 
 class Native(NamedTuple):
@@ -186,7 +196,7 @@ class _Differentiable(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         states, actions = ctx.saved_tensors
-        if ctx.native.version != ctx.executor.version:
+        if ctx.native.version != ctx.executor.shared["version"]:
             raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
         gradient = gradient.contiguous()  # to live until the call is done
         stored = None if ctx.stored is None else ctx.stored.tensor

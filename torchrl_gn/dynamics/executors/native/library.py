@@ -121,8 +121,9 @@ class NativeNetwork:
         return self.dtype == other.dtype and torch.equal(self.code, other.code)
 
     def same_weights(self, other: NativeNetwork) -> bool:
-        """Whether both have the same weights, whatever the tables of their scenes."""
-        return self.equals(other) and all(map(torch.equal, self.weights, other.weights))
+        """Whether both have the same weights and tables, but for those that come with a call."""
+        both = zip(self.weights + self.tables, other.weights + other.tables, strict=True)
+        return self.equals(other) and all(a is None or b is None or torch.equal(a, b) for a, b in both)
 
     def __del__(self) -> None:
         if (pointer := getattr(self, "pointer", None)) is not None:

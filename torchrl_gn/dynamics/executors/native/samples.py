@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +37,7 @@ class ParameterInputs:
     def of(cls, parameters: PhysicalParameters, before: ParameterInputs | None) -> ParameterInputs:
         """Inputs of parameters; the ``before`` ones themselves if they fit."""
         flat = _flat(parameters)
-        values = tuple(part[0] for part in flat) if before is None else before.values
+        values = tuple(part[0].copy() for part in flat) if before is None else before.values
         found = tuple((part != value).any(0) for part, value in zip(flat, values, strict=True))
         if before is None:
             return cls(values, found)
@@ -49,15 +50,22 @@ class ParameterInputs:
         return sum(int(varies.sum()) for varies in self.varies)
 
     def symbols(self, graph: Expressions) -> tuple[list[Any], list[Array]]:
-        """New inputs of an expression graph, P of them, and arrays of all parameters that have them."""
+        """New inputs of an expression graph, P of them, and arrays of those parameters that have some."""
         inputs, arrays, start = graph.inputs(3, len(self)), [], 0
         for value, varies in zip(self.values, self.varies, strict=True):
-            array = value.astype(object)
-            end = start + int(varies.sum())
-            array[varies] = inputs[start:end]
-            arrays.append(array)
-            start = end
+            if varies.any():
+                array = value.astype(object)
+                end = start + int(varies.sum())
+                array[varies] = inputs[start:end]
+                arrays.append(array)
+                start = end
         return inputs, arrays
+
+    def complete(self, symbolic: Iterable[Tensor]) -> PhysicalParameters:
+        """All parameters: those that have inputs, in order, and the constants."""
+        given = iter(symbolic)
+        both = zip(self.values, self.varies, strict=True)
+        return PhysicalParameters(*(next(given) if varies.any() else torch.from_numpy(value) for value, varies in both))
 
     def read(self, parameters: PhysicalParameters) -> Tensor:
         """Their values ``[B, P]`` float64; of parameters without batch ``[1, P]``."""
@@ -74,6 +82,11 @@ class Samples:
         sizes = {table.shape[1] for table in tables if table is not None} | {len(parameters)}
         self.count = max(sizes) if max(sizes) > 1 else None  # B; None: all samples have the same
         self._addresses = (ctypes.c_void_p * len(tables))(*(None if t is None else t.data_ptr() for t in tables))
+
+    @property
+    def empty(self) -> bool:
+        """Whether they bring nothing."""
+        return not self.parameters.shape[1] and all(table is None for table in self.tables)
 
     @classmethod
     def of(cls, layers: LayerList, parameters: Tensor, number: torch.dtype) -> Samples:

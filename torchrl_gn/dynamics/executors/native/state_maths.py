@@ -16,7 +16,6 @@ from torchrl_gn.dynamics.executors.native.samples import ParameterInputs
 from torchrl_gn.dynamics.executors.native.tape import Tape, assemble
 from torchrl_gn.dynamics.executors.native.trace import Array, trace
 from torchrl_gn.dynamics.program import StepProgram
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 
 class StateMaths:
@@ -122,14 +121,14 @@ def _forward(
     full[predicted] = outputs.reshape(len(predicted), width)
     read, arrays = parameters.symbols(graph)
 
-    def before(state: Tensor, action: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
-        own = replace(program, parameters=PhysicalParameters(*parameters))
+    def before(state: Tensor, action: Tensor, *symbolic: Tensor) -> tuple[Tensor, ...]:
+        own = replace(program, parameters=parameters.complete(symbolic))
         canonical = eager.canonical_state(own, state, action)
         nodes, edges = eager.features(own, canonical, action)
         return program.nodes(nodes, torch.float64), program.edges(edges, torch.float64)
 
-    def after(state: Tensor, action: Tensor, predicted: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
-        own = replace(program, parameters=PhysicalParameters(*parameters))
+    def after(state: Tensor, action: Tensor, predicted: Tensor, *symbolic: Tensor) -> tuple[Tensor, ...]:
+        own = replace(program, parameters=parameters.complete(symbolic))
         canonical = eager.canonical_state(own, state, action)
         change = eager.change(own, state, canonical, predicted)
         return program.layout.apply(state, change), change

@@ -119,11 +119,12 @@ class TracedProgram:
         if not library.rollout(network, maths, call):
             raise UntraceableError("The state maths do not fit the state that they were traced for.")
         found = found if self.change else found - state
-        error, size = float((found - change).norm()), float(change.norm())
-        if np.isfinite(size) and not error <= 1e-6 * size + 1e-12 * (1 + float(state.norm())):
-            raise UntraceableError(
-                f"The native step differs from torch's by {error / max(size, 1e-300):.1e} of the change."
-            )
+        sizes, errors = (each.flatten(-2).norm(dim=-1).flatten() for each in (change, found - change))
+        bound = 1e-6 * sizes + 1e-12 * (1 + float(self._example[0].norm()))
+        wrong = sizes.isfinite() & ~(errors <= bound)
+        if wrong.any():
+            worst = float((errors / sizes.clamp(min=1e-300))[wrong].max())
+            raise UntraceableError(f"The native step differs from torch's by {worst:.1e} of the change.")
 
     @functools.cached_property
     def _in_float64(self) -> tuple[StepProgram, library.NativeNetwork, Samples]:
