@@ -16,6 +16,9 @@ be ours, and gradients in node and edge features for one in the outputs. Ours go
 projection. The process is then kept on as many cores as `threads`, and JAX computes in the calling thread. `mujoco` is
 the true physics in C, on one thread. A baseline has no row where it has no such work.
 
+`own_parameters=true` gives each sample the physical parameters of a variant of its own, as in planning for identified
+systems; without `folded`, training steps, curves and baselines.
+
 `bound` is the share that a step reaches of its least time: the larger of its FLOPs at the rate of a large product, and
 of its weights read once at the bandwidth of reading as many bytes again and again. FLOPs and weights are those of the
 specialised network. `curves=true` draws the time of a step over links, batch sizes and hidden sizes, and of a rollout's
@@ -29,11 +32,13 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import os
 import statistics
-from typing import cast
+from typing import Any, cast
 
 import hydra
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
@@ -47,10 +52,14 @@ from _common.speed_work import make_works, pull, train_work
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.executors import EXECUTORS
+from torchrl_gn.dynamics.normalization import update_parameter_normalizers
 from torchrl_gn.evaluation import plot_loglog
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import product_speeds, usable_cores
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import load_scene, sample_variants
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+BATCHES = ("batches", "rollout_batches", "step_gradient_batches", "gradient_batches")
 
 
 def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[ForwardModel, TensorDict]:
@@ -66,15 +75,28 @@ def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[Forward
     return model, transitions
 
 
-def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Way]:
-    """All ways, the baseline first."""
-    scene = load_scene(system)
-    bound = model.bind(scene)
-    ways = {
-        "reference": Way(model.bind(scene, reference=True)),
-        "reference, fast": Way(model.bind(scene, reference=True), fast=True),
-        "folded, fast": Way(bound, fast=True),
-    }
+def variants_parameters(cfg: DictConfig, model: ForwardModel) -> TensorDict:
+    """Parameters of a variant for each sample of the largest batch, which the model's statistics then know.
+
+    ValueError with baselines, which have one system.
+    """
+    if as_list(cfg.baselines):
+        raise ValueError("Baselines have one system for all samples: leave out baselines or own_parameters.")
+    most = max(itertools.chain(*(cfg[name] for name in BATCHES)))
+    bound = model.bind(load_scene(cfg.system), parameters_key="parameters")
+    variants = sample_variants(cfg.system, most, np.random.default_rng(cfg.seed))
+    every = [PhysicalParameters.of(variant).tensordict() for variant in variants]
+    update_parameter_normalizers(bound, torch.stack(cast(Any, every)))
+    return cast(TensorDict, torch.stack([bound.parameters_of(variant) for variant in variants]))
+
+
+def make_ways(cfg: DictConfig, model: ForwardModel, system: str, parameters: TensorDict | None) -> dict[str, Way]:
+    """All ways, the baseline first; with ``parameters`` of samples but ``folded``."""
+    scene, key = load_scene(system), None if parameters is None else "parameters"
+    bound, reference = model.bind(scene, parameters_key=key), model.bind(scene, reference=True, parameters_key=key)
+    ways = {"reference": Way(reference), "reference, fast": Way(reference, fast=True)}
+    if parameters is None:
+        ways["folded, fast"] = Way(bound, fast=True)
     rounded = product_speeds().pays(torch.bfloat16)
     for executor in EXECUTORS:
         if executor == "compiled" and not cfg.compile:
@@ -85,7 +107,7 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str) -> dict[str, Wa
             ways[f"{name}, fast"] = Way(ways[name].model, fast=True)
             if rounded:
                 ways[f"{name}, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, executor=executor))
-    return ways
+    return ways if parameters is None else {name: way.bring(parameters) for name, way in ways.items()}
 
 
 def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float]]]]:
@@ -125,23 +147,26 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     model, transitions = make_model(cfg, cfg.system, list(cfg.hidden))
     baselines = make_baselines(cfg, model, load_scene(cfg.system), as_list(cfg.baselines))
+    parameters = variants_parameters(cfg, model) if cfg.own_parameters else None
     run, tracker = open_run(cfg, "benchmark_speed")
-    ways, works = make_ways(cfg, model, cfg.system), make_works(cfg, model, transitions, baselines)
+    ways, works = make_ways(cfg, model, cfg.system, parameters), make_works(cfg, model, transitions, baselines)
     model.requires_grad_(False)
-    reference = copy.deepcopy(model).double().bind(load_scene(cfg.system), reference=True)
-    compile_seconds = measure(works, ways, reference)
-    model.requires_grad_(True)
-    training = train_work(cfg, model, transitions)
-    measure([training], {name: way for name, way in ways.items() if "reference" in name or "folded" in name})
+    key = None if parameters is None else "parameters"
+    exact = Way(copy.deepcopy(model).double().bind(load_scene(cfg.system), reference=True, parameters_key=key))
+    compile_seconds = measure(works, ways, exact if parameters is None else exact.bring(parameters))
+    if parameters is None:
+        model.requires_grad_(True)
+        works.append(train_work(cfg, model, transitions))
+        measure(works[-1:], {name: way for name, way in ways.items() if "reference" in name or "folded" in name})
 
     print(f"{ways['specialised'].model}\n\nMilliseconds a step, medians of {cfg.repeats}, {cfg.threads} threads")
     if "jraph" in baselines:
         print(f"This process on {usable_cores()} cores, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}")
-    metrics = {"threads": cfg.threads, **report([*works, training], least_times(cfg, works, ways))}
+    metrics = {"threads": cfg.threads, **report(works, least_times(cfg, works, ways))}
     metrics |= {f"first call/{name}": seconds for name, seconds in compile_seconds.items()}
     if compile_seconds:
         print("First calls of the compiled model: " + ", ".join(f"{n} {s:.0f} s" for n, s in compile_seconds.items()))
-    if cfg.curves:
+    if cfg.curves and parameters is None:
         panels = curves(cfg)
         for panel, lines in panels.items():
             for name, (xs, ys) in lines.items():

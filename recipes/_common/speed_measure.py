@@ -9,10 +9,11 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
+from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
@@ -25,12 +26,42 @@ R = TypeVar("R")
 _TURN_SECONDS, _MOST_CALLS = 0.02, 50
 
 
+class OwnParameters:
+    """A predictor bound with a ``parameters_key``, for batches whose samples have parameters of their own."""
+
+    def __init__(self, predictor: Predictor, parameters: TensorDict) -> None:
+        self._predictor, self._parameters = predictor, parameters
+        self._of_batch: dict[int, TensorDict] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._predictor, name)
+
+    def __str__(self) -> str:
+        return str(self._predictor)
+
+    def step(self, state: Tensor, action: Tensor) -> tuple[Tensor, Any]:
+        return self._predictor.step(state, action, self._first(len(state)))
+
+    def rollout(self, state: Tensor, actions: Tensor) -> tuple[Tensor, Any]:
+        return self._predictor.rollout(state, actions, self._first(len(state)))
+
+    def _first(self, count: int) -> TensorDict:
+        # The same tensors at every call, as in a planner.
+        if count not in self._of_batch:
+            self._of_batch[count] = cast(TensorDict, self._parameters[:count].clone())
+        return self._of_batch[count]
+
+
 @dataclass(frozen=True)
 class Way:
     """A way to evaluate the forward model."""
 
     model: Predictor
     fast: bool = False
+
+    def bring(self, parameters: TensorDict) -> Way:
+        """The same for samples with physical parameters of their own."""
+        return replace(self, model=cast(Predictor, OwnParameters(self.model, parameters)))
 
 
 @dataclass
@@ -73,13 +104,13 @@ def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
         return result, time.perf_counter() - start
 
 
-def measure(works: Sequence[Work], ways: Mapping[str, Way], reference: Predictor | None = None) -> dict[str, float]:
+def measure(works: Sequence[Work], ways: Mapping[str, Way], reference: Way | None = None) -> dict[str, float]:
     """Time every work in every way, in turn; returns the seconds of first calls of compiled ways."""
     compile_seconds = {}
     turns = sum((work.repeats + 1) * (len(ways) + len(work.others)) for work in works)
     bar = tqdm(total=turns, desc="measuring", leave=False)
     for work in works:
-        expected = None if reference is None else work.compared(work.run(Way(reference)))
+        expected = None if reference is None else work.compared(work.run(reference))
         runs = {
             name: functools.partial(timed, functools.partial(work.run, way), way.fast) for name, way in ways.items()
         }

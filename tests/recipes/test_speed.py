@@ -24,7 +24,7 @@ def test_every_executor_is_a_way(load, compose, monkeypatch):
     scene = load_scene("pendulum")
     model = ForwardModel.for_scene(scene, hidden=4)
     monkeypatch.setitem(EXECUTORS, "another", EXECUTORS["eager"])
-    ways = recipe.make_ways(compose("benchmark_speed", "compile=false"), model, "pendulum")
+    ways = recipe.make_ways(compose("benchmark_speed", "compile=false"), model, "pendulum", None)
     assert {"reference", "specialised", "specialised, fast", "another"} <= set(ways) and "compiled" not in ways
     assert ways["another"].model.executor_name == "another" and next(iter(ways)) == "reference"
 
@@ -104,3 +104,23 @@ def test_jraph_network_is_ours(activation):
     for found, wanted in zip(gradients, (nodes.grad, edges.grad), strict=True):
         assert wanted is not None
         torch.testing.assert_close(torch.from_numpy(np.array(found)).view_as(wanted), wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_samples_with_parameters_of_their_own(load, compose):
+    recipe = load("benchmark_speed")
+    batches = ["batches=[1,3]", "rollout_batches=[2]", "step_gradient_batches=[]", "gradient_batches=[1]"]
+    sizes = ["hidden=[8,8]", "latent=6", "activation=silu", "compile=false", "own_parameters=true", "system=pendulum"]
+    cfg = compose("benchmark_speed", *sizes, *batches)
+    model, transitions = recipe.make_model(cfg, "pendulum", [8, 8])
+    parameters = recipe.variants_parameters(cfg, model)
+    assert parameters.shape == (3,)
+    ways = recipe.make_ways(cfg, model.requires_grad_(False), "pendulum", parameters)
+    state, action = transitions["state"][:3], transitions["action"][:3]
+    expected = ways["reference"].model.step(state, action)[0]
+    alone = ways["native"].model.step(state[:1], action[:1])[0]
+    torch.testing.assert_close(ways["native"].model.step(state, action)[0], expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(alone, expected[:1], rtol=1e-5, atol=1e-6)
+    own = model.bind(load_scene("pendulum")).step(state, action)[0]
+    assert (own - expected).abs().max() > 1e-5
+    with pytest.raises(ValueError, match="leave out baselines or own_parameters"):
+        recipe.variants_parameters(compose("benchmark_speed", *sizes, "baselines=[mujoco]"), model)
