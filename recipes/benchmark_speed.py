@@ -86,7 +86,7 @@ def variants_parameters(cfg: DictConfig, model: ForwardModel) -> TensorDict:
     bound = model.bind(load_scene(cfg.system), parameters_key="parameters")
     variants = sample_variants(cfg.system, most, np.random.default_rng(cfg.seed))
     every = [PhysicalParameters.of(variant).tensordict() for variant in variants]
-    update_parameter_normalizers(bound, torch.stack(cast(Any, every)))
+    update_parameter_normalizers(bound, cast(TensorDict, torch.stack(cast(Any, every))))
     return cast(TensorDict, torch.stack([bound.parameters_of(variant) for variant in variants]))
 
 
