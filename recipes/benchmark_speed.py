@@ -85,9 +85,10 @@ def variants_parameters(cfg: DictConfig, model: ForwardModel) -> TensorDict:
     most = max(itertools.chain(*(cfg[name] for name in BATCHES)))
     bound = model.bind(load_scene(cfg.system), parameters_key="parameters")
     variants = sample_variants(cfg.system, most, np.random.default_rng(cfg.seed))
-    every = [PhysicalParameters.of(variant).tensordict() for variant in variants]
-    update_parameter_normalizers(bound, cast(TensorDict, torch.stack(cast(Any, every))))
-    return cast(TensorDict, torch.stack([bound.parameters_of(variant) for variant in variants]))
+    every: Any = [PhysicalParameters.of(variant).tensordict() for variant in variants]
+    parameters = cast(TensorDict, torch.stack(every))
+    update_parameter_normalizers(bound, parameters)
+    return parameters
 
 
 def make_ways(cfg: DictConfig, model: ForwardModel, system: str, parameters: TensorDict | None) -> dict[str, Way]:
@@ -107,7 +108,7 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str, parameters: Ten
             ways[f"{name}, fast"] = Way(ways[name].model, fast=True)
             if rounded:
                 ways[f"{name}, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, executor=executor))
-    return ways if parameters is None else {name: way.bring(parameters) for name, way in ways.items()}
+    return {name: way.bring(parameters) for name, way in ways.items()}
 
 
 def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float]]]]:
@@ -146,14 +147,17 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     model, transitions = make_model(cfg, cfg.system, list(cfg.hidden))
-    baselines = make_baselines(cfg, model, load_scene(cfg.system), as_list(cfg.baselines))
     parameters = variants_parameters(cfg, model) if cfg.own_parameters else None
+    baselines = make_baselines(cfg, model, load_scene(cfg.system), as_list(cfg.baselines))
     run, tracker = open_run(cfg, "benchmark_speed")
     ways, works = make_ways(cfg, model, cfg.system, parameters), make_works(cfg, model, transitions, baselines)
     model.requires_grad_(False)
-    key = None if parameters is None else "parameters"
-    exact = Way(copy.deepcopy(model).double().bind(load_scene(cfg.system), reference=True, parameters_key=key))
-    compile_seconds = measure(works, ways, exact if parameters is None else exact.bring(parameters))
+    bound = (
+        copy.deepcopy(model)
+        .double()
+        .bind(load_scene(cfg.system), reference=True, parameters_key=ways["reference"].model.parameters_key)
+    )
+    compile_seconds = measure(works, ways, Way(bound).bring(parameters))
     if parameters is None:
         model.requires_grad_(True)
         works.append(train_work(cfg, model, transitions))

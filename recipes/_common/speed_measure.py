@@ -59,8 +59,10 @@ class Way:
     model: Predictor
     fast: bool = False
 
-    def bring(self, parameters: TensorDict) -> Way:
-        """The same for samples with physical parameters of their own."""
+    def bring(self, parameters: TensorDict | None) -> Way:
+        """The same for samples with physical parameters of their own, if there are some."""
+        if parameters is None:
+            return self
         return replace(self, model=cast(Predictor, OwnParameters(self.model, parameters)))
 
 

@@ -49,7 +49,7 @@ def _opened(file: Path) -> Any:
     return module
 
 
-def make_plan(executor: Executor | None, scene: Scene, watched: Watched, casts: int, attributes: dict) -> Any:
+def make_plan(executor: Executor, scene: Scene, watched: Watched, casts: int, attributes: dict) -> Any:
     """What ``load_binding().step`` takes with a state and an action; None if the executor cannot run such a step yet.
 
     The step gives None, and the general way must predict, once a ``watched`` tensor or ``attributes["casts"]`` changes.

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import copy
 from dataclasses import fields
-from functools import partial
 from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from torchrl_gn.dynamics.executors.eager import EagerExecutor, rollout_by_steps
+from torchrl_gn.dynamics.executors.eager import EagerExecutor
 from torchrl_gn.dynamics.executors.native import library
 from torchrl_gn.dynamics.executors.native.build import NoCompilerError
 from torchrl_gn.dynamics.executors.native.pool import Pool
@@ -82,8 +81,12 @@ class NativeExecutor:
         before, maths = self._last, _maths_of(program)
         same_maths = same(self._maths, maths)
         inputs = ParameterInputs.of(program.parameters, self._parameters if same_maths else None)
-        kept = before is not None and same_maths and before.network.equals(network) and inputs is self._parameters
-        traced = before.traced if before is not None and kept else TracedProgram(program, layers, inputs, self.change)
+        if before is not None and not before.network.equals(network):
+            before = None
+        if before is not None and same_maths and inputs is self._parameters:
+            traced = before.traced
+        else:
+            traced = TracedProgram(program, layers, inputs, self.change)
         if before is None or not before.network.same_weights(network):
             self.shared["version"] += 1
         samples = Samples.of(layers, inputs.read(program.parameters), network.number)
@@ -102,7 +105,7 @@ class NativeExecutor:
             states = self._rollout(native, state, actions, True)
             if states is not None:
                 return states, None
-        return rollout_by_steps(self.eager, state, actions, hidden)
+        return self.eager.rollout(state, actions, hidden)
 
     def running(self, state: Tensor, action: Tensor) -> Native | None:
         """What runs inputs natively; None if torch must."""
@@ -146,13 +149,10 @@ class NativeExecutor:
             part = self._rollout(of_group, states[at], actions[at], many)
             if part is None and native.samples.count is not None:
                 return None
-            parts.append(self._by_torch(states[at], actions[at], many) if part is None else part)
+            by_torch = self.eager.rollout if many else self.eager.step
+            parts.append(by_torch(states[at], actions[at])[0] if part is None else part)
         out = torch.cat(parts)[torch.cat(places).argsort()]
         return out.view(*state.shape[:-2], *out.shape[1:])
-
-    def _by_torch(self, state: Tensor, actions: Tensor, many: bool) -> Tensor:
-        run = partial(rollout_by_steps, self.eager) if many else self.eager.step
-        return run(state, actions, None)[0]
 
 
 class Native(NamedTuple):

@@ -121,9 +121,9 @@ class NativeNetwork:
         return self.dtype == other.dtype and torch.equal(self.code, other.code)
 
     def same_weights(self, other: NativeNetwork) -> bool:
-        """Whether both have the same weights and tables, but for those that come with a call."""
+        """Whether equal networks have the same weights and tables, but for those that come with a call."""
         both = zip(self.weights + self.tables, other.weights + other.tables, strict=True)
-        return self.equals(other) and all(a is None or b is None or torch.equal(a, b) for a, b in both)
+        return all(a is None or b is None or torch.equal(a, b) for a, b in both)
 
     def __del__(self) -> None:
         if (pointer := getattr(self, "pointer", None)) is not None:
@@ -219,11 +219,10 @@ def adjoint_call(
     shape = (*states.shape[:-3], *states.shape[-2:]) if many else states.shape
     of_state = torch.empty(shape, dtype=states.dtype, device="cpu")
     of_actions = torch.empty_like(actions)
-    sizes, stride = (forward.batch, forward.steps, forward.tile, forward.threads), size * (forward.steps * many + 1)
-    fields = (_array(states), stride, _array(actions), _array(gradient), many, _array(of_state), _array(of_actions))
-    call = Call(*sizes, *fields, None if stored is None else stored.data_ptr(), forward.train)
-    for name in ("sample_tables", "parameters", "parameter_stride"):
-        setattr(call, name, getattr(forward, name))
+    call = Call.from_buffer_copy(forward)
+    call.states, call.state_stride, call.actions = _array(states), size * (forward.steps * many + 1), _array(actions)
+    call.out, call.grad_state, call.grad_actions = _array(gradient), _array(of_state), _array(of_actions)
+    call.stored = None if stored is None else stored.data_ptr()
     return call, of_state, of_actions
 
 

@@ -68,7 +68,9 @@ class ParameterInputs:
         return PhysicalParameters(*(next(given) if varies.any() else torch.from_numpy(value) for value, varies in both))
 
     def read(self, parameters: PhysicalParameters) -> Tensor:
-        """Their values ``[B, P]`` float64; of parameters without batch ``[1, P]``."""
+        """Their values ``[B, P]`` float64; of parameters without batch, or without inputs, ``[1, P]``."""
+        if not len(self):
+            return torch.empty(1, 0, dtype=torch.float64, device="cpu")
         parts = [part[:, varies] for part, varies in zip(_flat(parameters), self.varies, strict=True)]
         count = max(map(len, parts))
         return torch.from_numpy(np.concatenate([np.broadcast_to(part, (count, part.shape[1])) for part in parts], 1))
@@ -92,7 +94,7 @@ class Samples:
     def of(cls, layers: LayerList, parameters: Tensor, number: torch.dtype) -> Samples:
         """Of a list of layers, in the dtype of its sums."""
         found: list[Tensor | None] = []
-        for table in layers.tensors()[1]:
+        for table in (layer.table for layer in layers.layers):
             if table is None or table.ndim < 3:
                 found.append(None)
             else:
