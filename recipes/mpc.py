@@ -11,13 +11,14 @@ planner:
 - cem, mppi: TorchRL's planners on the learned model
 - ilqg: on MuJoCo (paper, SM "Baseline Mujoco-based planner")
 - cem_true, mppi_true: TorchRL's planners on MuJoCo
+- policy: the policy of `policy=PATH` alone, without exploration
 - random, nothing: random controls, no controls
 
 Any other robot (`system=PATH`) needs a model (`checkpoint=PATH`) and a task: `horizon`, `steps`, and as `reward` a list
 of terms, as in `[{type: Velocity, body: torso, axis: x}, {type: Effort, weight: 0.1}]` (docs/planning.md).
 
-`value=PATH` and `policy=PATH` are what recipes/value.py learned from earlier episodes: planners then see further than
-the horizon, and begin with the policy's plan.
+`value=PATH` and `policy=PATH` are what recipes/value.py or recipes/shac.py learned: planners then see further than the
+horizon, and begin with the policy's plan.
 
 A checkpoint of an inference model first identifies the system from random controls. `variants=true` gives every episode
 its own random variant of the system; it needs a checkpoint trained on variants (the package has some for pendulum and
@@ -101,6 +102,9 @@ def make_planner(
     torch.manual_seed(seed)  # what TorchRL's planners draw from
     if name in ("random", "nothing"):
         return RandomControl(env.scene, cfg.episodes, cfg.steps, cfg.seed + 2, float(name == "random"), step=done)
+    if name == "policy":
+        assert policy is not None
+        return policy
     if name == "ilqg":
         return ILQGPlanner(env, cfg.horizon, seed=seed, **proposing, **cfg.ilqg)
     if name == "ilqr":
@@ -194,7 +198,7 @@ def main(cfg: DictConfig) -> None:
         if not torch.allclose(episodes.records["state"][0], start["state"]):
             raise ValueError(f"{episodes.path} began in other states than the other planners do; name a new run_dir.")
         planner = make_planner(name, cfg, physics, imagined, len(episodes), proposal)
-        if cfg.delay and not isinstance(planner, RandomControl):
+        if cfg.delay and not isinstance(planner, (RandomControl, BoundedPolicy)):
             planner = PlanAhead(cast(Any, planner), cfg.delay)
         policy = planner if target is None else TensorDictSequential([FreezeGoal(reward), planner])
         execute(cfg, name, policy, env, imagined, episodes)

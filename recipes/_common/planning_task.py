@@ -23,7 +23,7 @@ from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, load_scene, sample_variants
 from torchrl_gn.training import load_pretrained, plain_config, pretrained_names
 
-ON_MODEL, ON_PHYSICS = ("gn", "ilqr", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "random", "nothing")
+ON_MODEL, ON_PHYSICS = ("gn", "ilqr", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "policy", "random", "nothing")
 
 
 def fill_in(cfg: DictConfig) -> None:
@@ -54,6 +54,8 @@ def fill_in(cfg: DictConfig) -> None:
     unknown = [name for name in cfg.planner if name not in ON_MODEL + ON_PHYSICS]
     if unknown:
         raise ValueError(f"There is no planner {unknown[0]!r}; use some of {[*ON_MODEL, *ON_PHYSICS]}.")
+    if "policy" in cfg.planner and cfg.policy is None:
+        raise ValueError("planner=policy acts by a learned policy: give policy=PATH, a run of recipes/shac.py, say.")
 
 
 def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:

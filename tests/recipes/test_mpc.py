@@ -167,6 +167,7 @@ def test_bad_options_are_named(tmp_path, call):
         ("system=two_poles", "'two_poles' is no system of the paper, whose tasks this recipe has (['pendulum', "),
         ("system=my.xml", "'Plan for your own robot'"),
         ("system=my.xml reward=[{type:Effort}] horizon=3", "is no system of the paper"),
+        ("planner=policy", "planner=policy acts by a learned policy: give policy=PATH"),
         ("steps=0", "steps must be at least 1, got 0"),
         ("steps=2.5", "steps must be a whole number, got 2.5"),
         ("horizon=0", "horizon must be at least 1"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
 
 from _common.episodes import transitions
 from torchrl_gn.training import load_pretrained
@@ -60,6 +61,12 @@ def test_planners_see_further_with_what_was_learned(played, tmp_path, call):
     )
     assert all(not torch.equal(valued[name], plain[name]) for name in plain)
     assert not torch.equal(proposed["gn"], plain["gn"]) and torch.equal(proposed["cem"], plain["cem"])
+    options = ("planner=policy", "delay=1", f"policy={run}", f"run_dir={tmp_path / 'alone'}")
+    code, _, errors = call(*EPISODES, *options, recipe="mpc")
+    assert code == 0, errors
+    alone = load_file(tmp_path / "alone" / "policy.safetensors")
+    chosen = load_pretrained(run / "policy.safetensors").policy(TensorDict({"state": alone["state"][:, :-1]}))
+    torch.testing.assert_close(alone["action"], chosen["action"])
 
 
 def test_what_does_not_fit_is_refused(played, tmp_path, call):
