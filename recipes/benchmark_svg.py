@@ -4,8 +4,7 @@
 
 Times one update (sampling, losses of policy, value and model, gradients, optimiser) of SVG(N), in turn and several
 times: with a graph network evaluated by message passing (reference), folded, folded and compiled (what recipes/svg.py
-uses), and with an MLP in its place, beside a step of the environments. No figure of the paper. Results:
-docs/results/training-speed.md.
+uses), and with an MLP in its place, beside a step of the environments. No figure of the paper.
 
 Writes config.yaml, metrics.json and the table as table.md to its run folder.
 """

@@ -17,8 +17,8 @@ trajectories never trained on. Ctrl-C saves everything; the same `run_dir` goes 
   are the episodes that recipes/mpc.py saved.
 
 Writes config.yaml, metrics.json, the checkpoint, a figure of predicted against true states and a video to its run
-folder (`run_dir=PATH`). All options: recipes/config/forward_model.yaml. Results and times:
-docs/results/forward-predictions.md.
+folder (`run_dir=PATH`). All options: recipes/config/forward_model.yaml. Results:
+docs/results/forward-predictions.md; times: docs/results/any-processor.md.
 """
 
 from __future__ import annotations

@@ -57,6 +57,14 @@ def second_half(curve: dict[str, list[float]]) -> float:
     return mean(late or curve["returns"])
 
 
+def pairs_won(halves: dict[str, list[float]]) -> dict[str, int]:
+    """In how many pairs of a seed each has an agent the higher mean return than another."""
+    return {
+        f"{name}/pairs_won/{other}": sum(one > two for one, two in itertools.product(ours, theirs))
+        for (name, ours), (other, theirs) in itertools.permutations(halves.items(), 2)
+    }
+
+
 @with_help
 @hydra.main(config_path="config", config_name="learning_curves", version_base="1.3")
 @clean_exit
@@ -68,7 +76,7 @@ def main(cfg: DictConfig) -> None:
     tracker = open_log(cfg, folder)
     failed = run_all(in_turn, cfg.jobs, desc="learning")
 
-    curves, metrics = {}, {}
+    curves, metrics, halves_of = {}, {}, {}
     lines = [
         "| agent | seeds | second half of the returns | last tenth | best | frames | updates | minutes | updates/s |",
         "|---" * 9 + "|",
@@ -84,8 +92,9 @@ def main(cfg: DictConfig) -> None:
         cells = [name, str(len(done))]
         halves = {seed: second_half(curve) for seed, curve in of_seed.items()}
         metrics |= {f"{name}/return/{at}": quartiles(list(each))[1] for at, *each in zip(frames, *returns, strict=True)}
+        halves_of[name] = list(halves.values())
         metrics |= {f"{name}/second_half_return/seed {seed}": half for seed, half in halves.items()}
-        summed_up = {"second_half_return": list(halves.values())}
+        summed_up = {"second_half_return": halves_of[name]}
         summed_up |= {key: [values[key] for values in done.values()] for key in ("last_tenth_return", "best_return")}
         for key, values in summed_up.items():
             low, middle, high = quartiles(values)
@@ -95,6 +104,7 @@ def main(cfg: DictConfig) -> None:
             metrics[f"{name}/{key}"] = quartiles([values[key] for values in done.values()])[1]
             cells.append(f"{scale * metrics[f'{name}/{key}']:,.0f}")
         lines.append("| " + " | ".join(cells) + " |")
+    metrics |= pairs_won(halves_of)
     if curves:
         plot_learning_curves(curves, folder.file("curves.png"))
     report_sweep(folder, lines, {}, metrics, failed, tracker, seed=as_list(cfg.seeds)[0])

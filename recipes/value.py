@@ -8,7 +8,8 @@ the policy. recipes/plan_and_learn.py does both after every round (value=true, p
 
 Writes config.yaml, metrics.json, the value (checkpoint/), the policy (policy.safetensors) and value.png: the value of
 the states of the last file's episodes, beside the discounted return that followed. Repeats bit for bit; a run that was
-interrupted begins anew. All options: recipes/config/value.yaml.
+interrupted begins anew. All options: recipes/config/value.yaml. Results:
+docs/results/terminal-value.md.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import torch
 from omegaconf import OmegaConf
 
 from _common.progress import learn_with_progress, report_learning
-from learning_curves import make_runs, second_half
+from learning_curves import make_runs, pairs_won, second_half
 from torchrl_gn.training import (
     RunFolder,
     Tracker,
@@ -64,6 +64,11 @@ def test_a_report_holds_the_curve_and_its_last_tenth(make_learner, tracker, tmp_
 def test_the_second_half_of_a_curve_begins_after_half_of_the_frames():
     curve = {"frames": [0, 100, 200, 300, 400], "returns": [1.0, 2.0, 4.0, 8.0, 16.0]}
     assert second_half(curve) == 12.0 and second_half({"frames": [0], "returns": [3.0]}) == 3.0
+
+
+def test_pairs_of_seeds_are_won_by_the_higher_return():
+    won = pairs_won({"ours": [1.0, 3.0], "theirs": [0.0, 2.0, 3.0]})
+    assert won == {"ours/pairs_won/theirs": 3, "theirs/pairs_won/ours": 2}  # one is a draw
 
 
 def test_finished_curves_go_on_with_more_frames(tmp_path):
