@@ -31,7 +31,7 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
-from _common import as_list, clean_exit, finish_run, resumed_checkpoint, scene_options, with_help
+from _common import as_list, clean_exit, finish_run, load_system, resumed_checkpoint, with_help
 from _common.known_physics import load_physics
 from _common.models import build_model
 from _common.progress import cut_short_note, train_with_progress
@@ -49,7 +49,7 @@ from torchrl_gn.evaluation import (
     summary,
 )
 from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
-from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.scenes import Scene
 from torchrl_gn.training import Budget, RunFolder, Tracker, Trainer, Workers, join_workers, make_optimizer, plain_config
 
 # Options that may differ when a run goes on.
@@ -70,7 +70,7 @@ MAY_CHANGE = (
 
 def load_scenes(cfg: DictConfig, names: str | ListConfig) -> list[Scene]:
     """Scenes of one name or several."""
-    return [load_scene(name, **scene_options(cfg)) for name in as_list(names)]
+    return [load_system(cfg, name) for name in as_list(names)]
 
 
 def make_model(cfg: DictConfig, scenes: list[Scene], physics: Physics | None) -> ForwardModel:

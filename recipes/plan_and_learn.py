@@ -27,11 +27,10 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from _common import as_list, clean_exit, open_log, scene_options, with_help
+from _common import as_list, clean_exit, load_system, open_log, scene_options, with_help
 from _common.sweeps import FORWARD_MODEL, MPC, VALUE, Run, override, refuse_changes, report_sweep, run_all
 from _common.tensor_files import load_tensors
 from torchrl_gn.evaluation import plot_rewards
-from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, load_pretrained, pretrained_names
 
 
@@ -107,11 +106,11 @@ def make_runs(cfg: DictConfig, folder: Path, model: str | None) -> tuple[list[Ru
 @hydra.main(config_path="config", config_name="plan_and_learn", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
+    scene = load_system(cfg, cfg.system)
     folder = RunFolder(cfg.run_dir, "plan_and_learn")
     model = cfg.checkpoint or (cfg.system if cfg.system in pretrained_names() else None)
     if model is not None:
         load_pretrained(model)  # refused before anything is written
-    scene = load_scene(cfg.system, **scene_options(cfg))
     learned, executed, valued = make_runs(
         cfg, folder.path.resolve(), model
     )  # named in the options, which may not change

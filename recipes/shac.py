@@ -29,7 +29,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from tqdm import tqdm
 
-from _common import as_list, clean_exit, finish_run, open_log, refuse_other_options, scene_options, with_help
+from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_other_options, with_help
 from _common.actor_critic import WINDOW
 from _common.actor_critic_rounds import ActorCritic, Round, Task
 from _common.planning_task import reward_of
@@ -38,7 +38,6 @@ from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation import evaluate_errors, plot_learning_curves, rollout_video
 from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, load_pretrained
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
@@ -109,7 +108,7 @@ def judge(cfg: DictConfig, task: Task, policy: BoundedPolicy) -> tuple[TensorDic
     rewards = episodes["next", "reward"].squeeze(-1)
     numbers = {
         "reward": rewards.mean().item(),
-        "std": rewards.mean(1).std().item(),
+        "std": rewards.mean(1).std().item() if len(rewards) > 1 else 0.0,
         "return": cfg.action_repeat * rewards.sum(1).mean().item(),
     }
     return episodes, numbers
@@ -136,7 +135,7 @@ def make_tasks(cfg: DictConfig, systems: list[str]) -> list[Task]:
     """The task on every system."""
     tasks = []
     for system in systems:
-        scene = load_scene(system, **scene_options(cfg))
+        scene = load_system(cfg, system)
         reward = reward_of(cfg, scene)
         judged = reward if cfg.judged_reward is None else reward_of(cfg, scene, "judged_reward")
         tasks.append(Task(cfg, scene, reward, judged, scene.name if len(systems) > 1 else ""))

@@ -13,8 +13,10 @@ import torch
 from PIL import Image
 
 from torchrl_gn.__main__ import main
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.scenes import SYSTEMS, load_scene
-from torchrl_gn.training import load_pretrained, pretrained_names
+from torchrl_gn.training import load_pretrained, pretrained_names, save_checkpoint
+from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
 from . import zoo
 
@@ -56,6 +58,14 @@ def test_list_states_the_errors_of_the_checkpoints(listed):
 def test_show_prints_the_scene(capsys):
     assert main(["show", "swimmer4"]) == 0
     assert capsys.readouterr().out == f"{load_scene('swimmer4')}\n"
+
+
+def test_show_takes_a_run_folder(tmp_path, capsys):
+    scene = load_scene("pendulum")
+    model = ForwardModel.for_scene(scene, hidden=8)
+    save_checkpoint(tmp_path / CHECKPOINT_FILE, model, scene=scene)
+    assert main(["show", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == f"{scene}\n"
 
 
 def test_show_draws_a_file_of_ones_own(tmp_path, capsys):

@@ -2,7 +2,7 @@
 
 Usage:
     torchrl-gn [list]
-    torchrl-gn show NAME_OR_MJCF [--image FILE]
+    torchrl-gn show SCENE [--image FILE]
     torchrl-gn doctor
 """
 
@@ -12,6 +12,7 @@ import argparse
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 
@@ -21,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.add_parser("list", help="built-in systems and pretrained models (default)")
     show = commands.add_parser("show", help="a scene as a graph: nodes, joints, motors, moving parts")
-    show.add_argument("scene", metavar="NAME_OR_MJCF", help="a built-in system, or the path of an MJCF file")
+    show.add_argument("scene", metavar="SCENE", help="a built-in system, or the path of an MJCF file or a run folder")
     show.add_argument("--image", metavar="FILE", help="draw the start state into this file (.png, .jpg, ...)")
     commands.add_parser("doctor", help="this machine: hardware, libraries, speeds, and recommended options")
     options = parser.parse_args(arguments)
@@ -74,7 +75,12 @@ def _models() -> str:
 def _show(source: str, image: str | None) -> str:
     from torchrl_gn.scenes import load_scene
 
-    scene = load_scene(source)
+    if Path(source).is_dir():
+        from torchrl_gn.training import load_pretrained
+
+        scene = load_pretrained(source).scene()
+    else:
+        scene = load_scene(source)
     if image is None:
         return str(scene)
     from torchrl_gn.atomic import atomic_path

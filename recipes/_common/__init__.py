@@ -7,6 +7,7 @@ from _common.ablated_core import AblatedCore as AblatedCore
 from _common.exit import clean_exit as clean_exit
 from _common.help import with_help as with_help
 from _common.options import as_list as as_list
+from _common.options import load_system as load_system
 from _common.options import scene_options as scene_options
 from _common.run import finish_run as finish_run
 from _common.run import open_log as open_log

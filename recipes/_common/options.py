@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import plain_config
 from torchrl_gn.training.optimizers import Preset
 
@@ -83,3 +84,14 @@ def scene_options(cfg: DictConfig) -> dict[str, Any]:
     """Options of ``load_scene`` that a recipe has."""
     plain = plain_config(cfg)
     return {key: plain[key] for key in ("timestep", "action_bounds", "wide_starts")}
+
+
+def load_system(cfg: DictConfig, system: str) -> Scene:
+    """The scene of a recipe's system; ValueError if its actuators have no bounds."""
+    scene = load_scene(system, **scene_options(cfg))
+    if scene.unbounded:
+        raise ValueError(
+            f"{system!r} has actuators without bounds, {list(scene.unbounded)}: give action_bounds=[-1,1], say, or one"
+            f' by one "action_bounds={{{scene.unbounded[0]}: [-1, 1]}}"; the same to train, plan and learn policies.'
+        )
+    return scene

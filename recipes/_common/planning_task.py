@@ -12,7 +12,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from _common import scene_options
+from _common import load_system
 from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states, spline_controls
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
@@ -20,7 +20,7 @@ from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners import BoundedPolicy, StateValue, TerminalReward
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.rewards import Reward, make_reward
-from torchrl_gn.scenes import Scene, load_scene, sample_variants
+from torchrl_gn.scenes import Scene, sample_variants
 from torchrl_gn.training import load_pretrained, plain_config, pretrained_names
 
 ON_MODEL, ON_PHYSICS = ("gn", "ilqr", "cem", "mppi"), ("ilqg", "cem_true", "mppi_true", "policy", "random", "nothing")
@@ -60,7 +60,7 @@ def fill_in(cfg: DictConfig) -> None:
 
 def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
     """Load the standard scene, and with ``variants=true`` a random variant for every episode."""
-    scene = load_scene(cfg.system, **scene_options(cfg))
+    scene = load_system(cfg, cfg.system)
     if not cfg.variants:
         return scene, [scene]
     rng = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(2,)))

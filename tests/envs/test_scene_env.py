@@ -193,6 +193,8 @@ def test_a_task_entry_reaches_the_reward(pendulum):
 
 def test_a_reward_of_a_wrong_shape_is_named(pendulum):
     env = SceneEnv(pendulum, lambda state, action, next_state, task: state[..., 0, 0], seed=0)
+    with pytest.raises(TypeError, match=r"a function of \(state, action, next_state, task\), .*<lambda> is not"):
+        SceneEnv(pendulum, lambda state, action, next_state: state[..., 0, :1])  # pyright: ignore
     with pytest.raises(ValueError, match=r"the reward must be \[3, 1\]"):
         env.rollout(1, tensordict=batch(3))
 

@@ -155,5 +155,7 @@ def test_refuses_what_does_not_fit() -> None:
         policy.act(state[:, 1:])
     with pytest.raises(ValueError, match="has no yaw to leave out"):
         policy.for_scene(load_scene("cheetah"))
+    with pytest.raises(ValueError, match=r"The policy learned with control steps of .* load it with timestep="):
+        policy.for_scene(load_scene("swimmer6", timestep=0.1))
     with pytest.raises(ValueError, match="hidden="):
         GraphStatePolicy(policy.scene, hidden=())

@@ -225,6 +225,8 @@ def test_what_does_not_fit_is_refused_by_name():
         SceneEnv(scene, terminal=StateValue(scene))
     with pytest.raises(ValueError, match="scene 'cartpole', whose bodies are not those of 'pendulum'"):
         SceneEnv(scene, terminal=learned_value(load_scene("cartpole")))
+    with pytest.raises(ValueError, match=r"steps of 20 ms, scene 'pendulum' has 40 ms: load it with timestep=0\.02"):
+        SceneEnv(load_scene("pendulum", timestep=0.04), terminal=learned_value(scene))
     with pytest.raises(TypeError, match="terminal= must be a function of states"):
         SceneEnv(scene, terminal=3.0)  # pyright: ignore
     swimmer = load_scene("swimmer6")

@@ -56,6 +56,12 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     assert code == 0, errors
 
 
+def test_one_judged_episode_has_no_spread(tmp_path, call):
+    code, _, errors = call(*SMALL, "rounds=1", "evaluate.episodes=1", f"run_dir={tmp_path}", recipe="shac")
+    assert code == 0 and "warning" not in errors.lower(), errors
+    assert json.loads((tmp_path / "metrics.json").read_text())["std"] == 0.0
+
+
 SWIMMERS = (
     *SMALL,
     "system=[swimmer3,swimmer4]",
@@ -93,7 +99,7 @@ def test_one_graph_policy_learns_on_several_systems(tmp_path, call):
     assert zero_shot["zero_shot/swimmer4"] == metrics[0]["return swimmer4"] != zero_shot["zero_shot/swimmer5"]
 
     # The policy proposes plans for a length that it has not learned on.
-    planning = ("horizon=2", "steps=2", "video=false", "gn.warm_up=1", "gn.samples=3", "gn.iterations=1")
+    planning = ("timestep=0.1", "horizon=2", "steps=2", "video=false", "planner=ilqg", "ilqg.iterations=1")
     code, _, errors = call("system=swimmer5", f"policy={whole}", *planning, f"run_dir={tmp_path / 'mpc'}", recipe="mpc")
     assert code == 0, errors
 

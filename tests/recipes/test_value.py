@@ -89,6 +89,9 @@ def test_what_does_not_fit_is_refused(played, tmp_path, call):
         options = ("planner=nothing", f"value={run}", option, f"run_dir={tmp_path / 'refused'}")
         code, _, errors = call(*EPISODES, *options, recipe="mpc")
         assert code == 1 and message in errors and "Traceback" not in errors
+    options = ("planner=policy", f"policy={run}", "timestep=0.04", f"run_dir={tmp_path}/no")
+    code, _, errors = call(*EPISODES, *options, recipe="mpc")
+    assert code == 1 and f"policy={run}: The policy learned with control steps of 20 ms" in errors
     code, _, errors = call(*EPISODES, "system=cartpole", f"policy={run}", f"run_dir={tmp_path}/no", recipe="mpc")
     assert code == 1 and "is of scene 'pendulum', not 'cartpole'" in errors
 

@@ -12,6 +12,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
 
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import Budget, CheckpointError, load_pretrained, package_versions, save_checkpoint
@@ -156,12 +157,21 @@ def test_an_agent_comes_back_with_its_statistics(tmp_path, dtype):
     assert (chosen[0] == chosen[1]).all()
     assert agent.model is not None and again.model is not None
     assert torch.equal(again.model.step(observation, action), agent.model.step(observation, action))
-    with pytest.raises(CheckpointError, match="The checkpoint holds a Agent .*, not a ForwardModel"):
+    with pytest.raises(CheckpointError, match="trained is Agent, no ForwardModel"):
         _ = loaded.model
 
 
+def test_a_checkpoint_prints_what_it_holds(tmp_path):
+    scene = load_scene("pendulum")
+    model = ForwardModel.for_scene(scene, hidden=8)
+    save_checkpoint(tmp_path / "a.safetensors", model, scene=scene, training={"big": torch.zeros(999)})
+    text = repr(load_pretrained(tmp_path / "a.safetensors"))
+    assert text.startswith("Checkpoint(ForwardModel, scenes=['pendulum'], metrics={}, torchrl_gn 0")
+    assert "tensor" not in text
+
+
 def test_a_model_is_no_agent(saved):
-    with pytest.raises(CheckpointError, match="The checkpoint holds a ForwardModel .*, not a Agent"):
+    with pytest.raises(CheckpointError, match="trained is ForwardModel, no Agent"):
         _ = load_pretrained(saved).agent
 
 

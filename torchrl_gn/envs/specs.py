@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import itertools
 import math
 from collections.abc import Callable
@@ -73,7 +74,23 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
 
 
 def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
-    """The reward on the environment's device, copied if need be; ValueError if it is of another scene."""
+    """The reward on the environment's device, copied if need be.
+
+    TypeError unless it is a function of state, action, next state and task; ValueError if it is of another scene.
+    """
+    if reward is not None:
+        try:
+            inspect.signature(reward).bind(None, None, None, None)
+        except TypeError:
+            name = getattr(reward, "__qualname__", type(reward).__name__)
+            raise TypeError(f"reward= must be a function of (state, action, next_state, task), {name} is not") from None
+        except ValueError:  # a built-in function that does not say
+            pass
+    return on_device(reward, env, scene)
+
+
+def on_device(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
+    """A reward or value on the environment's device, copied if need be; ValueError if it is of another scene."""
     if not isinstance(reward, nn.Module):
         return reward
     for each in reward.modules():

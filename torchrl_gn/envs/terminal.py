@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchrl_gn.envs.specs import DIVERGED, reward_of
+from torchrl_gn.envs.specs import DIVERGED, on_device
 from torchrl_gn.finite import is_traced
 from torchrl_gn.scenes.scene import Scene
 
@@ -33,7 +33,8 @@ def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> Termi
     own = getattr(terminal, "scene", scene)
     if own.node_names != scene.node_names:
         raise ValueError(f"{name} is of scene {own.name!r}, whose bodies are not those of {scene.name!r}")
-    return reward_of(terminal, env, scene)
+    scene.require_timestep(own.timestep, name)
+    return on_device(terminal, env, scene)
 
 
 def discount_of(terminal: TerminalValue | None) -> float:

@@ -75,6 +75,7 @@ class SHACLoss(LossModule):
                 raise ValueError(
                     f"{type(network).__name__} is of scene {network.scene.name!r}, not {env.scene.name!r}."
                 )
+            env.scene.require_timestep(network.scene.timestep, f"{type(network).__name__}")
         self.policy, self.value, self.steps = policy, value, int(steps)
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)

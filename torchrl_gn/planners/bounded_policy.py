@@ -56,7 +56,7 @@ class BoundedPolicy(TensorDictModuleBase):
 
     @abstractmethod
     def for_scene(self, scene: Scene) -> BoundedPolicy:
-        """The policy for a scene, sharing its weights; ValueError if it cannot drive it."""
+        """The policy for a scene, sharing its weights; ValueError if it cannot drive it or has another timestep."""
 
     @abstractmethod
     def unbounded(self, state: Tensor) -> Tensor:

@@ -75,7 +75,7 @@ class GraphStatePolicy(BoundedPolicy):
         return self.log_std[self.slots]
 
     def for_scene(self, scene: Scene) -> GraphStatePolicy:
-        """The same weights and statistics for another scene; ValueError if a body there has more actions."""
+        """The same weights and statistics for a scene of the same timestep; ValueError if a body has more actions."""
         if scene is self.scene:
             return self
         nodes, slots = _places(scene)
@@ -86,6 +86,7 @@ class GraphStatePolicy(BoundedPolicy):
         features = BodyFrameFeatures(scene, self.features.options).to(self.log_std.device)
         if features.size != self.features.size:
             raise ValueError(f"Scene {scene.name!r} has no yaw to leave out, as {self.scene.name!r} has, or only it.")
+        scene.require_timestep(self.scene.timestep, "The policy")
         features.node_normalizer, features.edge_normalizer = (
             self.features.node_normalizer,
             self.features.edge_normalizer,

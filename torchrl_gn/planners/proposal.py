@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_gn.finite import require_finite
+from torchrl_gn.scenes.scene import Scene
 
 _CONSTANT = ("task", "target")  # entries that a policy may read besides what an environment writes
 
@@ -26,6 +27,9 @@ def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env:
     elif not getattr(proposal, "fitted", True):
         raise ValueError(f"{type(proposal).__name__} has learned no policy yet: call fit_policy on it, or load one")
     else:
+        own, scene = getattr(proposal, "scene", None), getattr(env, "scene", None)
+        if isinstance(own, Scene) and isinstance(scene, Scene):
+            scene.require_timestep(own.timestep, f"{type(proposal).__name__}")
         known = {*env.observation_spec.keys(True), *env.state_spec.keys(True), *_CONSTANT}
         if unknown := [key for key in proposal.in_keys if key not in known]:
             raise ValueError(

@@ -45,6 +45,7 @@ class StatePolicy(BoundedPolicy):
     def for_scene(self, scene: Scene) -> StatePolicy:
         if scene.node_names != self.scene.node_names:
             raise ValueError(f"The policy is of scene {self.scene.name!r}, not {scene.name!r}.")
+        scene.require_timestep(self.scene.timestep, "The policy")
         return self
 
     def unbounded(self, state: Tensor) -> Tensor:

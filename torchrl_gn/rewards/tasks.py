@@ -160,7 +160,10 @@ class Effort(Reward):
         super().__init__()
         bounds = np.maximum(np.abs(scene.action_low), np.abs(scene.action_high))
         if not (np.isfinite(bounds).all() and (bounds > 0).all()):
-            raise ValueError(f"Effort needs bounded controls; scene {scene.name!r} has bounds {bounds.tolist()}.")
+            raise ValueError(
+                f"Effort needs bounded controls; scene {scene.name!r} has bounds {bounds.tolist()}: give its"
+                " actuators a ctrlrange, or load it with action_bounds=."
+            )
         self.shown = {"scene": scene.name}
         self.register_buffer("scale", torch.from_numpy(bounds))
 

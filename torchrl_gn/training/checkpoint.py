@@ -48,7 +48,7 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be used: missing, damaged, of a newer format, or not ours."""
 
 
-@dataclass
+@dataclass(repr=False)
 class Checkpoint:
     """What a checkpoint file holds."""
 
@@ -58,6 +58,11 @@ class Checkpoint:
     versions: dict  # of packages, likewise
     metrics: dict = field(default_factory=dict)
     training: dict = field(default_factory=dict)  # nested state to resume from
+
+    def __repr__(self) -> str:
+        scenes, own = [description["name"] for description in self.scene_descriptions], self.versions
+        made = f", torchrl_gn {own['torchrl_gn']}" if "torchrl_gn" in own else ""
+        return f"Checkpoint({type(self.trained).__name__}, scenes={scenes}, metrics={self.metrics}{made})"
 
     @property
     def model(self) -> ForwardModel:
@@ -86,7 +91,7 @@ class Checkpoint:
     def _as(self, kind: type[_Kind]) -> _Kind:
         if not isinstance(self.trained, kind):
             raise CheckpointError(
-                f"The checkpoint holds a {type(self.trained).__name__} (its attribute trained), not a {kind.__name__}."
+                f"The checkpoint's attribute trained is {type(self.trained).__name__}, no {kind.__name__}."
             )
         return self.trained
 
@@ -224,9 +229,10 @@ def load_pretrained(
 ) -> Checkpoint:
     """Load a trained model: one of :func:`pretrained_names`, or the path of a run folder or checkpoint file.
 
-    ``"./cheetah"`` is a folder that has the name of a model. The checkpoint's ``metrics`` hold the model's errors.
-    ``physics`` is the function that a forward model corrects; :class:`~torchrl_gn.dynamics.MujocoPhysics` rebuild
-    themselves. CheckpointError if there is no such source, or the file cannot be used; ValueError if it needs physics.
+    ``"./cheetah"`` is a folder that has the name of a model. The ``metrics`` of the package's models hold their
+    errors; those of a run are in its ``metrics.json``. ``physics`` is the function that a forward model corrects;
+    :class:`~torchrl_gn.dynamics.MujocoPhysics` rebuild themselves. CheckpointError if there is no such source, or the
+    file cannot be used; ValueError if it needs physics.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
