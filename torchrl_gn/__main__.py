@@ -73,9 +73,9 @@ def _models() -> str:
 
 
 def _show(source: str, image: str | None) -> str:
-    from torchrl_gn.scenes import load_scene
+    from torchrl_gn.scenes import SYSTEMS, load_scene
 
-    if Path(source).is_dir():
+    if Path(source).is_dir() and source not in SYSTEMS:
         from torchrl_gn.training import load_pretrained
 
         scene = load_pretrained(source).scene()

@@ -80,7 +80,7 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
     """
     if reward is not None:
         try:
-            inspect.signature(reward).bind(None, None, None, None)
+            inspect.signature(getattr(reward, "forward", reward)).bind(None, None, None, None)
         except TypeError:
             name = getattr(reward, "__qualname__", type(reward).__name__)
             raise TypeError(f"reward= must be a function of (state, action, next_state, task), {name} is not") from None
