@@ -62,7 +62,7 @@ class OffPolicyTrainer:
         evaluate_frames: environment steps between evaluations.
         target_interval: updates between copies to the target networks (paper: 1000).
         max_norm: norm that the joint gradient is clipped to.
-        compile: compile losses and gradients: minutes at the second update, then 1.6 to 1.9 times as fast. None: where
+        compile: compile losses and gradients: minutes at the second update, faster ones after it. None: where
             torch and a C++ compiler can.
         seed: seed of the replay buffer, and of the environments of a resumed run.
     """
