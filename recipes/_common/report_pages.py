@@ -73,7 +73,7 @@ def _claim_page(name: str, claim: Mapping[str, Any], data: Path) -> str:
         raise ValueError(f"verdict={claim['verdict']!r} must be one of {VERDICTS}.")
     if len(claim["text"]) > MOST_SENTENCES:
         raise ValueError(f"{len(claim['text'])} sentences of text; {MOST_SENTENCES} at most.")
-    qualified = f" {claim['qualified']}." if "qualified" in claim else ""
+    qualified = f" {_filled(claim['qualified'], claim, data)}." if "qualified" in claim else ""
     parts = [f"# {claim['title']}", claim["claim"], f"**Verdict: {claim['verdict']}.**{qualified}"]
     for figure in claim.get("figures", ()):
         parts.append(f"![{figure['caption']}](../images/{figure['file']})")

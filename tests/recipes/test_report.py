@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from _common.report_data import add_run, read_run
+from _common.report_data import DROPPED, INDEX, add_run, read_run
 from _common.report_drawing import _name_places, draw_figure
 from _common.report_figures import numbers, read_figures, stale_figures
 from _common.report_pages import fill_readme, make_pages, shown
@@ -122,6 +122,16 @@ def test_every_claim_has_a_picture():
     assert without == {"README", "tried-and-dropped"}
     pictures = list((REPORT.parent / "images" / "results").iterdir())
     assert max(file.stat().st_size for file in pictures) <= 40_000
+
+
+def test_every_row_of_a_table_quotes_a_run():
+    """Unless its table says where else its numbers are from."""
+    for file in sorted((REPORT / "data").glob("*.json")):
+        if file.name.endswith(".metrics.json") or file.stem in (INDEX, DROPPED):
+            continue
+        for table in json.loads(file.read_text())["tables"]:
+            typed = [row for row in table["rows"] if '"metric"' not in json.dumps(row)]
+            assert not typed or table.get("source") in ("published", "the other tables"), (file.name, typed)
 
 
 def test_a_run_is_added_with_its_command_and_versions(report, finished):
