@@ -90,10 +90,10 @@ def main(cfg: DictConfig) -> None:
         frames, returns = next(iter(of_seed.values()))["frames"], [curve["returns"] for curve in of_seed.values()]
         curves[name] = (frames, returns)
         cells = [name, str(len(done))]
-        halves = {seed: second_half(curve) for seed, curve in of_seed.items()}
         metrics |= {f"{name}/return/{at}": quartiles(list(each))[1] for at, *each in zip(frames, *returns, strict=True)}
-        halves_of[name] = list(halves.values())
-        metrics |= {f"{name}/second_half_return/seed {seed}": half for seed, half in halves.items()}
+        halves_of[name] = [second_half(curve) for curve in of_seed.values()]
+        halves = zip(of_seed, halves_of[name], strict=True)
+        metrics |= {f"{name}/second_half_return/seed {seed}": half for seed, half in halves}
         summed_up = {"second_half_return": halves_of[name]}
         summed_up |= {key: [values[key] for values in done.values()] for key in ("last_tenth_return", "best_return")}
         for key, values in summed_up.items():
