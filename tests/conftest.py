@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.maths import quaternion
 from torchrl_gn.networks import Graph, GraphSize
 from torchrl_gn.policies import ObservationModel

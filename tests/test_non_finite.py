@@ -22,7 +22,7 @@ from torchrl_gn.data import (
     trajectory_buffer,
 )
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, guarded_rollout, rollout, rollout_video
 from torchrl_gn.maths import Normalizer

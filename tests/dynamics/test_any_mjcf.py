@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.scenes import Scene, SceneError, load_scene
 
 from .. import zoo

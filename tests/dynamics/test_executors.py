@@ -116,5 +116,5 @@ def test_every_executor_is_the_reference(
             assert got.dtype == wanted.dtype and got.shape == wanted.shape
             assert (got - wanted).norm() <= BOUNDS[dtype] * wanted.norm()
         if executor == "native":
-            running = predictor.executor(parameters)
+            running = predictor.prepared(parameters).executor
             assert isinstance(running, NativeExecutor) and (running.reason is None) == (kind in ("gn", "mlp"))

@@ -14,7 +14,7 @@ from torchrl_gn.dynamics import BodyState, Controls, ForwardModel, JointAxes, Sp
 from torchrl_gn.dynamics.executors import NativeExecutor
 from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, batch_of
 from torchrl_gn.dynamics.features import Feature
-from torchrl_gn.dynamics.normalization import update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_parameter_normalizers
 from torchrl_gn.scenes import sample_variants
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 

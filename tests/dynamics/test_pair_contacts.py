@@ -14,7 +14,7 @@ from torchrl_gn.dynamics import BodyState, Contacts, Controls, ForwardModel, Joi
 from torchrl_gn.dynamics.executors import NativeExecutor, eager
 from torchrl_gn.dynamics.features import graph_edges
 from torchrl_gn.dynamics.features.pair_contacts import BoundPairContacts
-from torchrl_gn.dynamics.normalization import static_graph, update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import static_graph, update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene, sample_variants
 from torchrl_gn.scenes.contact_pairs import _configurations

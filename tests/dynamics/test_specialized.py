@@ -20,7 +20,7 @@ from torchrl_gn.dynamics import (
     UnseenParameterWarning,
     specialize,
 )
-from torchrl_gn.dynamics.normalization import dynamic_graph
+from torchrl_gn.dynamics.bound import dynamic_graph
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.evaluation import rollout
 from torchrl_gn.objectives import ForwardModelLoss

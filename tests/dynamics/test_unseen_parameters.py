@@ -11,7 +11,7 @@ from torchrl_gn.dynamics import (
     UnseenParameterWarning,
     specialize,
 )
-from torchrl_gn.dynamics.normalization import static_graph
+from torchrl_gn.dynamics.bound import static_graph
 from torchrl_gn.scenes import ParameterNames, load_scene
 from torchrl_gn.scenes.systems import find_system
 

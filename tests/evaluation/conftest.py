@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, Predictor
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes import load_scene
 

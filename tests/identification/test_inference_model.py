@@ -9,7 +9,7 @@ from torchrl.envs.utils import step_mdp
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.identification import IdentifyingModel, InferenceModel
 from torchrl_gn.networks import GNBlock, GraphSize, graph_concat

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchrl_gn.dynamics.normalization import dynamic_graph, static_graph
+from torchrl_gn.dynamics.bound import dynamic_graph, static_graph
 from torchrl_gn.networks import GNCore, Graph, GraphSize, Incidence, folded_gn_core, graph_concat
 from torchrl_gn.networks.fold_gn_core import fold_gn_core
 

@@ -12,7 +12,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import DDPGLoss, HardUpdate, ValueEstimators
 
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.objectives import SVGLoss
 from torchrl_gn.policies import Agent
 from torchrl_gn.rewards import make_reward

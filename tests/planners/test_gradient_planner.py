@@ -17,7 +17,7 @@ from torchrl.envs import StepCounter
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import FreezeGoal, make_reward

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import make_reward

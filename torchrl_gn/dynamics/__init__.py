@@ -1,7 +1,8 @@
 """Forward models: weights, predictors of one scene, and what executes their steps."""
 
 from torchrl_gn.dynamics.as_predictor import as_predictor as as_predictor
-from torchrl_gn.dynamics.checks import UnseenParameterWarning as UnseenParameterWarning
+from torchrl_gn.dynamics.bound import BoundPredictor as BoundPredictor
+from torchrl_gn.dynamics.bound import UnseenParameterWarning as UnseenParameterWarning
 from torchrl_gn.dynamics.export import export_c as export_c
 from torchrl_gn.dynamics.export import export_step as export_step
 from torchrl_gn.dynamics.features import BodyState as BodyState

@@ -23,9 +23,8 @@ from torchrl_gn.dynamics.features import (
     Wrenches,
     graph_edges,
 )
-from torchrl_gn.dynamics.normalization import DYNAMIC_FLOOR
+from torchrl_gn.dynamics.bound import DYNAMIC_FLOOR, BoundPredictor
 from torchrl_gn.dynamics.physics import as_physics, physics_from_description
-from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
 from torchrl_gn.networks.core import Core
@@ -43,7 +42,8 @@ _PARAMETER_LIMIT = 20.0
 class ForwardModel(nn.Module):
     """Weights of a forward model: features, core and normalisers (paper, "Forward models", SM "Forward prediction").
 
-    Knows no scene; :meth:`bind` joins it to one and gives the :class:`~torchrl_gn.dynamics.Predictor`. Any number of
+    Knows no scene; :meth:`bind` joins it to one and gives the 
+    :class:`~torchrl_gn.dynamics.BoundPredictor`. Any number of
     scenes share the same weights. :meth:`for_scene` builds one without typing a scene's facts.
 
     Args:
@@ -119,7 +119,6 @@ class ForwardModel(nn.Module):
         self.delta_normalizer = Normalizer(layout.delta_size, floor=DYNAMIC_FLOOR)
         kind = cast(Any, core_class(core))
         fixed = {"counts": counts} if kind.fixed_size else {}
-        self.casts = 0  # of the weights, which PyTorch counts as no change of them
         self.core: Core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
         if not hasattr(self.core, "hidden_size"):
             raise TypeError(f"{kind.__name__}.__init__ must call super().__init__(dynamic), as a Core does.")
@@ -147,10 +146,6 @@ class ForwardModel(nn.Module):
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)
-
-    def _apply(self, fn, recurse: bool = True):
-        self.casts += 1
-        return super()._apply(fn, recurse)
 
     @property
     def parameter_normalizers(self) -> dict[str, Normalizer]:
@@ -198,7 +193,7 @@ class ForwardModel(nn.Module):
         reference: bool = False,
         parameters_key: NestedKey | None = None,
         parameter_names: ParameterNames | None = None,
-    ) -> Predictor:
+    ) -> BoundPredictor:
         """Join these weights to a scene, or that of a name or path.
 
         Args:
@@ -214,7 +209,7 @@ class ForwardModel(nn.Module):
         """
         options = {"parameters_key": parameters_key, "parameter_names": parameter_names}
         with torch.device("cpu"):  # the scene's constants have numbers, also where weights are made on the meta device
-            return Predictor(self, as_scene(scene), strict=strict, reference=reference, **options)
+            return BoundPredictor(self, as_scene(scene), strict=strict, reference=reference, **options)
 
     def description(self) -> dict:
         """Plain, JSON-able values for :meth:`from_description`; ValueError if a feature is not in ``FEATURES``."""

@@ -2,142 +2,75 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from abc import abstractmethod
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchrl_gn.dynamics.checks import check_scene, check_shapes, warn_of_unseen
-from torchrl_gn.dynamics.constraints import make_projection
 from torchrl_gn.dynamics.executors import eager
-from torchrl_gn.dynamics.executors.eager import EagerExecutor
-from torchrl_gn.dynamics.executors.native import NativeDelta
-from torchrl_gn.dynamics.features.controls import ControlInputs
-from torchrl_gn.dynamics.features.feature import graph_edges
-from torchrl_gn.dynamics.normalization import in_range, scaled, static_graph
-from torchrl_gn.dynamics.parameters import ParameterReader
-from torchrl_gn.dynamics.program import Executor, StepProgram
-from torchrl_gn.finite import is_traced
-from torchrl_gn.networks.core import UnfoldedCore, dtype_of
+from torchrl_gn.dynamics.program import PreparedStep, StepProgram
+from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.networks.graph import Graph
-from torchrl_gn.networks.incidence import Incidence
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
-
-if TYPE_CHECKING:
-    from torchrl_gn.dynamics.model import ForwardModel
-    from torchrl_gn.scenes import ParameterNames, Scene
+from torchrl_gn.scenes.kinematic_tree import KinematicTree
+from torchrl_gn.scenes.scene import Scene
 
 
 class Predictor(TensorDictModuleBase):
-    """Predict the next state of one scene with a forward model's shared weights; made by :meth:`ForwardModel.bind`.
+    """Predict the next state of one scene: a :class:`BoundPredictor` or a :class:`SpecializedPredictor`.
 
     Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes ``("next", "state")`` in the dtype of ``state``;
-    the network sees recentred, normalised values in its own dtype. Differentiable in states, actions and weights.
+    the network sees recentred, normalised values in its own dtype.
 
     With a ``parameters_key`` each sample may be another variant of the scene: reads a TensorDict of the entries of
     :class:`~torchrl_gn.scenes.PhysicalParameters` there, from :meth:`parameters_of` or an inference model. Without one,
     samples with other parameters are refused. A model with ``parameters="none"`` or ``"inferred"`` never reads true
     parameters. A recurrent model also reads ``hidden_state``, a TensorDict ``[*B]`` of ``nodes``, ``edges`` and
     ``globals_``, by default the initial one, and writes ``("next", "hidden_state")``.
-
-    Options are those of :meth:`ForwardModel.bind`.
-
-    Raises:
-        ValueError: if the scene lacks parameters that the model reads, its graph has another size than the core reads,
-            or it is a variant whose parameters must be hidden from the model; or with ``strict``.
     """
 
-    model: ForwardModel
-    movable: Tensor
+    scene: Scene
+    layout: StateLayout
+    parameters_key: NestedKey | None
+    recurrent: bool  # whether a hidden state runs through the steps
+    fixed_batch = False  # whether another batch size costs a compilation
 
     def __init__(
         self,
-        model: ForwardModel,
         scene: Scene,
+        layout: StateLayout,
         *,
-        strict: bool = False,
-        reference: bool = False,
+        recurrent: bool,
         state_key: NestedKey = "state",
         action_key: NestedKey = "action",
         parameters_key: NestedKey | None = None,
-        parameter_names: ParameterNames | None = None,
     ) -> None:
         super().__init__()
-        self.parameters_key = parameters_key
-        hidden_keys = ["hidden_state"] if model.core.recurrent else []
+        self.scene, self.layout, self.recurrent, self.parameters_key = scene, layout, recurrent, parameters_key
+        hidden_keys = ["hidden_state"] if recurrent else []
         parameters_keys = [] if parameters_key is None else [parameters_key]
         self.in_keys: list[NestedKey] = [state_key, action_key, *parameters_keys, *hidden_keys]
         self.out_keys: list[NestedKey] = [unravel_key(("next", key)) for key in (state_key, *hidden_keys)]
-        check_scene(model, scene, varies=parameters_key is not None)
-        self.model, self.scene, self.layout = model, scene, model.layout
-        self.strict, self.reference = strict, reference
-        self.trainer: NativeDelta | None = None  # last training_executor() in C++
-
-        self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
-        predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
-        self.incidence = Incidence(graph_edges(scene, model.features), scene.num_nodes, predicted)
-        self.canonicalizer = model.canonicalizer.bind(scene, model.layout)
-        self.controls = ControlInputs(scene)
-        self.features = nn.ModuleDict({"nodes": nn.ModuleList(), "edges": nn.ModuleList()})
-        for feature in model.features:
-            bound = feature.bind(scene, model.layout, self.canonicalizer)
-            self.features[feature.part].append(bound)  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
-        # Bodies that rotate about one fixed point have nothing to project.
-        joined = scene.joint_anchors.root != np.arange(scene.num_nodes)
-        constrained = bool((scene.movable[:, :3].any(1) & joined).any())
-        # Anchors follow from lengths, which are hidden from a model of variants that does not read them.
-        hidden = parameters_key is not None and model.parameter_source == "none"
-        self.projection = make_projection(scene) if model.project and constrained and not hidden else None
-        self.parameter_reader = ParameterReader(
-            model, scene, parameters_key, project=self.projection is not None, brought=parameter_names
-        )
-        self.to(model.residual_normalizer.mean.device)
-        warn_of_unseen(self, self.scene_parameters, scene.name, stacklevel=4)
 
     @property
-    def scene_parameters(self) -> PhysicalParameters:
-        """The scene's physical parameters, without batch."""
-        return self.parameter_reader.own
-
-    @property
+    @abstractmethod
     def dtype(self) -> torch.dtype:
-        """Dtype of the network."""
-        return dtype_of(self.model.core)
+        """Dtype of the network's products."""
 
-    @property
-    def recurrent(self) -> bool:
-        """Whether a hidden state runs through the steps."""
-        return self.model.core.recurrent
-
-    @property
-    def fixed_batch(self) -> bool:
-        """Whether another batch size costs a compilation."""
-        return False
-
+    @abstractmethod
     def own_parameters(self) -> TensorDict:
         """Entry of the scene itself at the ``parameters_key``, without batch; zeros of an inferred graph."""
-        return self.parameter_reader.entries()
 
+    @abstractmethod
     def parameters_of(self, scene: Scene) -> TensorDict:
         """Physical parameters of a variant of this scene, for the ``parameters_key``; stack several for a batch.
 
         ValueError if it is another scene (other bodies, joints, motors or control step); ``strict`` holds here too.
         """
-        here, there = topology(self.scene), topology(scene)
-        differs = [what for what in here if here[what] != there[what]]
-        if differs:
-            raise ValueError(
-                f"Scene {scene.name!r} is no variant of {self.scene.name!r}: {', '.join(differs)} differ."
-                " Bind the model to it instead."
-            )
-        values = self.model.parameters_of(scene)
-        warn_of_unseen(self, values, scene.name, stacklevel=3)
-        return self.parameter_reader.of(scene, values)
 
+    @abstractmethod
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """Physical parameters that samples bring; None where they are the scene's own or the model reads none.
 
@@ -145,21 +78,49 @@ class Predictor(TensorDictModuleBase):
             KeyError: if the model reads them and they are missing.
             ValueError: if the model does not read them and they are not its scene's.
         """
-        return self.parameter_reader.find(tensordict)
+
+    @abstractmethod
+    def initial_hidden_state(self) -> TensorDict | None:
+        """Initial hidden state of a recurrent model, without batch; None of others."""
+
+    @abstractmethod
+    def program(self, parameters: TensorDictBase | None = None) -> StepProgram:
+        """The step as data."""
+
+    @abstractmethod
+    def prepared(self, parameters: TensorDictBase | None = None, *, size: int = 1) -> PreparedStep:
+        """The step with what runs it, for any number of steps of the same samples.
+
+        Args:
+            parameters: physical parameters of each sample, or without batch; default: the scene's.
+            size: steps of samples to come, which decide what pays.
+        """
+
+    @abstractmethod
+    def training_squares(self) -> dict[str, Tensor]:
+        """Mean square ``[]`` of each component of a state that adds up, in training; 0 if it is not known."""
+
+    @abstractmethod
+    def recentered(self, states: Tensor) -> Tensor:
+        """States ``[*B, N, 13]`` about their scene's centre, along axes of translation invariance."""
 
     def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """Hidden state that samples bring to a recurrent model; None: the initial one."""
         return tensordict.get("hidden_state", None) if self.recurrent else None
 
     def in_range(self, states: Tensor, limit: float) -> Tensor:
-        """Which states ``[*B, N, 13]`` are finite and within ``limit`` times training's range, ``[*B]``."""
-        return in_range(self, states, limit)
+        """Which states ``[*B, N, 13]`` are finite and within ``limit`` times training's range, ``[*B]``.
 
-    def initial_hidden_state(self) -> TensorDict | None:
-        """Initial hidden state of a recurrent model, without batch; None of others."""
-        if not self.recurrent:
-            return None
-        return self.model.core.start(static_graph(self, self.scene_parameters)).tensordict()
+        In range: every body's distance from its scene's centre, and its speeds, are below ``limit`` times the root mean
+        square of training.
+        """
+        good = states.isfinite().flatten(-2).all(-1)
+        states = self.recentered(states)
+        for name, square in self.training_squares().items():
+            # Without statistics, as before training, there is nothing to compare with.
+            largest = torch.where(square > 0, limit**2 * square, torch.inf)
+            good &= (states[..., self.layout.slices[name]].square().sum(-1) <= largest).all(-1)
+        return good
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase, *_: Tensor, **__: Tensor) -> TensorDictBase:
@@ -168,64 +129,6 @@ class Predictor(TensorDictModuleBase):
         after, hidden = self.step(state, action, self.parameters_in(tensordict), self.hidden_state_in(tensordict))
         tensordict.set(self.out_keys[0], after)
         return tensordict if hidden is None else tensordict.set(self.out_keys[1], hidden)
-
-    def program(
-        self, parameters: TensorDictBase | None = None, *, reference: bool = False, reduced: bool = False
-    ) -> StepProgram:
-        """The step as it is now, differentiable in the weights.
-
-        The ``reference`` does not fold the core; ``reduced`` leaves out features that never vary.
-        """
-        model, values = self.model, self.parameter_reader.read(parameters)
-        static, unfolded = static_graph(self, values), self.reference or reference
-        core = UnfoldedCore(model.core, static) if unfolded else model.core.fold(self.incidence, static)
-        # All components: a loss of weights that are not finite is not finite.
-        rows = torch.arange(model.residual_normalizer.size, device=self.movable.device) if reduced else None
-        core, nodes, edges, output = scaled(self, core, rows)
-        return StepProgram(
-            **self.constants(),
-            parameters=values,
-            nodes=nodes,
-            edges=edges,
-            recurrent=model.core if self.recurrent else None,
-            static=static if self.recurrent else None,
-            core=core,
-            output=output,
-            change_std=model.delta_normalizer.std,
-            dtype=self.dtype,
-            physics=model.physics,
-        )
-
-    def constants(self) -> dict:
-        """Those parts of a program that follow from the scene alone."""
-        return {
-            "layout": self.layout,
-            # Physics know how rates integrate.
-            "timestep": float(self.scene.timestep) if self.model.integrate and self.model.physics is None else None,
-            "movable": self.movable,
-            "edge_index": self.incidence.edge_index,
-            "canonicalizer": self.canonicalizer,
-            "controls": self.controls,
-            "node_features": self.features["nodes"],
-            "edge_features": self.features["edges"],
-            "projection": self.projection,
-        }
-
-    def executor(self, parameters: TensorDictBase | None = None) -> Executor:
-        """What runs the step, for one or many steps of the same samples."""
-        return EagerExecutor(self.program(parameters))
-
-    def training_executor(self, parameters: TensorDictBase | None = None) -> EagerExecutor | NativeDelta:
-        """What predicts changes by its ``delta``, differentiable in states, actions and weights."""
-        # What is traced cannot ask which features vary; C++ has no gradient in parameters of physics.
-        if is_traced() or (self.model.physics is not None and self.model.physics.trained):
-            return EagerExecutor(self.program(parameters))
-        program = self.program(parameters, reduced=True)
-        if self.trainer is None:
-            self.trainer = NativeDelta(program)
-        else:
-            self.trainer = self.trainer.update(program)
-        return self.trainer
 
     def step(
         self,
@@ -243,7 +146,8 @@ class Predictor(TensorDictModuleBase):
             hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
         """
         check_shapes(self.scene, state, action, parameters)
-        after, hidden = self.executor(parameters).step(state, action, self._graph(hidden_state))
+        step = self.prepared(parameters, size=state.shape[:-2].numel())
+        after, hidden = step.step(state, action, self._graph(hidden_state))
         return after, None if hidden is None else hidden.tensordict()
 
     def rollout(
@@ -259,7 +163,8 @@ class Predictor(TensorDictModuleBase):
         """
         for action in actions[..., :1, :].unbind(-2):
             check_shapes(self.scene, state, action, parameters)
-        states, hidden = self.executor(parameters).rollout(state, actions, self._graph(hidden_state))
+        step = self.prepared(parameters, size=actions.shape[:-1].numel())
+        states, hidden = step.rollout(state, actions, self._graph(hidden_state))
         return states, None if hidden is None else hidden.tensordict()
 
     def teacher_forced(
@@ -273,9 +178,9 @@ class Predictor(TensorDictModuleBase):
             if parameters is not None and parameters.ndim:
                 parameters = parameters.unsqueeze(-1).expand(actions.shape[:-1])
             return self.step(states, actions, parameters)
-        hidden, predictions, executor = None, [], self.executor(parameters)
+        hidden, predictions, step = None, [], self.prepared(parameters, size=actions.shape[:-1].numel())
         for state, action in zip(states.unbind(-3), actions.unbind(-2), strict=True):
-            predicted, hidden = executor.step(state, action, hidden)
+            predicted, hidden = step.step(state, action, hidden)
             predictions.append(predicted)
         assert hidden is not None
         return torch.stack(predictions, dim=-3), hidden.tensordict()
@@ -283,16 +188,50 @@ class Predictor(TensorDictModuleBase):
     def delta(self, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> Tensor:
         """Predicted change ``[*B, N, 12]``, zero in fixed components; from a recurrent model's initial hidden state."""
         check_shapes(self.scene, state, action, parameters)
-        return eager.delta(self.executor(parameters).program, state, action)[0]
+        return eager.delta(self.program(parameters), state, action)[0]
+
+    @property
+    @abstractmethod
+    def _edge_index(self) -> Tensor:
+        """``[2, E]``."""
 
     def _graph(self, hidden_state: TensorDictBase | None) -> Graph | None:
         if hidden_state is None:
             return None
         nodes, edges, globals_ = (hidden_state[part] for part in ("nodes", "edges", "globals_"))
-        return Graph(nodes, edges, globals_, self.incidence.edge_index)
-
-    def __getstate__(self) -> dict:
-        return {**super().__getstate__(), "trainer": None}  # a copy packs for itself
+        return Graph(nodes, edges, globals_, self._edge_index)
 
     def extra_repr(self) -> str:
         return f"scene={self.scene.name!r}"
+
+
+def require_bound(model: object) -> None:
+    """TypeError for a model of any scene, which predicts only once it is bound to one."""
+    if hasattr(model, "bind"):
+        raise TypeError(f"{type(model).__name__} is not bound to a scene: use model.bind(scene).")
+
+
+def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> None:
+    """ValueError unless states are ``[*B, N, C]``, actions ``[*B, A]``, and parameters have that batch or none."""
+    batch, wanted = state.shape[:-2], [scene.num_nodes, scene.state_size]
+    if list(state.shape[-2:]) != wanted:
+        raise ValueError(
+            f"State of scene {scene.name!r} must be [*B, {', '.join(map(str, wanted))}], got {list(state.shape)}."
+        )
+    if action.shape != (*batch, scene.num_actions):
+        raise ValueError(
+            f"Action of scene {scene.name!r} must be {[*batch, scene.num_actions]} to go with a state"
+            f" {list(state.shape)}, got {list(action.shape)}.{_past_commands(scene, action)}"
+        )
+    if parameters is not None and parameters.shape not in ((), batch):
+        raise ValueError(
+            f"Physical parameters must have no batch or that of the state, {list(batch)}, got {list(parameters.shape)}."
+        )
+
+
+def _past_commands(scene: Scene, action: Tensor) -> str:
+    """What to do if an action may hold other numbers of past commands than a robot's tree."""
+    commands = scene.num_actions // (scene.history + 1) if isinstance(scene, KinematicTree) else 0
+    if not commands or action.shape[-1] % commands:
+        return ""
+    return f" If it holds past commands, give log_tree(..., history={action.shape[-1] // commands - 1})."

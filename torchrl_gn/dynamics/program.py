@@ -1,9 +1,10 @@
-"""The description of one scene's prediction step: what every executor runs."""
+"""The description of one scene's prediction step, and what every executor is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -80,15 +81,17 @@ class OutputScaling(NamedTuple):
 class StepProgram:
     """One scene's prediction step: state maths, folded network, constraint projection.
 
-    Made by :meth:`Predictor.program` and run by the executors in :mod:`~torchrl_gn.dynamics.executors`. Constants of
-    the scene are modules with buffers; a program of a specialised predictor shares no memory with the weights.
+    Made by :meth:`Predictor.program`: a value, whose tensors executors (:mod:`~torchrl_gn.dynamics.executors`) take as
+    arguments at every call. Constants of the scene are tensors and modules with buffers.
     """
 
     layout: StateLayout  # channels of the state
     timestep: float | None  # control step, seconds, to integrate the rates; None: they are not
     movable: Tensor  # [N, 12] movable-component mask
     edge_index: Tensor  # [2, E]
-    parameters: PhysicalParameters  # physical parameters of the scene, or of each sample
+    reference: Tensor  # [N, C] float64, the scene's reference pose, at rest
+    standard: PhysicalParameters  # physical parameters of the scene
+    parameters: PhysicalParameters  # the same, or of each sample
     canonicalizer: BoundCanonicalizer  # to the canonical state and back
     controls: ControlInputs  # actions to edges
     node_features: nn.ModuleList  # modules from StepInputs to node features
@@ -100,29 +103,102 @@ class StepProgram:
     core: FoldedCore  # the folded network
     output: OutputScaling  # scaling of its output
     projection: MaximalProjection | None  # onto the joint constraints; None without
-    change_std: Tensor  # [12] standard deviations of a change, weights of the projection
+    position_weight: Tensor | None  # [] float64, of the projection: a squared metre against a squared radian
     dtype: torch.dtype  # of the network
     physics: Physics | None = None  # whose prediction the network corrects; None without
 
 
+def numbers_of(program: StepProgram) -> list[Tensor]:
+    """The model's numbers that the state maths reads: means and scales of network inputs and outputs, and a weight.
+
+    Training changes them; all else that the state maths reads is the scene's.
+    """
+    parts = [*program.nodes[1:], *program.edges[1:], *(program.output[1:] if program.output.runs is None else ())]
+    return [part for part in (*parts, program.position_weight) if part is not None]
+
+
+def with_numbers(program: StepProgram, numbers: Iterable[Tensor]) -> StepProgram:
+    """The program with other :func:`numbers_of`, in their order."""
+    given = iter(numbers)
+
+    def changed(scaling: Any) -> Any:
+        return scaling._replace(**{
+            name: next(given) for name in scaling._fields[1:] if getattr(scaling, name) is not None
+        })
+
+    return replace(
+        program,
+        nodes=changed(program.nodes),
+        edges=changed(program.edges),
+        output=changed(program.output) if program.output.runs is None else program.output,
+        position_weight=None if program.position_weight is None else next(given),
+    )
+
+
+def structure_key(program: StepProgram) -> tuple:
+    """What tells the structures of one scene's programs apart: programs of equal keys differ in numbers alone."""
+    tensors = [program.nodes.columns, program.edges.columns]
+    if program.output.runs is not None:  # components that never varied keep their mean
+        tensors.append(program.output.mean)
+    if program.physics is not None:
+        tensors += [*program.physics.parameters(), *program.physics.buffers()]
+    numbers = tuple(None if each is None else each.detach().cpu().numpy().tobytes() for each in tensors)
+    varies, count = [], 1
+    for given, own in zip(program.parameters, program.standard, strict=True):
+        if given is own:
+            continue
+        batch = given.shape[: given.ndim - own.ndim]
+        varies.append((given != own).flatten(0, len(batch) - 1).any(0) if batch else given != own)
+        count = max(count, batch.numel())
+    masks = tuple(each.cpu().numpy().tobytes() for each in varies)
+    return repr(program.output.runs), program.dtype, numbers, masks, count > 1
+
+
 class Executor(Protocol):
-    """What runs a program; made from it, ``EXECUTORS[name](program)``."""
+    """Runs the programs of one structure: made from one of them, ``EXECUTORS[name](program)``.
 
-    program: StepProgram
+    It keeps what follows from the scene and the network's shape (compiled code, traces) and no number that training
+    changes: those come with the program, as :meth:`pack` prepares it.
+    """
+
     fixed_batch: bool  # whether another batch size costs a compilation
-    runs_all: bool  # whether its constructor refuses no program
+    reason: str | None  # why it runs by torch operations after all, for print
 
-    def update(self, program: StepProgram) -> Executor:
-        """What runs another program of the same scene: this executor, or one that shares with it what it can."""
+    def pack(self, program: StepProgram) -> StepProgram:
+        """The program in the form that the other methods take, differentiable in the weights if these are."""
         ...
 
-    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+    def step(
+        self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
         """Next state ``[*B, N, 13]`` and hidden state of a state and an action ``[*B, A]``."""
         ...
 
-    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+    def rollout(
+        self, program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
         """States ``[*B, T + 1, N, 13]`` from a start state under actions ``[*B, T, A]``, and the last hidden state."""
         ...
+
+
+@dataclass(frozen=True)
+class PreparedStep:
+    """A packed program with what runs it, for one or many steps of the same samples."""
+
+    executor: Executor
+    program: StepProgram
+
+    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        """As :meth:`Executor.step`."""
+        return self.executor.step(self.program, state, action, hidden)
+
+    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        """As :meth:`Executor.rollout`."""
+        return self.executor.rollout(self.program, state, actions, hidden)
+
+    def delta(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+        """Predicted change ``[*B, N, 12]``, differentiable in the weights too, and hidden state."""
+        return cast(Any, self.executor).delta(self.program, state, action, hidden)
 
 
 def _runs(rows: list[int], size: int) -> tuple[tuple[bool, slice], ...]:

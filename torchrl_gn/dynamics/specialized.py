@@ -1,104 +1,104 @@
-"""A predictor from a snapshot of its weights, without what the scene does not need."""
+"""A predictor that is a value: a snapshot of the weights, without what the scene does not need."""
 
 from __future__ import annotations
 
 import copy
-import itertools
-import threading
 import warnings
-from typing import Any, NamedTuple
-
+from dataclasses import replace
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from torchrl_gn.dynamics import operators
-from torchrl_gn.dynamics.checks import UnseenParameterWarning, require_bound
-from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor
-from torchrl_gn.dynamics.executors.native.binding import load_binding, make_plan
-from torchrl_gn.dynamics.normalization import scaled, static_graph
-from torchrl_gn.dynamics.physics import Physics
-from torchrl_gn.dynamics.predictor import Predictor
-from torchrl_gn.dynamics.program import Executor, InputScaling, StepProgram
-from torchrl_gn.dynamics.watched import Watched, is_same, version_of
+from torchrl_gn.dynamics.bound import BoundPredictor, UnseenParameterWarning, static_graph
+from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor, NativeExecutor
+from torchrl_gn.dynamics.predictor import Predictor, check_shapes, require_bound
+from torchrl_gn.dynamics.program import Executor, InputScaling, PreparedStep, StepProgram, structure_key
+from torchrl_gn.dynamics.snapshot import Snapshot
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
-from torchrl_gn.networks.snapshot import snapshot
+from torchrl_gn.networks.tensor_tree import in_dtype
 from torchrl_gn.processor import SlowDtypeWarning, product_speeds
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters
-
-_TAKING = threading.Lock()  # one thread takes a snapshot, others wait for it
-
-
-class _Snapshot(NamedTuple):
-    """What runs the step, and what it was made of."""
-
-    executor: Executor
-    weights: Watched
-    casts: int  # of the model, before them
-    given: dict[str, tuple[Tensor, int]]  # parameters of samples, and how often each was changed
+from torchrl_gn.scenes.scene import Scene
 
 
 class SpecializedPredictor(Predictor):
     """Predictor with everything constant in its scene folded away; made by :func:`specialize`.
 
-    Predicts what the given predictor predicts, from a *snapshot* of its weights and normalisers, made again when one of
-    them has changed (an optimiser step, ``load_state_dict``, ``to``). A change through ``.data``, which PyTorch does
-    not count, goes unseen: call :meth:`refresh`. Differentiable in states and actions, never in weights. Native
-    gradients are of first order; that in a component of the state that cannot move is that of copying it. Reads and
-    writes the same keys. ``print`` shows what was skipped and what runs it. ``torch.compile`` takes steps and rollouts
-    as operators.
+    A value: it predicts what the given predictor predicted when it was made, and never changes by itself. Its folded
+    weights are its buffers and its only copy, so what is done to a module (``to``, ``load_state_dict``, copies, pickles,
+    shared memory, a collector's weight update, ``functional_call``) is done to the model. After training,
+    :meth:`refresh` takes the new weights, in place.
 
-    Samples with parameters of their own (``parameters_key``) are folded once, and again for others: give a rollout's
-    steps the same tensors. No gradient flows to them.
+    Differentiable in states and actions, never in weights. Native gradients are of first order; that in a component of
+    the state that cannot move is that of copying it. Reads and writes the keys of the given predictor. ``print`` shows
+    what was skipped and what runs it. ``torch.compile`` takes native steps and rollouts as operators.
+
+    With a ``parameters_key`` it keeps a copy of the weights instead, which it folds for the samples' parameters at each
+    call; :meth:`prepared` folds once for many. No gradient flows to the parameters.
     """
 
-    def __init__(self, predictor: Predictor, *, executor: str = "native", dtype: torch.dtype | None = None) -> None:
+    def __init__(
+        self, predictor: BoundPredictor, *, executor: str = "native", dtype: torch.dtype | None = None
+    ) -> None:
         state_key, action_key = predictor.in_keys[:2]
-        with warnings.catch_warnings():  # the predictor has warned
-            warnings.simplefilter("ignore", UnseenParameterWarning)
-            super().__init__(
-                predictor.model,
-                predictor.scene,
-                state_key=state_key,
-                action_key=action_key,
-                parameters_key=predictor.parameters_key,
-                parameter_names=predictor.parameter_reader.brought,
-            )
-        self.strict, self.executor_name = predictor.strict, executor
-        self._dtype = dtype
-        self._taken: _Snapshot | None = None
-        self._plan: Any = None  # of a single step, if it can be called without ctypes
-        self.number = operators.register(self)
-        # Refuse now what the executor cannot run, not at the first step.
-        if not getattr(EXECUTORS[executor], "runs_all", True):
-            self.executor()
-
-    def __getstate__(self) -> dict:
-        # A copy folds and compiles for itself.
-        return {**super().__getstate__(), "_taken": None, "_plan": None}
-
-    def __setstate__(self, state: dict) -> None:
-        super().__setstate__(state)
-        self.number = operators.register(self)
+        keys = {"state_key": state_key, "action_key": action_key, "parameters_key": predictor.parameters_key}
+        super().__init__(predictor.scene, predictor.layout, recurrent=predictor.recurrent, **keys)
+        self.executor_name = executor
+        self.snapshot: Snapshot | None = None
+        self.source: BoundPredictor | None = None  # of which each call folds the core
+        self._executors: dict[tuple, Executor] = {}  # by the structures they run
+        # Tensors made in inference mode could be neither overwritten nor differentiated outside.
+        with torch.inference_mode(False), torch.no_grad():
+            self._products = dtype or predictor.dtype
+            program = _folded(predictor, None, self._products)
+            self._key = structure_key(program)
+            self.executor = self._executors[self._key] = EXECUTORS[executor](program)
+            if predictor.parameters_key is None:
+                self.snapshot = Snapshot(self.executor.pack(program))
+                self.reader = copy.deepcopy(predictor.parameter_reader)
+            else:
+                self.source = _frozen_copy(predictor)
+            squares = predictor.training_squares()
+            self._squares = tuple(squares)
+            self.register_buffer("squares", torch.stack([*squares.values(), torch.zeros_like(program.reference[0, 0])]))
+        self._skipped = _skipped(predictor, program)
 
     @property
     def dtype(self) -> torch.dtype:
-        """Dtype of the products."""
-        return self._dtype or dtype_of(self.model.core)
+        return self._products if self.snapshot is None else self.snapshot.dtype
 
     @property
-    def fixed_batch(self) -> bool:
-        return getattr(EXECUTORS[self.executor_name], "fixed_batch", False)
+    def fixed_batch(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.executor.fixed_batch
 
-    def refresh(self) -> None:
-        """Take a new snapshot of the weights at the next step."""
-        if self._taken is not None:
-            self._taken = self._taken._replace(weights=Watched([]))
-        self._plan = None
+    @property
+    def reason(self) -> str | None:
+        """Why torch operations run it although it is native; None if they do not."""
+        return self.executor.reason
+
+    @torch.no_grad()
+    def refresh(self, predictor: BoundPredictor) -> None:
+        """Take the weights of a model bound to the same scene, in place: whoever shares its memory sees them.
+
+        Raises:
+            ValueError: if the model has another form: other layers or, after :func:`fit_normalizers`, other features
+                that vary.
+        """
+        with torch.inference_mode(False):
+            program = _folded(predictor, None, self._products)
+            if structure_key(program) != self._key or predictor.scene is not self.scene:
+                raise ValueError(
+                    f"{type(self).__name__} of {self.scene.name!r} cannot take these weights: the model is bound to"
+                    " another scene object, or other features vary in its training. Specialise it anew."
+                )
+            if self.snapshot is not None:
+                self.snapshot.load(self.executor.pack(program))
+            else:
+                assert self.source is not None
+                self.source.model.load_state_dict(predictor.model.state_dict())
+            self.squares[: len(self._squares)] = torch.stack(list(predictor.training_squares().values()))
 
     def step(
         self,
@@ -107,152 +107,130 @@ class SpecializedPredictor(Predictor):
         parameters: TensorDictBase | None = None,
         hidden_state: TensorDictBase | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
-        if parameters is not None or hidden_state is not None or torch.compiler.is_compiling():
-            return super().step(state, action, parameters, hidden_state)
-        if self._plan is not None and (after := load_binding().step(self._plan, state, action)) is not None:
-            return after, None
-        out = super().step(state, action)
-        taken = self._taken
-        if self._plan is None and taken is not None and not taken.given:
-            self._plan = make_plan(taken.executor, self.scene, taken.weights, taken.casts, vars(self.model))
-        return out
+        after = None
+        if parameters is None and hidden_state is None:
+            after = self._native(state, action, False)
+        return super().step(state, action, parameters, hidden_state) if after is None else (after, None)
 
-    def executor(self, parameters: TensorDictBase | None = None) -> Executor:
-        """What runs the step, from a snapshot of the weights as they are now.
+    def rollout(
+        self,
+        state: Tensor,
+        actions: Tensor,
+        parameters: TensorDictBase | None = None,
+        hidden_state: TensorDictBase | None = None,
+    ) -> tuple[Tensor, TensorDict | None]:
+        states = None
+        if parameters is None and hidden_state is None:
+            states = self._native(state, actions, True)
+        return super().rollout(state, actions, parameters, hidden_state) if states is None else (states, None)
 
-        Within ``torch.compile`` steps and rollouts are operators; with parameters of samples, or a hidden state, they
-        fold in the compiled code, which then follows the weights.
-        """
-        if torch.compiler.is_compiling():
-            if parameters is None and not self.recurrent:
-                return operators.OperatorExecutor(self)  # pyright: ignore[reportReturnType]
-            with torch.no_grad():
-                return EagerExecutor(super().program(parameters))
-        taken = self._taken  # once: another thread may take a snapshot for other weights or parameters
-        if taken is None or not self._is_current(taken, parameters):
-            with _TAKING:
-                taken = self._taken
-                if taken is None or not self._is_current(taken, parameters):
-                    self._taken = taken = self._take(parameters)
-        return taken.executor
+    def _native(self, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
+        """Result of the operator, without the program around it, which takes longer than a step of one state."""
+        snapshot, executor = self._modules["snapshot"], self.executor
+        if snapshot is None or type(executor) is not NativeExecutor or executor.reason is not None:
+            return None
+        if many and actions.ndim > 1 and not actions.shape[-2]:
+            return None
+        check_shapes(self.scene, state, actions[..., 0, :] if many else actions)
+        packed = snapshot._buffers
+        numbers = packed["core_weights"], packed["core_tables"], None, packed["core_numbers"]
+        return executor.call(*numbers, state, actions, many)
 
-    def _take(self, parameters: TensorDictBase | None) -> _Snapshot:
-        """A snapshot of the weights as they are now."""
-        modules = list(self.model.modules())
-        owners: list[dict[str, Any]] = [module._parameters for module in modules]
-        owners += [module._buffers for module in modules]
-        weights = itertools.chain.from_iterable(owner.values() for owner in owners)
-        if any(one is not None and is_functorch_wrapped_tensor(one) for one in weights):
-            raise TypeError(
-                "A specialised model has a snapshot of its weights, which torch.func cannot exchange: stack or"
-                " differentiate the bound model."
-            )
-        watched, casts = Watched(owners), self.model.casts  # before they are read: another thread may change them
-        # Tensors made in inference mode could be neither overwritten nor differentiated outside.
-        with torch.inference_mode(False), torch.no_grad():
-            program = self.program(parameters)
-            if self._taken is None:
-                executor = EXECUTORS[self.executor_name](program)
-            else:
-                executor = self._taken.executor.update(program)
-        self._plan = None
-        # Views that share the storage keep it alive: no other tensor can come to lie at its address.
-        given = {} if parameters is None else {str(name): value for name, value in parameters.items()}
-        kept = {name: (value.detach(), version_of(value)) for name, value in given.items()}
-        return _Snapshot(executor, watched, casts, kept)
+    def program(self, parameters: TensorDictBase | None = None) -> StepProgram:
+        """The step as data, packed for its executor."""
+        return self.prepared(parameters).program
 
-    def _is_current(self, taken: _Snapshot, parameters: TensorDictBase | None) -> bool:
-        model = self._modules["model"]  # not self.model: torch looks that up in a microsecond
-        if not taken.weights.unchanged() or model.casts != taken.casts:  # pyright: ignore[reportOptionalMemberAccess]
-            return False
-        if parameters is None:
-            return not taken.given
-        given = dict(parameters.items())
-        return given.keys() == taken.given.keys() and all(
-            is_same(given[str(name)], *kept) for name, kept in taken.given.items()
-        )
+    def prepared(self, parameters: TensorDictBase | None = None, *, size: int = 1) -> PreparedStep:
+        if self.snapshot is not None:
+            if parameters is not None:
+                raise ValueError("Samples bring parameters: bind with parameters_key, then specialise.")
+            return PreparedStep(self.executor, self.snapshot.program())
+        assert self.source is not None
+        with torch.no_grad():
+            program = _folded(self.source, parameters, self._products)
+            if torch.compiler.is_compiling():  # a compiler sees the fold
+                return PreparedStep(EagerExecutor(program), program)
+            key = structure_key(program)
+            if (executor := self._executors.get(key)) is None:
+                executor = self._executors[key] = EXECUTORS[self.executor_name](program)
+            return PreparedStep(executor, executor.pack(program))
 
-    def program(
-        self, parameters: TensorDictBase | None = None, *, reference: bool = False, reduced: bool = True
-    ) -> StepProgram:
-        """Snapshot of the step, without features and components that never vary; whole as the ``reference``."""
-        if reference:
-            return super().program(parameters, reference=True)
-        values = PhysicalParameters(*(value.detach().clone() for value in self.parameter_reader.read(parameters)))
-        # In float64, so that folding loses nothing.
-        core = copy.deepcopy(self.model.core).double()
-        folded = core.fold(self.incidence, static_graph(self, values, torch.float64))
-        rows = (self.movable.any(0) & ~self.model.residual_normalizer.constant).nonzero().flatten()
-        folded, nodes, edges, output = scaled(self, folded, rows if reduced else None)
-        return StepProgram(
-            **self.constants(),
-            parameters=values,
-            nodes=_copied(nodes),
-            edges=_copied(edges),
-            recurrent=snapshot(core, self.dtype) if core.recurrent else None,
-            static=static_graph(self, values, self.dtype) if core.recurrent else None,
-            core=snapshot(folded, self.dtype),
-            output=_copied(output),
-            change_std=self.model.delta_normalizer.std.clone(),
-            dtype=self.dtype,
-            physics=_frozen(self.model.physics),
-        )
+    @property
+    def scene_parameters(self):
+        """The scene's physical parameters, without batch."""
+        return self._reader.own
+
+    @property
+    def _reader(self):
+        return self.reader if self.source is None else self.source.parameter_reader
+
+    @property
+    def _edge_index(self) -> Tensor:
+        return self.snapshot.get("edge_index") if self.snapshot is not None else self.source._edge_index  # pyright: ignore
+
+    def own_parameters(self) -> TensorDict:
+        return self._reader.entries()
+
+    def parameters_of(self, scene: Scene) -> TensorDict:
+        if self.source is None:
+            raise ValueError("The model is of one scene: bind with parameters_key, then specialise.")
+        return self.source.parameters_of(scene)
+
+    def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        return self._reader.find(tensordict)
+
+    def initial_hidden_state(self) -> TensorDict | None:
+        if not self.recurrent:
+            return None
+        program = self.program()
+        assert program.recurrent is not None and program.static is not None
+        return program.recurrent.start(program.static).tensordict()
+
+    def recentered(self, states: Tensor) -> Tensor:
+        if self.source is not None:
+            return self.source.recentered(states)
+        assert self.snapshot is not None
+        return self.snapshot.get("canonicalizer").recentered(states)
+
+    def training_squares(self) -> dict[str, Tensor]:
+        return dict(zip(self._squares, self.squares, strict=False))
 
     def skipped(self) -> dict[str, tuple[float, float]]:
         """What one prediction handles in the reference model, and here."""
-        program, core, size = self.executor().program, self.model.core, self.model.dynamic_size
-        nodes, edges = self.scene.num_nodes, self.incidence.num_edges
-        static = static_graph(self, self.scene_parameters, dtype_of(core))
-        kept_nodes, kept_edges = _width(program.nodes, size.nodes), _width(program.edges, size.edges)
+        return dict(self._skipped)
 
-        def graph(nodes_: int, edges_: int, dtype: torch.dtype) -> Graph:
-            def empty(*shape: int) -> Tensor:
-                return torch.zeros(1, *shape, dtype=dtype, device=self.movable.device)
-
-            dynamic = Graph(empty(nodes, nodes_), empty(edges, edges_), empty(0), self.incidence.edge_index)
-            return graph_concat(dynamic, dynamic.zeros(core.hidden_size)) if core.recurrent else dynamic
-
-        with FlopCounterMode(display=False) as plain, torch.no_grad():
-            core(graph_concat(graph(size.nodes, size.edges, dtype_of(core)), static))
-        with FlopCounterMode(display=False) as quick, torch.no_grad():
-            program.core.predict(graph(kept_nodes, kept_edges, self.dtype))
-        rows = {
-            "node features": (size.nodes + static.nodes.shape[-1], kept_nodes),
-            "edge features": (size.edges + static.edges.shape[-1], kept_edges),
-            "global features": (static.globals_.shape[-1], 0),
-            "nodes predicted": (nodes, len(self.incidence.predicted)),
-        }
-        if program.output.runs is not None:
-            moved = sum(where.stop - where.start for varies, where in program.output.runs if varies)
-            rows["components predicted"] = (self.layout.delta_size, moved)
-        if isinstance(program.core, FoldedGNCore):
-            rows["edges of the second block"] = (edges, program.core.gather.shape[0])
-        return {**rows, "kFLOP": (plain.get_total_flops() / 1e3, quick.get_total_flops() / 1e3)}
+    def _apply(self, fn, recurse: bool = True):
+        squares = self.squares
+        super()._apply(fn, recurse)
+        if self.squares.dtype != squares.dtype:
+            self.squares = squares.to(self.squares.device)
+        return self
 
     def __str__(self) -> str:
         """Table of what was skipped."""
         name = str(self.dtype).removeprefix("torch.")
-        reason = getattr(self.executor(), "reason", None)
-        how = self.executor_name if reason is None else f"{self.executor_name}, but here by torch: {reason}"
+        how = self.executor_name if self.reason is None else f"{self.executor_name}, but here by torch: {self.reason}"
         lines = [f"Forward model of {self.scene.name}, specialised, {name}, {how}"]
         lines.append(f"  {'':26}{'plain':>10}{'here':>10}")
-        for what, (plain, here) in self.skipped().items():
+        for what, (plain, here) in self._skipped.items():
             lines.append(f"  {what:26}{plain:10,.0f}{here:10,.0f}")
         return "\n".join(lines)
 
 
 def specialize(
-    predictor: Predictor, *, executor: str = "native", dtype: torch.dtype | None = None
+    predictor: BoundPredictor, *, executor: str = "native", dtype: torch.dtype | None = None
 ) -> SpecializedPredictor:
     """Fold everything that a scene does not need out of its forward model.
 
     The result predicts the same with fewer operations: static features and biases become tables, adjacent linear layers
     are merged, features, components, nodes and edges that do not matter are left out. A core without
-    :meth:`~torchrl_gn.networks.Core.fold` is evaluated as it is.
+    :meth:`~torchrl_gn.networks.Core.fold` is evaluated as it is. It is a snapshot: :meth:`SpecializedPredictor.refresh`
+    takes weights that training has changed.
 
     Args:
+        predictor: a model bound to a scene.
         executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"native"`` runs steps, rollouts and their
-            gradients in C++ that is built once, 20 s, and kept; where it cannot (a GPU, a recurrent core, float16, no
+            gradients in C++ that is built once, a minute, and kept; where it cannot (a GPU, a recurrent core, float16, no
             compiler), as ``"eager"``, and ``print`` says why. ``"eager"`` runs torch operations anywhere.
             ``"compiled"``, for GPUs and what native cannot run, compiles at the first call with every new shape: half a
             minute, minutes for a gradient.
@@ -263,10 +241,13 @@ def specialize(
     Raises:
         FileNotFoundError: to compile for a CPU without a C++ compiler.
         RuntimeError: to compile with a torch before 2.13.
-        TypeError: to compile a core that is evaluated by message passing.
+        TypeError: if the model is not bound or specialised already, or to compile a core that is evaluated by message
+            passing.
         ValueError: if the executor is not known.
     """
     require_bound(predictor)
+    if not isinstance(predictor, BoundPredictor):
+        raise TypeError(f"specialize() takes a bound model, not {type(predictor).__name__}: use model.bind(scene).")
     if executor not in EXECUTORS:
         raise ValueError(f"executor={executor!r} is not known; use one of {list(EXECUTORS)}.")
     if dtype is not None and predictor.movable.device.type == "cpu" and not product_speeds().pays(dtype):
@@ -279,17 +260,64 @@ def specialize(
     return SpecializedPredictor(predictor, executor=executor, dtype=dtype)
 
 
+def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype: torch.dtype) -> StepProgram:
+    """Snapshot of the step in a dtype, without features and components that never vary."""
+    # In float64, so that folding loses nothing.
+    core = copy.deepcopy(predictor.model.core).double().requires_grad_(False)
+    rows = (predictor.movable.any(0) & ~predictor.model.residual_normalizer.constant).nonzero().flatten()
+    program = predictor.program(parameters, reference=False, reduced=True, rows=rows, core=core)
+    changed = {name: in_dtype(getattr(program, name), dtype) for name in ("core", "recurrent", "static")}
+    return replace(program, dtype=dtype, **changed)
+
+
+def _frozen_copy(predictor: BoundPredictor) -> BoundPredictor:
+    """The predictor with a copy of the weights, in float64, so that folding loses nothing."""
+    model = copy.deepcopy(predictor.model).requires_grad_(False)
+    model.core.double()
+    state_key, action_key = predictor.in_keys[:2]
+    with warnings.catch_warnings():  # the predictor has warned
+        warnings.simplefilter("ignore", UnseenParameterWarning)
+        return BoundPredictor(
+            model,
+            predictor.scene,
+            state_key=state_key,
+            action_key=action_key,
+            parameters_key=predictor.parameters_key,
+            parameter_names=predictor.parameter_reader.brought,
+        )
+
+
+def _skipped(predictor: BoundPredictor, program: StepProgram) -> dict[str, tuple[float, float]]:
+    """What one prediction handles in the reference model, and in a program."""
+    core, size = predictor.model.core, predictor.model.dynamic_size
+    nodes, edges = predictor.scene.num_nodes, predictor.incidence.num_edges
+    static = static_graph(predictor, predictor.scene_parameters, dtype_of(core))
+    kept_nodes, kept_edges = _width(program.nodes, size.nodes), _width(program.edges, size.edges)
+
+    def graph(nodes_: int, edges_: int, dtype: torch.dtype) -> Graph:
+        def empty(*shape: int) -> Tensor:
+            return torch.zeros(1, *shape, dtype=dtype, device=predictor.movable.device)
+
+        dynamic = Graph(empty(nodes, nodes_), empty(edges, edges_), empty(0), predictor.incidence.edge_index)
+        return graph_concat(dynamic, dynamic.zeros(core.hidden_size)) if core.recurrent else dynamic
+
+    with FlopCounterMode(display=False) as plain, torch.no_grad():
+        core(graph_concat(graph(size.nodes, size.edges, dtype_of(core)), static))
+    with FlopCounterMode(display=False) as quick, torch.no_grad():
+        program.core.predict(graph(kept_nodes, kept_edges, program.dtype))
+    rows = {
+        "node features": (size.nodes + static.nodes.shape[-1], kept_nodes),
+        "edge features": (size.edges + static.edges.shape[-1], kept_edges),
+        "global features": (static.globals_.shape[-1], 0),
+        "nodes predicted": (nodes, len(predictor.incidence.predicted)),
+    }
+    if program.output.runs is not None:
+        moved = sum(where.stop - where.start for varies, where in program.output.runs if varies)
+        rows["components predicted"] = (predictor.layout.delta_size, moved)
+    if isinstance(program.core, FoldedGNCore):
+        rows["edges of the second block"] = (edges, program.core.gather.shape[0])
+    return {**rows, "kFLOP": (plain.get_total_flops() / 1e3, quick.get_total_flops() / 1e3)}
+
+
 def _width(inputs: InputScaling, full: int) -> int:
     return full if inputs.columns is None else len(inputs.columns)
-
-
-def _frozen(physics: Physics | None) -> Physics | None:
-    """The physics, or a copy of those that are trained."""
-    if physics is None or not physics.trained:
-        return physics
-    return copy.deepcopy(physics).requires_grad_(False)
-
-
-def _copied(scaling: Any) -> Any:
-    """The same named tuple with copies of its tensors."""
-    return type(scaling)(*(part.detach().clone() if isinstance(part, Tensor) else part for part in scaling))

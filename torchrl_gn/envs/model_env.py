@@ -18,7 +18,7 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.drawing import draw_states
 from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
-from torchrl_gn.dynamics.checks import require_bound
+from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.envs.specs import (
     DoneFunction,
     RewardFunction,

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_gn.dynamics import as_predictor
-from torchrl_gn.dynamics.checks import require_bound
+from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
 from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout
 from torchrl_gn.finite import require_finite

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchrl_gn.dynamics import ForwardModel, Predictor
 from torchrl_gn.dynamics.constraints import AnchorEstimator
-from torchrl_gn.dynamics.normalization import dynamic_graph, residual
+from torchrl_gn.dynamics.bound import dynamic_graph, residual
 from torchrl_gn.networks.gn_block import GNBlock
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat, graph_split
 from torchrl_gn.scenes import Scene

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchrl_gn.networks.linear import ACTIVATIONS
-
 NODES, EDGES, FIRST = 0, 1, 2  # buffers: node inputs, edge inputs, output of the first layer
 
 
@@ -60,26 +58,6 @@ class LayerList:
     nodes: tuple[int, int]  # N, F_n
     edges: tuple[int, int]  # E, F_e
     layers: tuple[LinearLayer, ...]
-
-    def code(self) -> Tensor:
-        """All but weights and tables, int64 numbers in a row, as ``native/network.h`` reads them.
-
-        ``N, F_n, E, F_e, number of layers``, then for each layer ``I, out, activation, number of inputs, number of
-        added`` and for each of the inputs, then of the added, ``source, offsets (I + 1), items``. The activation is 0
-        for none or 1 + its place in :data:`ACTIVATIONS`.
-        """
-        code = [*self.nodes, *self.edges, len(self.layers)]
-        for layer in self.layers:
-            activation = 0 if layer.activation is None else 1 + list(ACTIVATIONS).index(layer.activation)
-            code += [layer.count, len(layer.weight), activation, len(layer.inputs), len(layer.added)]
-            for gather in (*layer.inputs, *layer.added):
-                code += [gather.source, *gather.offsets.tolist(), *gather.items.tolist()]
-        return torch.tensor(code, device="cpu")
-
-    def tensors(self) -> tuple[list[Tensor], list[Tensor | None]]:
-        """Weights and tables of all layers, contiguous."""
-        weights = [layer.weight.contiguous() for layer in self.layers]
-        return weights, [None if layer.table is None else layer.table.contiguous() for layer in self.layers]
 
 
 class LayerBuilder:

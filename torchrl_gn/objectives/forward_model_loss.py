@@ -12,12 +12,11 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor
-from torchrl_gn.dynamics.checks import check_shapes, require_bound
-from torchrl_gn.dynamics.executors.eager import EagerExecutor
-from torchrl_gn.dynamics.executors.native import NativeDelta
+from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor
+from torchrl_gn.dynamics.predictor import check_shapes, require_bound
+from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.dynamics.features.controls import present_actions
-from torchrl_gn.dynamics.normalization import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.objectives.checks import read_entries, require_fitted
@@ -72,14 +71,14 @@ class ForwardModelLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
 
-    model: Predictor
+    model: BoundPredictor
     noise_scale: Tensor
     error_weight: Tensor
     channel_scale: Tensor | None
 
     def __init__(
         self,
-        model: Predictor,
+        model: BoundPredictor,
         *,
         noise: float = 0.0,
         generator: torch.Generator | None = None,
@@ -123,9 +122,10 @@ class ForwardModelLoss(LossModule):
         return self.model.model
 
     @property
-    def native(self) -> bool:
-        """Whether the last loss was computed in C++."""
-        return (trainer := self.model.trainer) is not None and trainer.reason is None
+    def reason(self) -> str | None:
+        """Why a loss of this model's scene is computed by torch operations; None if in C++."""
+        with torch.no_grad():
+            return self.model.prepared_for_training().executor.reason
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         pass
@@ -199,10 +199,10 @@ class ForwardModelLoss(LossModule):
         layout, steps = self.model.layout, state.shape[1]
         current, hidden = self.perturb(state[:, 0]), None
         errors = state.new_zeros(len(layout.components))
-        executor = self.model.training_executor(parameters)
+        prepared = self.model.prepared_for_training(parameters)
         for step in range(steps):
             target = layout.delta(current, next_state[:, step])
-            delta, hidden = executor.delta(current, action[:, step], hidden)
+            delta, hidden = prepared.delta(current, action[:, step], hidden)
             errors = errors + self.component_errors(delta, target)
             if step + 1 < steps:
                 teacher_forced = step + 1 < self.teacher_forced_steps
@@ -213,12 +213,12 @@ class ForwardModelLoss(LossModule):
         movable = torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
         loss = errors.sum() / movable.sum().clamp(min=1)
         if self.residual_weight:
-            correction = self._correction(executor, state, action).sum() / movable.sum().clamp(min=1)
+            correction = self._correction(prepared, state, action).sum() / movable.sum().clamp(min=1)
             loss = loss + self.residual_weight * correction
         out = {f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)}
         return TensorDict({"loss_forward_model": loss, **out}, [])
 
-    def _correction(self, executor: EagerExecutor | NativeDelta, state: Tensor, action: Tensor) -> Tensor:
+    def _correction(self, prepared: PreparedStep, state: Tensor, action: Tensor) -> Tensor:
         """Squared correction of the physics by component, in states ``[B, H, N, 13]`` under each other's actions."""
         state, action = state.flatten(0, 1), action.flatten(0, 1)
         device = state.device if self.generator is None else self.generator.device
@@ -230,7 +230,7 @@ class ForwardModelLoss(LossModule):
         physics = self.trained.physics
         assert physics is not None
         after = physics(state, action[..., : present_actions(self.model.scene)]).to(state.dtype)
-        return self.component_errors(executor.delta(state, action)[0], self.model.layout.delta(state, after))
+        return self.component_errors(prepared.delta(state, action)[0], self.model.layout.delta(state, after))
 
     def _require_noise_scale(self) -> None:
         noise = self.noise or (self.residual_noise if self.residual_weight else 0.0)

@@ -52,17 +52,17 @@ class SeveralScenesLoss(LossModule):
         return self.of_scenes[0].trained
 
     @property
-    def native(self) -> bool:
-        """Whether the last losses of all scenes were computed in C++."""
-        return all(loss.native for loss in self.of_scenes)
-
-    @property
     def in_keys(self) -> list:
         return list(dict.fromkeys(key for loss in self.of_scenes for key in loss.in_keys))
 
     @property
     def out_keys(self) -> list[str]:
         return [*self.of_scenes[0].out_keys, *(f"scene_{name}" for name in self.names)]
+
+    @property
+    def reason(self) -> str | None:
+        """Why torch operations compute the loss of some scene; None if C++ computes all."""
+        return next((loss.reason for loss in self.of_scenes if loss.reason is not None), None)
 
     def fit_normalizers(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> None:
         """Fit all scales and the model's normalisers to thousands of clean transitions ``[B]`` of each scene."""

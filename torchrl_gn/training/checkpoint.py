@@ -20,7 +20,7 @@ from torch import Tensor
 
 import torchrl_gn
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.dynamics import ForwardModel, Predictor
+from torchrl_gn.dynamics import BoundPredictor, ForwardModel
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue
 from torchrl_gn.policies import Agent
@@ -69,7 +69,7 @@ class Checkpoint:
         """The forward model; CheckpointError if it is another kind of model."""
         return self._as(ForwardModel)
 
-    def bind(self, scene: Scene | str | os.PathLike, **options) -> Predictor:
+    def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundPredictor:
         """The forward model joined to a scene, see :meth:`ForwardModel.bind`."""
         return self.model.bind(scene, **options)
 
@@ -123,7 +123,7 @@ def package_versions() -> dict[str, str]:
 
 def save_checkpoint(
     path: str | os.PathLike,
-    model: Trained | Predictor,
+    model: Trained | BoundPredictor,
     *,
     scene: Scene | Sequence[Scene] = (),
     config: Mapping[str, Any] | None = None,
@@ -143,11 +143,11 @@ def save_checkpoint(
         TypeError: if no checkpoint can hold the model.
     """
     scenes = list(scene) if isinstance(scene, Sequence) else [scene]
-    if isinstance(model, Predictor):
+    if isinstance(model, BoundPredictor):
         model, scenes = model.model, scenes or [model.scene]
     kind = next((name for name, kind in KINDS.items() if isinstance(model, kind)), None)
     if kind is None:
-        kinds = ", ".join(cast(type, each).__name__ for each in (Predictor, *KINDS.values()))
+        kinds = ", ".join(cast(type, each).__name__ for each in (BoundPredictor, *KINDS.values()))
         raise TypeError(f"A checkpoint cannot hold a {type(model).__name__}; give one of {kinds}.")
     tensors: dict[str, Tensor] = {}
     plain = _flatten(training or {}, "training", tensors)

@@ -10,8 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_gn.dynamics.executors.native import NoCompilerError, muon_update
-
 # Odd quintics (linear, cubic, quintic), each optimal after the one before for singular values in [0.002, 1] (N. Amsel
 # et al., "The Polar Express", 2025). Four of them reach [0.68, 1.32], like five of Muon's usual equal ones.
 _POLYNOMIALS = (
@@ -56,12 +54,7 @@ class Muon(torch.optim.Optimizer):
                 if not self.state[parameter]:
                     self.state[parameter]["momentum_buffer"] = torch.zeros_like(parameter)
             moments = [self.state[parameter]["momentum_buffer"] for parameter in parameters]
-            try:
-                rest = muon_update(parameters, moments, group["momentum"], group["lr"], _POLYNOMIALS)
-            except NoCompilerError:
-                rest = list(range(len(parameters)))
-            if rest:
-                self._update([parameters[i] for i in rest], [moments[i] for i in rest], group)
+            self._update(parameters, moments, group)
         return loss
 
     def _update(self, parameters: Sequence[Tensor], moments: Sequence[Tensor], group: dict[str, Any]) -> None:

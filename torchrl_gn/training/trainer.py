@@ -94,8 +94,8 @@ class Trainer:
         FloatingPointError, and no change, if the loss or the gradient is not finite.
         """
         module, fraction = self.workers.wrap(self.loss), self.workers.agree(lambda: self.fraction)
+        native = getattr(self.loss, "reason", "no forward model") is None
         while fraction < 1 and (self.patience is None or self.since_best < self.patience):
-            native = getattr(self.loss, "native", False)
             with fast_matmul(), threads_for_native() if native else nullcontext():
                 loss = self._update(module, fraction)
             fraction = self.workers.agree(lambda: self.fraction)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection, position_weight
+from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes.physical_parameters import joint_axes
@@ -69,11 +69,11 @@ class GeneralizedProjection(MaximalProjection):
         self._two_stages = bool((stage == 1).any())
 
     def forward(
-        self, state: Tensor, matrices: Tensor, delta: Tensor, std: Tensor, parameters: PhysicalParameters
+        self, state: Tensor, matrices: Tensor, delta: Tensor, weight: Tensor, parameters: PhysicalParameters
     ) -> Tensor:
         """Nearest change of joint angles and rates; arguments and result as of :class:`MaximalProjection`."""
         at, to = BODY_STATE.slices, BODY_STATE.delta_slices
-        weight = position_weight(std).to(state.dtype)
+        weight = weight.to(state.dtype)
         position = state[..., at["position"]] + delta[..., to["position"]]
         velocity = state[..., at["linear_velocity"]] + delta[..., to["linear_velocity"]]
         angular = state[..., at["angular_velocity"]] + delta[..., to["angular_velocity"]]

@@ -67,7 +67,7 @@ class MaximalProjection(Float64Buffers):
         self.constants({"offset_jacobian": jacobian[self.used_offsets][:, self.moved_rows].flatten(1)})
 
     def forward(
-        self, state: Tensor, matrices: Tensor, delta: Tensor, std: Tensor, parameters: PhysicalParameters
+        self, state: Tensor, matrices: Tensor, delta: Tensor, weight: Tensor, parameters: PhysicalParameters
     ) -> Tensor:
         """Nearest change that keeps the joint anchors together.
 
@@ -75,7 +75,7 @@ class MaximalProjection(Float64Buffers):
             state: ``[*B, N, 13]``.
             matrices: ``[*B, N, 3, 3]`` of its orientations.
             delta: ``[*B, N, 12]`` predicted change.
-            std: ``[12]`` standard deviation of each component of a change.
+            weight: ``[]`` :func:`position_weight`.
             parameters: the anchor offsets are read.
 
         Returns:
@@ -91,7 +91,7 @@ class MaximalProjection(Float64Buffers):
         offsets, implied = self.forward_kinematics(state, before, rotation, spin)
         jacobian = self.jacobian(offsets)
         residual = self._residual(predicted, implied)[..., self.moved_rows].mT
-        weighted = position_weight(std).to(state.dtype) * jacobian.mT
+        weighted = weight.to(state.dtype) * jacobian.mT
         normal = weighted @ jacobian + torch.eye(jacobian.shape[-1], dtype=state.dtype, device=state.device)
         # At least the identity: never singular.
         solved, _ = torch.linalg.solve_ex(normal, weighted @ residual)
@@ -155,7 +155,7 @@ class MaximalProjection(Float64Buffers):
 
 
 def position_weight(std: Tensor) -> Tensor:
-    """Weight of a squared metre against a squared radian."""
+    """Weight ``[]`` of a squared metre against a squared radian, by the ``[12]`` standard deviations of a change."""
     return std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Callable, Collection, Sequence
-from functools import partial
+import operator
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.networks.core import UnfoldedCore
 from torchrl_gn.networks.graph import Graph
-from torchrl_gn.networks.snapshot import copy_into
+from torchrl_gn.networks.tensor_tree import leaves, rebuild, skeleton
 
 
 class CompiledExecutor:
@@ -31,7 +31,7 @@ class CompiledExecutor:
         TypeError: of a core that is evaluated by message passing, or physics outside torch.
     """
 
-    fixed_batch, runs_all = True, False
+    fixed_batch, reason = True, None
 
     def __init__(self, program: StepProgram) -> None:
         check_compiling(program.movable.device)
@@ -40,64 +40,74 @@ class CompiledExecutor:
             raise TypeError(f"{kind} has no fold() and is evaluated by message passing: use executor='eager'.")
         if program.physics is not None and program.physics.outside:
             raise TypeError("The physics run outside torch, which cannot compile them: use executor='eager'.")
-        self.version = 0
-        self._load(program)
+        self._compiled: _Compiled | None = None
 
-    def _load(self, program: StepProgram) -> None:
-        self.program = program
-        run, pull = _functions(program) if program.recurrent is None else _recurrent_functions(program)
+    def __getstate__(self) -> dict:
+        return {"_compiled": None}  # a copy compiles for itself
+
+    def pack(self, program: StepProgram) -> StepProgram:
+        return program
+
+    def step(
+        self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        inputs = [state, action]
+        if program.recurrent is not None:
+            hidden = _start(program, state, action) if hidden is None else hidden
+            inputs += hidden.features
+        if self._compiled is None or not self._compiled.runs(program):
+            self._compiled = _Compiled(program)
+        functions, tensors = self._compiled, [leaf for _, leaf in leaves(program) if isinstance(leaf, Tensor)]
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+            after, *rest = _Differentiable.apply(functions, len(inputs), *inputs, *tensors)
+        else:
+            after, *rest = detached(functions.run, *inputs, *tensors)
+        return after, Graph(rest[0], rest[1], rest[2], program.edge_index) if rest else None
+
+    def rollout(
+        self, program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        states = [state]
+        for action in actions.unbind(-2):
+            state, hidden = self.step(program, state, action, hidden)
+            states.append(state)
+        return torch.stack(states, dim=-3), hidden
+
+
+def _start(program: StepProgram, state: Tensor, action: Tensor) -> Graph:
+    """Initial hidden state of a recurrent program."""
+    assert program.recurrent is not None
+    canonical = eager.canonical_state(program, state, action)
+    return program.recurrent.start(eager.dynamic_graph(program, canonical, action))
+
+
+class _Compiled:
+    """Compiled functions of state, action, hidden features and all tensors of a program; its modules are constants."""
+
+    def __init__(self, program: StepProgram) -> None:
+        self._modules = [leaf for _, leaf in leaves(program) if not isinstance(leaf, Tensor)]
+        of, kinds = skeleton(program), [isinstance(leaf, Tensor) for _, leaf in leaves(program)]
+        modules, dynamic = self._modules, 2 if program.recurrent is None else 5
+
+        def run(*inputs: Tensor) -> tuple[Tensor, ...]:
+            tensors, others = iter(inputs[dynamic:]), iter(modules)
+            now: StepProgram = rebuild(of, (next(tensors) if kind else next(others) for kind in kinds))
+            hidden = None if dynamic == 2 else Graph(*inputs[2:5], now.edge_index)
+            after, hidden = eager.step(now, inputs[0], inputs[1], hidden)
+            return (after,) if hidden is None else (after, *hidden.features)
+
+        def pull(*inputs: Tensor) -> tuple[Tensor, ...]:
+            count = len(kinds) - len(modules)
+            end = len(inputs) - count  # dynamic inputs, gradients, tensors
+            rest = inputs[end:]
+            return torch.func.vjp(lambda *some: run(*some, *rest), *inputs[:dynamic])[1](inputs[dynamic:end])
+
         self.run, self.pull = _compile(run), _compile(pull)
 
-    def update(self, program: StepProgram) -> CompiledExecutor:
-        """Take another program: without compiling again if only its numbers differ."""
-        self.version += 1
-        if not copy_into(self.program, program):
-            self._load(program)
-        return self
-
-    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        inputs = [state, action]
-        if self.program.recurrent is not None:
-            hidden = self._start(state, action) if hidden is None else hidden
-            inputs += hidden.features
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
-            after, *rest = _Differentiable.apply(self, *inputs)
-        else:
-            after, *rest = detached(self.run, *inputs)
-        return after, Graph(rest[0], rest[1], rest[2], self.program.edge_index) if rest else None
-
-    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        return eager.rollout_by_steps(self, state, actions, hidden)
-
-    def _start(self, state: Tensor, action: Tensor) -> Graph:
-        program = self.program
-        assert program.recurrent is not None
-        canonical = eager.canonical_state(program, state, action)
-        return program.recurrent.start(eager.dynamic_graph(program, canonical, action))
-
-
-def _functions(program: StepProgram) -> tuple[Callable, Callable]:
-    def run(state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-        return (eager.step(program, state, action, None)[0],)
-
-    def pull(state: Tensor, action: Tensor, *gradients: Tensor) -> tuple[Tensor, ...]:
-        return torch.func.vjp(run, state, action)[1](gradients)
-
-    return run, pull
-
-
-def _recurrent_functions(program: StepProgram) -> tuple[Callable, Callable]:
-    def run(state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor) -> tuple[Tensor, ...]:
-        after, hidden = eager.step(program, state, action, Graph(nodes, edges, globals_, program.edge_index))
-        assert hidden is not None
-        return after, *hidden.features
-
-    def pull(
-        state: Tensor, action: Tensor, nodes: Tensor, edges: Tensor, globals_: Tensor, *gradients: Tensor
-    ) -> tuple[Tensor, ...]:
-        return torch.func.vjp(run, state, action, nodes, edges, globals_)[1](gradients)
-
-    return run, pull
+    def runs(self, program: StepProgram) -> bool:
+        """Whether the program has these modules."""
+        modules = [leaf for _, leaf in leaves(program) if not isinstance(leaf, Tensor)]
+        return len(modules) == len(self._modules) and all(map(operator.is_, modules, self._modules))
 
 
 def detached(function: Callable, *inputs: Tensor) -> Any:
@@ -108,23 +118,23 @@ def detached(function: Callable, *inputs: Tensor) -> Any:
 
 class _Differentiable(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, executor: CompiledExecutor, *inputs: Tensor) -> tuple[Tensor, ...]:
-        ctx.executor, ctx.version = executor, executor.version
+    def forward(ctx, functions: _Compiled, count: int, *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.functions, ctx.count = functions, count
         ctx.save_for_backward(*inputs)
-        return detached(executor.run, *inputs)
+        return detached(functions.run, *inputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *gradients: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        if ctx.version != ctx.executor.version:
-            raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
-        return None, *detached(ctx.executor.pull, *ctx.saved_tensors, *gradients)
+        inputs, tensors = ctx.saved_tensors[: ctx.count], ctx.saved_tensors[ctx.count :]
+        found = detached(ctx.functions.pull, *inputs, *gradients, *tensors)
+        return None, None, *found, *(None for _ in tensors)
 
 
 def _compile(function: Callable) -> Callable:
     # Small linear systems are solved through Python's fallback, of which the compiler warns.
     logging.getLogger("torch._inductor.ir").addFilter(_is_worth_showing)
-    options: dict[str, Any] = {"guard_filter_fn": partial(_input_guards, inspect.signature(function).parameters)}
+    options: dict[str, Any] = {"guard_filter_fn": _input_guards}
     if not torch.cuda.is_available():
         # The kernels of a small graph take less time than calling them from Python.
         options["cpp_wrapper"] = True
@@ -132,12 +142,12 @@ def _compile(function: Callable) -> Callable:
     return torch.compile(function, fullgraph=True, dynamic=False, options=options, **limits)
 
 
-def _input_guards(inputs: Collection[str], guards: Sequence[Any]) -> list[bool]:
+def _input_guards(guards: Sequence[Any]) -> list[bool]:
     """Check at each call only shapes, dtypes and devices of the inputs.
 
-    All else that the function reads belongs to one program; checking it takes longer than a step of a small graph.
+    All else that the function reads belongs to one structure; checking it takes longer than a step of a small graph.
     """
-    return [guard.guard_type == "TENSOR_MATCH" and guard.name in inputs for guard in guards]
+    return [guard.guard_type == "TENSOR_MATCH" and guard.name.startswith("inputs") for guard in guards]
 
 
 def _is_worth_showing(record: logging.LogRecord) -> bool:

@@ -8,7 +8,7 @@ from torch.nn.functional import pad
 
 from torchrl_gn.dynamics.features.canonical_state import CanonicalState
 from torchrl_gn.dynamics.features.feature import StepInputs
-from torchrl_gn.dynamics.program import Executor, StepProgram
+from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.maths import quaternion
 from torchrl_gn.networks.graph import Graph, graph_concat
 
@@ -16,34 +16,29 @@ from torchrl_gn.networks.graph import Graph, graph_concat
 class EagerExecutor:
     """Interpret a program operation by operation; differentiable in all that the program is."""
 
-    fixed_batch, runs_all = False, True
+    fixed_batch, reason = False, None
 
     def __init__(self, program: StepProgram) -> None:
-        self.program = program
+        pass  # any structure
 
-    def update(self, program: StepProgram) -> EagerExecutor:
-        return type(self)(program)
+    def pack(self, program: StepProgram) -> StepProgram:
+        return program
 
-    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        return step(self.program, state, action, hidden)
+    def step(
+        self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        return step(program, state, action, hidden)
 
-    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        return rollout_by_steps(self, state, actions, hidden)
+    def rollout(
+        self, program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        return rollout(program, state, actions, hidden)
 
-    def delta(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
+    def delta(
+        self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
         """As :func:`delta`."""
-        return delta(self.program, state, action, hidden)
-
-
-def rollout_by_steps(
-    executor: Executor, state: Tensor, actions: Tensor, hidden: Graph | None
-) -> tuple[Tensor, Graph | None]:
-    """States ``[*B, T + 1, N, 13]`` of an executor's steps under actions ``[*B, T, A]``, and the last hidden state."""
-    states = [state]
-    for action in actions.unbind(-2):
-        state, hidden = executor.step(state, action, hidden)
-        states.append(state)
-    return torch.stack(states, dim=-3), hidden
+        return delta(program, state, action, hidden)
 
 
 def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> CanonicalState:
@@ -112,11 +107,25 @@ def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predi
         # Without a rotation the canonical state's matrices are the world's.
         matrices = canonical.matrices if canonical.rotation is None else program.canonicalizer.matrices(state)
         assert matrices is not None
-        change = program.projection(state, matrices, change, program.change_std, program.parameters)
+        assert program.position_weight is not None
+        change = program.projection(state, matrices, change, program.position_weight, program.parameters)
     return change
 
 
-def step(program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None) -> tuple[Tensor, Graph | None]:
+def step(
+    program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+) -> tuple[Tensor, Graph | None]:
     """Next state ``[*B, N, 13]`` and hidden state."""
     change, hidden = delta(program, state, action, hidden)
     return program.layout.apply(state, change), hidden
+
+
+def rollout(
+    program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
+) -> tuple[Tensor, Graph | None]:
+    """States ``[*B, T + 1, N, 13]`` under actions ``[*B, T, A]``, and the last hidden state."""
+    states = [state]
+    for action in actions.unbind(-2):
+        state, hidden = step(program, state, action, hidden)
+        states.append(state)
+    return torch.stack(states, dim=-3), hidden

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import functools
 import hashlib
 import os
@@ -13,7 +12,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,12 +21,11 @@ import torch
 from filelock import FileLock
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.processor import cache_folder, processor_flags, processor_name
+from torchrl_gn.processor import cache_folder
 
 L = TypeVar("L")
 
 SOURCES = sorted(path for path in Path(__file__).parent.iterdir() if path.suffix in (".h", ".cpp"))
-_OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno", "-pthread")
 
 
 class NoCompilerError(FileNotFoundError):
@@ -39,32 +38,18 @@ def find_compiler() -> list[str] | None:
     return command if command and shutil.which(command[0]) else None
 
 
-def load_code() -> ctypes.CDLL:
-    """The compiled code, built at the first use on a processor and kept in ``~/.cache/torchrl_gn`` (20 s).
+def load(
+    name: str,
+    what: str,
+    sources: Mapping[str, Sequence[str]],
+    link: Sequence[str],
+    parts: Sequence[str],
+    opened: Callable[[Path], L],
+) -> L:
+    """What ``opened`` makes of the library of sources beside this file, built where none is kept.
 
-    Raises:
-        NoCompilerError: without a working C++ compiler (``CXX``, which may have arguments, else c++, g++ or clang++).
-    """
-    found = _library_or_reason()
-    if isinstance(found, str):
-        raise NoCompilerError(found)
-    return found
-
-
-@functools.cache
-def _library_or_reason() -> ctypes.CDLL | str:
-    try:
-        options = [*_OPTIONS, *instruction_flags(), *shlex.split(os.environ.get("TORCHRL_GN_CXXFLAGS", ""))]
-        parts = (processor_name(), processor_flags())
-        return load("native.cpp", "the native executor", options, parts, lambda file: ctypes.CDLL(str(file)))
-    except (OSError, ValueError) as error:
-        return str(error)
-
-
-def load(source: str, what: str, options: Sequence[str], parts: Sequence[str], opened: Callable[[Path], L]) -> L:
-    """What ``opened`` makes of the library of a source beside this file, built where none is kept.
-
-    ``what`` says what is built. A library is kept for its sources, compiler, options and ``parts``.
+    ``sources`` are file names with the options to compile them, ``link`` options to link, ``what`` says what is built. A
+    library is kept for its sources, compiler, options and ``parts``.
 
     Raises:
         NoCompilerError: without a working C++ compiler.
@@ -73,10 +58,11 @@ def load(source: str, what: str, options: Sequence[str], parts: Sequence[str], o
     if compiler is None:
         raise NoCompilerError("There is no C++ compiler: install g++ for the native executor.")
     version = _run([*compiler, "--version"]).splitlines()[:1]
-    key = [*compiler, *version, *options, *parts, sys.platform]
+    options = [option for each in sources.values() for option in each]
+    key = [*compiler, *version, *options, *link, *parts, sys.platform]
     digest = hashlib.sha256("\n".join([*key, *(path.read_text() for path in SOURCES)]).encode())
-    name = f"{Path(source).stem}-{digest.hexdigest()[:16]}.so"
-    command = [*compiler, str(Path(__file__).parent / source), *options]
+    name = f"{name}-{digest.hexdigest()[:16]}.so"
+    build = functools.partial(_build, what, compiler, sources, link)
     try:
         folder = cache_folder()
         file = folder / name
@@ -87,7 +73,7 @@ def load(source: str, what: str, options: Sequence[str], parts: Sequence[str], o
             if not _is_whole(file):
                 for left in folder.glob(f".{file.stem}.*.so"):  # by a build that was interrupted
                     left.unlink()
-                _build(what, command, file)
+                build(file)
         return opened(file)
     except NoCompilerError:
         raise
@@ -95,15 +81,23 @@ def load(source: str, what: str, options: Sequence[str], parts: Sequence[str], o
         pass
     with tempfile.TemporaryDirectory(prefix="torchrl_gn-") as temporary:
         file = Path(temporary) / name  # code in the home may not be run, either
-        _build(what, command, file)
+        build(file)
         return opened(file)
 
 
-def _build(what: str, command: Sequence[str], file: Path) -> None:
-    """Compile to a file that ends with its SHA-256."""
-    sys.stderr.write(f"Building {what} for this processor, once: about 20 s.\n")
-    with atomic_path(file) as temporary:
-        _run([*command, "-o", str(temporary)])
+def _build(
+    what: str, compiler: Sequence[str], sources: Mapping[str, Sequence[str]], link: Sequence[str], file: Path
+) -> None:
+    """Compile, all sources at once, to a file that ends with its SHA-256."""
+    sys.stderr.write(f"Building {what} for this processor, once: about a minute.\n")
+    with atomic_path(file) as temporary, tempfile.TemporaryDirectory(prefix="torchrl_gn-") as objects:
+        places = {source: str(Path(objects) / f"{source}.o") for source in sources}
+        with ThreadPoolExecutor(len(sources)) as pool:
+            list(pool.map(_run, [
+                [*compiler, str(Path(__file__).parent / source), *options, "-c", "-o", places[source]]
+                for source, options in sources.items()
+            ]))
+        _run([*compiler, *places.values(), "-shared", "-pthread", *link, "-o", str(temporary)])
         with temporary.open("ab") as out:
             out.write(hashlib.sha256(temporary.read_bytes()).digest())
 

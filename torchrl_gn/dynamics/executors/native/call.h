@@ -1,7 +1,10 @@
-// What a call of the native executor reads: shared by its library and the binding of single steps.
+// What a call of the native executor reads and writes.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
+
+#include "structure.h"
 
 namespace gn __attribute__((visibility("hidden"))) {
 
@@ -18,7 +21,7 @@ struct Array {
   }
 };
 
-// As library.py fills it in.
+// What a rollout, or its adjoint, reads and writes.
 struct Call {
   int64_t batch, steps, tile, threads;
   Array states;            // forward: start states [B, size]; adjoint: all states, sample stride below
@@ -26,15 +29,45 @@ struct Call {
   Array actions;           // [B, T, A]
   Array out;               // forward: [B, T + with_start, result_size]; adjoint: gradient of those
   int64_t with_start;
+  const double* numbers;   // [B, numbers] of the model and of each sample, sample stride below
+  int64_t number_stride;
+  const void* sample_tables;  // every layer's [I, B, out padded to kPanel], one after the other; null: none has any
   Array grad_state;        // adjoint: [B, size]
   Array grad_actions;      // adjoint: [B, T, A]
-  void* stored;            // what the adjoint needs: [B * T] slopes and outputs, or if train gn_stored(); null: nothing
-  int64_t train;           // of one step all is stored, and the adjoint adds gradients of the weights
-  void* const* grad_weights;  // of every layer [out, K]
-  void* const* grad_tables;   // and [I, out], or null
-  const void* const* sample_tables;  // of every layer [I, B, out padded to 16], or null; null: none has one
-  const double* parameters;          // [B, P] physical parameters that the tapes read, sample stride below
-  int64_t parameter_stride;
+  void* stored;            // what the adjoint needs, as stored_count() says; null: it computes the steps again
+  int64_t keeps_all;       // of one step also the activations, for gradients of the weights
+  void* grad_weights;      // adjoint: as the packed weights, zeros to begin with; null: no gradient of the weights
+  void* grad_tables;       // adjoint: as the shared tables, zeros to begin with
 };
+
+// State maths of a structure: its words, and the lists that they name.
+struct Maths : MathsWords {
+  Structure structure;
+  Tape forward, adjoint;
+  const int64_t *varying, *constant, *results;
+  const double* values;
+
+  Maths(const Structure& of, const MathsWords& words)
+      : MathsWords(words),
+        structure(of),
+        forward(of, words.forward),
+        adjoint(of, words.adjoint),
+        varying(of.list(words.varying)),
+        constant(of.list(words.constant)),
+        results(of.list(words.results)),
+        values(of.doubles(words.values)) {}
+};
+
+constexpr int64_t kTile = 24;  // samples that stay in a processor's cache from layer to layer
+
+// Whether a start state's constant channels are those that the tapes were made for.
+inline bool fits(const Maths& m, const Array& states, int64_t start) {
+  const double tolerance = states.is_double ? 1e-9 : 2e-7;  // of a number that was rounded to float32
+  for (int64_t i = 0; i < m.size - m.varying_count; ++i) {
+    const double difference = states.get(start + m.constant[i]) - m.values[i];
+    if (!(std::fabs(difference) <= tolerance * (1 + std::fabs(m.values[i])))) return false;
+  }
+  return true;
+}
 
 }  // namespace gn

@@ -2,207 +2,230 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import fields
-from typing import NamedTuple, Self
+import contextlib
+from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_gn.dynamics.executors.eager import EagerExecutor
-from torchrl_gn.dynamics.executors.native import library
+from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native.build import NoCompilerError
-from torchrl_gn.dynamics.executors.native.pool import Pool
-from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, Samples, batch_of
+from torchrl_gn.dynamics.executors.native.operators import load_operators
+from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, batch_of
+from torchrl_gn.dynamics.executors.native.state_maths import StateMaths, may_be_constant
+from torchrl_gn.dynamics.executors.native.structure import structure
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
-from torchrl_gn.dynamics.executors.native.traced_program import MixedStatesError, TracedProgram
-from torchrl_gn.dynamics.program import StepProgram
-from torchrl_gn.dynamics.watched import version_of
+from torchrl_gn.dynamics.program import StepProgram, numbers_of
 from torchrl_gn.networks.core import ListedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.layers import LayerList
 from torchrl_gn.networks.linear import needs_plain_operations
-from torchrl_gn.networks.snapshot import same
+from torchrl_gn.networks.packed_layers import LayerShapes, PackedLayers, pack_pairs, pack_sample_tables
+from torchrl_gn.networks.tensor_tree import in_dtype
+from torchrl_gn.processor import native_threads
 
-STORED_BYTES = 2**28  # activations' derivatives are kept for the gradient up to this size, else computed again
-_TYPES = (Tensor, torch.nn.Parameter)
+_NUMBERS = (torch.float32, torch.float64)  # of states, actions, weights
+_PACKED = (*_NUMBERS, torch.bfloat16)
+_TENSORS = (Tensor, torch.nn.Parameter)
 
 
 class NativeExecutor:
     """Run the step in C++ on a processor; by torch operations what it cannot: ``reason`` says why.
 
-    State maths in float64, the network in the program's float32 or float64. Differentiable once, in state and action;
-    the gradient in a component of the state that cannot move is that of copying it. Results depend neither on the batch
-    that a sample is in nor on the number of threads; with parameters of each sample, which torch folds, they do by
-    rounding. Several threads may run it at once.
+    State maths in float64, the network in the program's float32 or float64. Differentiable once, in state, action and
+    weights; the gradient in a component of the state that cannot move is that of copying it. Results depend neither on
+    the batch that a sample is in nor on the number of threads; with parameters of each sample, which torch folds, they
+    do by rounding. Several threads may run it at once.
+
+    The state maths is traced for states whose components that cannot move are those of the scene's reference pose, and
+    once more for any others.
+
+    Args:
+        program: one of those that it is to run.
+        change: whether :meth:`delta` is to run natively, instead of :meth:`step` and :meth:`rollout`.
     """
 
-    fixed_batch, runs_all = False, True
-    change = False  # whether the result is a change instead of the next state
+    fixed_batch = False
 
-    def __init__(self, program: StepProgram) -> None:
-        self.pool = Pool()
-        self.shared = {"version": 0}  # of the weights; with executors that update() made
-        self._last: Native | None = None  # and the state maths and physical parameters that it was traced for
-        self._maths: tuple = ()
-        self._parameters: ParameterInputs | None = None
-        self._load(program)
-
-    @property
-    def reason(self) -> str | None:
-        """Why it runs by torch operations; None if it runs natively."""
-        return self._reason if self.native is None else self.native.traced.reason
-
-    def update(self, program: StepProgram) -> Self:
-        """What runs another program of the same scene: its state maths are traced again only if they differ.
-
-        This executor still runs its own, for other threads.
-        """
-        other = copy.copy(self)
-        other._load(program)
-        return other
-
-    def _load(self, program: StepProgram) -> None:
-        self.program, self.eager, self.native = program, EagerExecutor(program), None
-        batch = batch_of(program.parameters)
-        if self.change and batch:
-            layers, self._reason = None, "with parameters of each sample, training runs by torch operations"
-        elif not batch.numel():
-            layers, self._reason = None, "there is no sample"
-        else:
-            layers, self._reason = list_layers(program)
+    def __init__(self, program: StepProgram, *, change: bool = False) -> None:
+        layers, self.reason = list_layers(program)
         if layers is None:
             return
+        self.change = change
+        self.shapes = LayerShapes(layers)
+        self.parameters = ParameterInputs.of(program.standard, program.parameters)
+        self.channels = program.layout.delta_size if change else program.layout.size
         try:
-            network = library.NativeNetwork(layers, program.dtype)
-        except (NoCompilerError, TypeError) as error:
-            self._reason = str(error)
-            return
-        before, maths = self._last, _maths_of(program)
-        same_maths = same(self._maths, maths)
-        inputs = ParameterInputs.of(program.parameters, self._parameters if same_maths else None)
-        if before is not None and not before.network.equals(network):
-            before = None
-        if before is not None and same_maths and inputs is self._parameters:
-            traced = before.traced
+            if program.dtype == torch.bfloat16 and not load_operators().has_bfloat16():
+                raise NoCompilerError("This processor multiplies no bfloat16.")
+            load_operators()
+            self.structure = self._trace(program, layers)
+        except (NoCompilerError, UntraceableError) as error:
+            self.reason = str(error)
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+        if self.reason is None:
+            try:
+                load_operators()
+            except NoCompilerError as error:
+                self.reason = str(error)
+
+    def pack(self, program: StepProgram) -> StepProgram:
+        """The program with its core as :class:`PackedLayers`; itself if torch must run it."""
+        if self.reason is not None:
+            return program
+        core = program.core
+        assert isinstance(core, ListedCore)
+        layers, operators = core.layers(), load_operators()
+        assert layers is not None
+        sums = torch.float32 if program.dtype == torch.bfloat16 else program.dtype  # dtype of sums and tables
+        weights = [layer.weight for layer in layers.layers]
+        if program.dtype == torch.bfloat16:
+            packed = pack_pairs(weights)
         else:
-            traced = TracedProgram(program, layers, inputs, self.change)
-        if before is None or not before.network.same_weights(network):
-            self.shared["version"] += 1
-        samples = Samples.of(layers, inputs.read(program.parameters), network.number)
-        self._maths, self._parameters = maths, inputs
-        self.native = self._last = Native(network, layers, traced, samples, self.shared["version"])
-
-    def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        if (native := self.running(state, action)) is not None:
-            after = self._rollout(native, state, action, False)
-            if after is not None:
-                return after, None
-        return self.eager.step(state, action, hidden)
-
-    def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        if actions.shape[-2] and (native := self.running(state, actions)) is not None:
-            states = self._rollout(native, state, actions, True)
-            if states is not None:
-                return states, None
-        return self.eager.rollout(state, actions, hidden)
-
-    def running(self, state: Tensor, action: Tensor) -> Native | None:
-        """What runs inputs natively; None if torch must."""
-        native = self.native
-        runs = (
-            native is not None
-            and native.traced.reason is None
-            and type(state) in _TYPES
-            and type(action) in _TYPES
-            and state.dtype in library.DTYPES
-            and action.dtype in library.DTYPES
-            and state.is_cpu
-            and action.is_cpu
-            and state.numel() > 0
-            and native.samples.count in (None, state.shape[:-2].numel())
-            and not needs_plain_operations()
-            and not torch._C._len_torch_dispatch_stack()  # a mode that must see every operation
-            and torch._C._get_tracing_state() is None  # of torch.jit.trace
+            plain = torch.cat([weight.reshape(-1) for weight in weights]).to(sums)
+            packed = operators.pack(plain, self.shapes.weights, True)
+        tables = [layer.table.reshape(-1) for layer in layers.layers if layer.table is not None and layer.table.ndim == 2]
+        rows = torch.cat([*tables, packed.new_empty(0, dtype=sums)]).to(sums)
+        numbers = torch.cat([part.reshape(-1) for part in numbers_of(program)] or [torch.empty(0)]).double().unsqueeze(0)
+        given = self.parameters.read(program.parameters)
+        if given.shape[1]:
+            numbers = torch.cat((numbers.expand(len(given), -1), given), 1)
+        core = PackedLayers(
+            self.shapes,
+            core.predicted,
+            packed,
+            operators.pack(rows, self.shapes.tables, False),
+            numbers.contiguous(),
+            pack_sample_tables(layers, sums),
         )
-        return native if runs else None
+        return replace(program, core=core)
 
-    def _rollout(self, native: Native, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
-        """The next state for an action ``[*B, A]``; for ``many``, ``[*B, T, A]``, states ``[*B, T + 1, N, C]``.
+    def step(
+        self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        if (after := self._run(program, state, action, False)) is not None:
+            return after, None
+        return eager.step(program, state, action, hidden)
 
-        None if torch operations must run it.
-        """
-        try:
-            if (state.requires_grad or actions.requires_grad) and torch.is_grad_enabled():
-                return _Differentiable.apply(self, native, state, actions, many)  # pyright: ignore[reportReturnType]
-            return _run(native, state.contiguous(), actions.contiguous(), many)[0]
-        except MixedStatesError as mixed:
-            groups = mixed.groups
-        except UntraceableError:
+    def rollout(
+        self, program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        if (states := self._run(program, state, actions, True)) is not None:
+            return states, None
+        return eager.rollout(program, state, actions, hidden)
+
+    def delta(
+        self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        """Predicted change ``[*B, N, 12]``, as :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
+        if (change := self._run(program, state, action, False)) is not None:
+            return change, None
+        return eager.delta(program, state, action, hidden)
+
+    def _run(self, program: StepProgram, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
+        core = program.core
+        if not isinstance(core, PackedLayers):
             return None
-        states = state.reshape(-1, *state.shape[-2:])
-        actions = actions.reshape(len(groups), *actions.shape[state.ndim - 2 :])
-        places = [(groups == group).nonzero().flatten() for group in groups.unique().tolist()]
-        parts: list[Tensor] = []
-        for at in places:
-            of_group = native._replace(samples=native.samples.part(at))
-            part = self._rollout(of_group, states[at], actions[at], many)
-            if part is None and native.samples.count is not None:
-                return None
-            by_torch = self.eager.rollout if many else self.eager.step
-            parts.append(by_torch(states[at], actions[at])[0] if part is None else part)
-        out = torch.cat(parts)[torch.cat(places).argsort()]
-        return out.view(*state.shape[:-2], *out.shape[1:])
+        return self.call(core.weights, core.tables, core.sample_tables, core.numbers, state, actions, many)
+
+    def call(
+        self,
+        weights: Tensor,
+        tables: Tensor,
+        sample_tables: Tensor | None,
+        numbers: Tensor,
+        state: Tensor,
+        actions: Tensor,
+        many: bool,
+    ) -> Tensor | None:
+        """Result of the operator for an action ``[*B, A]`` or ``many`` ``[*B, T, A]``; None if torch must compute it.
+
+        The first four are those of :class:`PackedLayers`.
+        """
+        if weights.dtype not in _PACKED or not weights.is_cpu or not runs_natively(state, actions):
+            return None
+        packed = self.structure, weights, tables, sample_tables, numbers
+        with contextlib.suppress(NotImplementedError):  # states that no state maths could be traced for
+            return torch.ops.torchrl_gn.rollout(state, actions, *packed, self.channels, many, native_threads())
+        return None
+
+    def _trace(self, program: StepProgram, layers: LayerList) -> Tensor:
+        """The structure, compared with torch's own numbers; UntraceableError if they differ or have no scalar form."""
+        reference = program.reference.detach().double().numpy()
+        with torch.device("cpu"), torch.no_grad():
+            # What a step changes is not constant: found by numbers, it need not be traced to be found.
+            constant = may_be_constant(program, reference)
+            batch, moved = batch_of(program.parameters), _example(program, torch.from_numpy(constant), False)
+            after = eager.step(program, moved.expand(*batch, -1, -1), _action(program).expand(*batch, -1))[0]
+            constant &= (np.abs(after.numpy() - reference) <= 1e-9 * (1 + np.abs(reference))).reshape(-1, *constant.shape).all(0)
+            special = self._state_maths(program, layers, reference, constant)
+            try:
+                general = self._state_maths(program, layers, reference, np.zeros_like(constant))
+            except UntraceableError:  # states that need it are left to torch
+                general = None
+            words = structure(layers, special, general)
+            self._compare(program, words, special.is_constant, general is not None)
+        return words
+
+    def _state_maths(
+        self, program: StepProgram, layers: LayerList, state: np.ndarray, constant: np.ndarray
+    ) -> StateMaths:
+        """State maths for states whose channels ``constant`` ``[N, C]`` are those of ``state``."""
+        core, last = program.core, layers.layers[-1]
+        assert isinstance(core, ListedCore)
+        predicted = torch.arange(layers.nodes[0], device="cpu")[core.predicted].numpy()
+        width = last.count * len(last.weight) // max(len(predicted), 1)
+        state = np.where(constant, state, 0.0)
+        return StateMaths(program, state, constant, predicted, width, self.parameters, self.change)
+
+    def _compare(self, program: StepProgram, words: Tensor, constant: np.ndarray, general: bool) -> None:
+        """UntraceableError unless steps in float64 are those of torch, in states of both state maths."""
+        core = program.core
+        assert isinstance(core, ListedCore)
+        program = replace(program, core=in_dtype(core, torch.float64), dtype=torch.float64)
+        other = object.__new__(NativeExecutor)
+        other.__dict__.update(self.__dict__, structure=words)
+        packed, batch = other.pack(program), batch_of(program.parameters)
+        for everywhere in (False, True)[: 1 + general]:
+            state = _example(program, torch.from_numpy(constant), everywhere).expand(*batch, -1, -1)
+            action = _action(program).expand(*batch, -1)
+            wanted = eager.delta(program, state, action)[0]
+            found = other._run(packed, state, action, False)
+            assert found is not None
+            if not self.change:
+                wanted, found = program.layout.apply(state, wanted) - state, found - state
+            sizes, errors = (each.flatten(-2).norm(dim=-1).flatten() for each in (wanted, found - wanted))
+            wrong = sizes.isfinite() & ~(errors <= 1e-6 * sizes + 1e-12 * (1 + state.norm()))
+            if wrong.any():
+                worst = float((errors / sizes.clamp(min=1e-300))[wrong].max())
+                raise UntraceableError(f"The native step differs from torch's by {worst:.1e} of the change.")
 
 
-class Native(NamedTuple):
-    """A network and the state maths around it."""
-
-    network: library.NativeNetwork
-    layers: LayerList
-    traced: TracedProgram
-    samples: Samples
-    version: int  # of the weights
-
-
-def _run(
-    native: Native, state: Tensor, actions: Tensor, many: bool, stored: Tensor | None = None
-) -> tuple[Tensor, library.Call, library.NativeMaths]:
-    """Results for contiguous inputs, and what a gradient needs: the call, and its state maths.
-
-    Raises:
-        MixedStatesError: if the samples need different state maths.
-        UntraceableError: if torch operations must run it.
-    """
-    call, out = library.forward_call(state, actions, many, stored)
-    native.samples.bring(call)
-    return out, call, native.traced.run(native.network, call, state, actions)
-
-
-class _Differentiable(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, executor: NativeExecutor, native: Native, state: Tensor, actions: Tensor, many: bool) -> Tensor:
-        state, actions, network = state.contiguous(), actions.contiguous(), native.network
-        numbers = state.shape[:-2].numel() * (actions.shape[-2] if many else 1) * network.kept
-        stored = None
-        if numbers * network.number.itemsize <= STORED_BYTES:
-            stored = executor.pool.take(numbers, network.number)
-        out, ctx.call, ctx.maths = _run(native, state, actions, many, None if stored is None else stored.tensor)
-        ctx.save_for_backward(out if many else state, actions)
-        ctx.executor, ctx.native, ctx.stored = executor, native, stored
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        states, actions = ctx.saved_tensors
-        if ctx.native.version != ctx.executor.shared["version"]:
-            raise RuntimeError("The model's weights changed between a prediction and its gradient; predict again.")
-        gradient = gradient.contiguous()  # to live until the call is done
-        stored = None if ctx.stored is None else ctx.stored.tensor
-        call, of_state, of_actions = library.adjoint_call(ctx.call, states, actions, gradient, stored)
-        library.rollout_adjoint(ctx.native.network, ctx.maths, call)
-        return None, None, of_state, of_actions, None
+def runs_natively(state: Tensor, actions: Tensor) -> bool:
+    """Whether C++ can compute with such tensors, here."""
+    if torch.compiler.is_compiling():
+        observed = False
+    else:
+        observed = (
+            needs_plain_operations()
+            or torch._C._len_torch_dispatch_stack()  # a mode that must see every operation
+            or torch._C._get_tracing_state() is not None  # of torch.jit.trace
+        )
+    return (
+        not observed
+        and type(state) in _TENSORS
+        and type(actions) in _TENSORS
+        and state.dtype in _NUMBERS
+        and actions.dtype in _NUMBERS
+        and state.is_cpu
+        and actions.is_cpu
+        and state.numel() > 0
+        and 0 not in actions.shape[state.ndim - 2 : -1]
+    )
 
 
 def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
@@ -214,17 +237,27 @@ def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
         return None, "its physics run outside, so it runs by torch operations"
     if program.movable.device.type != "cpu":
         return None, f"on {program.movable.device.type}, it runs by torch operations"
-    if program.dtype not in (*library.DTYPES, torch.bfloat16):
+    if program.dtype not in (*_NUMBERS, torch.bfloat16):
         return None, f"{str(program.dtype).removeprefix('torch.')} products run by torch operations"
     if not isinstance(core, ListedCore):
         return None, "a core without fold() and layers() runs by torch operations"
+    if not batch_of(program.parameters).numel():
+        return None, "there is no sample"
     if (layers := core.layers()) is None:
         return None, "a core with dynamic globals runs by torch operations"
     return layers, None
 
 
-def _maths_of(program: StepProgram) -> tuple:
-    """Parts of a program beside network and physical parameters, and how often the physics' tensors were changed."""
-    parts = tuple(getattr(program, field.name) for field in fields(program) if field.name not in ("core", "parameters"))
-    known = () if program.physics is None else (*program.physics.parameters(), *program.physics.buffers())
-    return *parts, *map(version_of, known)
+def _action(program: StepProgram) -> Tensor:
+    """An action ``[A]`` within its bounds."""
+    low, high = (bound.clamp(-1, 1) for bound in (program.controls.action_low, program.controls.action_high))
+    return 0.3 * low + 0.7 * high
+
+
+def _example(program: StepProgram, constant: Tensor, everywhere: bool) -> Tensor:
+    """A state ``[N, C]`` off the reference pose, in all components or in those that are not ``constant``."""
+    generator = torch.Generator().manual_seed(0)
+    reference, layout = program.reference.double(), program.layout
+    change = 0.1 * torch.randn(len(reference), layout.delta_size, dtype=torch.float64, generator=generator)
+    moved = layout.apply(reference, change if everywhere else change * program.movable)
+    return moved if everywhere else torch.where(constant, reference, moved)

@@ -13,6 +13,8 @@
 #include <immintrin.h>
 #endif
 
+#include "structure.h"
+
 namespace gn __attribute__((visibility("hidden"))) {  // libraries built for other processors may be loaded beside
 
 #if defined(__AVX512F__)
@@ -79,9 +81,9 @@ void accumulate_rows(T* to, int64_t to_step, const T* from, int64_t step, int ro
   }
 }
 
-// out[r][column] = init[r][column] + sum_k x[r][k] w[k][column] for R rows and N panels of columns, begun at one.
-// Kernels are of three kinds: x is [r][kStride] and w packed [panel][depth][L]; the same of pairs of bfloat16, summed in
-// float32; or sums over rows, for gradients of weights, where x is [k][kStride] and so is w.
+// out[r][column] = init[r][column] + sum_k x[r][k] w[k][column] for R rows and N vectors of columns, begun at one.
+// Kernels are of three kinds: x is [r][kStride] and w packed [panel][depth][kPanel]; the same of pairs of bfloat16, summed
+// in float32; or sums over rows, for gradients of weights, where x is [k][kStride] and so is w.
 enum Kind { kPlain, kPairs, kOverRows };
 
 template <class T>
@@ -92,8 +94,8 @@ template <class T, Kind kKind, int R, int N>
 void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64_t panel, const T* const* init,
               int64_t column, T* out, int64_t stride) {
   using V = Vector<T>;
-  constexpr int L = kLanes<T>, row = kKind == kOverRows ? 1 : kStride;
-  constexpr int next_w = kKind == kOverRows ? kStride : L, next_x = kKind == kOverRows ? kStride : 1;
+  constexpr int L = kLanes<T>, row = kKind == kOverRows ? 1 : kStride, inside = kPanel / L;  // vectors of a panel
+  constexpr int next_w = kKind == kOverRows ? kStride : kPanel, next_x = kKind == kOverRows ? kStride : 1;
   typename V::type sum[R][N];
 #pragma GCC unroll 12
   for (int r = 0; r < R; r++)
@@ -102,7 +104,8 @@ void multiply(const T* __restrict x, const T* __restrict w, int64_t depth, int64
   for (int64_t k = 0; k < depth; k++, w += next_w, x += next_x) {
     typename V::type weights[N];
 #pragma GCC unroll 8
-    for (int v = 0; v < N; v++) weights[v] = V::load(w + v * (kKind == kOverRows ? L : panel));
+    for (int v = 0; v < N; v++)
+      weights[v] = V::load(w + (kKind == kOverRows ? v * L : v / inside * panel + v % inside * L));
 #pragma GCC unroll 12
     for (int r = 0; r < R; r++) {
 #pragma GCC unroll 8
@@ -129,40 +132,34 @@ Kernel<T> kernel_of_rows(int rows, std::integer_sequence<int, R...>) {
 }
 
 template <class T, Kind kKind>
-Kernel<T> kernel(int rows, int panels) {
-  if constexpr (kKind != kOverRows) {  // few rows are worth more panels at once: sums that do not wait for each other
-    if (panels == 8) return kernel_of_rows<T, kKind, 8>(rows, std::make_integer_sequence<int, kAccumulators / 8>{});
-    if (panels == 4) return kernel_of_rows<T, kKind, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
+Kernel<T> kernel(int rows, int vectors) {
+  if constexpr (kKind != kOverRows) {  // few rows are worth more vectors at once: sums that do not wait for each other
+    if (vectors == 8) return kernel_of_rows<T, kKind, 8>(rows, std::make_integer_sequence<int, kAccumulators / 8>{});
+    if (vectors == 4) return kernel_of_rows<T, kKind, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
   }
-  if (panels == 2) return kernel_of_rows<T, kKind, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
+  if (vectors == 2) return kernel_of_rows<T, kKind, 2>(rows, std::make_integer_sequence<int, kAccumulators / 2>{});
   return kernel_of_rows<T, kKind, 1>(rows, std::make_integer_sequence<int, kRows>{});
 }
 
-// out[rows][panels * L] = init + x @ w, with panels of w some numbers apart.
+// out[rows][vectors * L] = init + x @ w, with panels of w some numbers apart.
 template <class T, Kind kKind>
-void product(const T* x, const T* w, int rows, int64_t panels, int64_t depth, int64_t panel, const T* const* init,
+void product(const T* x, const T* w, int rows, int64_t vectors, int64_t depth, int64_t panel, const T* const* init,
              T* out, int64_t stride) {
+  constexpr int L = kLanes<T>, inside = kPanel / L;
   int blocks = (rows + kRows - 1) / kRows, block = (rows + blocks - 1) / blocks;
   int most = 2;
   while (kKind != kOverRows && most < 8 && block <= kAccumulators / (2 * most)) most *= 2;
-  for (int64_t p = 0; p < panels;) {
+  for (int64_t p = 0; p < vectors;) {  // a power of two at once, so that no kernel begins inside a panel and leaves it
     int taken = most;
-    while (taken > panels - p) taken /= 2;
+    while (taken > vectors - p) taken /= 2;
+    const T* right = w + (kKind == kOverRows ? p * L : p / inside * panel + p % inside * L);
     for (int r = 0; r < rows; r += block) {
       const T* left = x + r * (kKind == kOverRows ? 1 : kStride);
-      kernel<T, kKind>(rows - r < block ? rows - r : block, taken)(left, w + p * panel, depth, panel, init + r,
-                                                                   p * kLanes<T>, out + r * stride, stride);
+      kernel<T, kKind>(rows - r < block ? rows - r : block, taken)(left, right, depth, panel, init + r, p * L,
+                                                                   out + r * stride, stride);
     }
     p += taken;
   }
-}
-
-// Nearest bfloat16, as its bits; NaN stays.
-inline uint16_t bfloat16(float value) {
-  uint32_t bits;
-  std::memcpy(&bits, &value, 4);
-  if (value != value) return static_cast<uint16_t>(bits >> 16 | 64);
-  return static_cast<uint16_t>((bits + 0x7fff + (bits >> 16 & 1)) >> 16);
 }
 
 // Rows of x as bfloat16, in place: pairs of numbers where one was, an odd last one with a zero.

@@ -1,4 +1,4 @@
-// Rollouts of a specialised forward model and their gradients: the state maths by tapes, the network by network.h.
+// Rollouts of a forward model for one scene and their gradients: the state maths by tapes, the network by network.h.
 //
 // Samples are handled in tiles of up to 24, each from its first step to its last by one thread, with samples as the
 // lanes of its tapes. Every sample is computed in the same order whatever the batch, the tile and the number of
@@ -8,6 +8,9 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdlib>
+#include <exception>
+#include <mutex>
+#include <new>
 #include <system_error>
 #include <thread>
 #include <vector>
@@ -18,27 +21,6 @@
 
 namespace gn __attribute__((visibility("hidden"))) {
 
-// What library.py fills in; all memory is Python's.
-struct Maths {
-  int64_t size;            // channels of a state, N * C
-  int64_t varying_count;   // of them change
-  int64_t result_size;     // numbers of a result: a state, or a change N * 12
-  int64_t result_count;    // of them are computed
-  int64_t is_state;        // a result is a state: its other channels are copied, and steps follow each other
-  int64_t actions;
-  int64_t parameters;      // physical parameters that differ between samples
-  int64_t outputs;         // P * F_out
-  int64_t node_inputs, edge_inputs;  // N * F_n, E * F_e
-  int64_t node_width, edge_width, output_width;
-  const int32_t* varying;
-  const int32_t* constant;
-  const double* values;    // of the constant channels
-  const int32_t* results;  // channels of a result that are computed
-  Tape forward, adjoint;
-};
-
-constexpr double TOLERANCE = 1e-9;
-
 // Memory of one thread that is kept from call to call: fresh pages would cost a small batch more than its steps.
 class Arena {
  public:
@@ -47,7 +29,10 @@ class Arena {
   void reserve(size_t bytes) {
     if (bytes > size_) {
       std::free(data_);
+      size_ = 0;
+      bytes = padded(bytes) / 64 * 64;
       data_ = static_cast<char*>(std::aligned_alloc(64, bytes));
+      if (!data_) throw std::bad_alloc();
       size_ = bytes;
       std::memset(data_, 0, bytes);
     }
@@ -77,19 +62,19 @@ struct Runner {
   int count;  // samples of this tile
   double* r;
   T* ws;
-  T* whole;  // where the only step keeps its slopes and activations; null: as stored() says
+  T* whole;  // where the only step keeps its slopes and activations; null: as kept() says
 
   int64_t sample(int lane) const { return first + (lane < count ? lane : count - 1); }
 
   // Numbers at[index] of every sample into a group of a tape's registers.
   template <class F>
   void load(const Tape& tape, int group, int64_t size, F number) const {
-    const int32_t* registers = tape.inputs[group];
+    const int64_t* registers = tape.inputs(group);
     for (int64_t i = 0; i < size; ++i)
       if (registers[i] >= 0)
-        for (int lane = 0; lane < L; ++lane) r[registers[i] * int64_t(L) + lane] = number(sample(lane), lane, i);
+        for (int lane = 0; lane < L; ++lane) r[registers[i] * L + lane] = number(sample(lane), lane, i);
   }
-  const double* result(const Tape& tape, int phase, int64_t i) const { return r + tape.outputs[phase][i] * int64_t(L); }
+  const double* result(const Tape& tape, int phase, int64_t i) const { return r + tape.outputs(phase)[i] * L; }
 
   // Between lanes and the network's buffers [item][sample][feature].
   void to_network(const Tape& tape, int phase, int64_t skip, int64_t size, int64_t width, T* buffer) const {
@@ -101,19 +86,19 @@ struct Runner {
   }
   void from_network(const Tape& tape, int group, int64_t skip, int64_t size, int64_t width, const T* buffer) const {
     for (int64_t i = 0; i < size; ++i) {
-      const int32_t at = tape.inputs[group][skip + i];
+      const int64_t at = tape.inputs(group)[skip + i];
       if (at < 0) continue;
       const T* from = buffer + (i / width) * width * count + i % width;
       for (int lane = 0; lane < L; ++lane)
-        r[at * int64_t(L) + lane] = static_cast<double>(from[(lane < count ? lane : count - 1) * width]);
+        r[at * L + lane] = static_cast<double>(from[(lane < count ? lane : count - 1) * width]);
     }
   }
 
-  void load_parameters(const Tape& tape) const {
-    load(tape, 3, m.parameters, [&](int64_t s, int, int64_t i) { return call.parameters[s * call.parameter_stride + i]; });
+  void load_numbers(const Tape& tape) const {
+    load(tape, 3, m.numbers, [&](int64_t s, int, int64_t i) { return call.numbers[s * call.number_stride + i]; });
   }
 
-  T* stored(int64_t step) const {
+  T* kept(int64_t step) const {
     if (!call.stored || whole) return whole;
     const int64_t block = network.stored() + m.outputs;
     return static_cast<T*>(call.stored) + (first * call.steps + step * count) * block;
@@ -133,12 +118,12 @@ struct Runner {
       for (int lane = 0; lane < count; ++lane)
         for (int64_t i = 0; i < m.size; ++i)
           call.out.set((first + lane) * rows * m.size + i, call.states.get((first + lane) * call.state_stride + i));
-    load_parameters(m.forward);
+    load_numbers(m.forward);
     load(m.forward, 0, m.varying_count,
          [&](int64_t s, int, int64_t i) { return call.states.get(s * call.state_stride + m.varying[i]); });
     for (int64_t t = 0; t < call.steps; ++t) {
       load(m.forward, 1, A, [&](int64_t s, int, int64_t i) { return call.actions.get((s * call.steps + t) * A + i); });
-      T* derivatives = stored(t);
+      T* derivatives = kept(t);
       predict(m.forward, derivatives);
       const T* output = network.output(ws, count);
       if (whole)
@@ -159,7 +144,7 @@ struct Runner {
       }
       if (t + 1 < call.steps) {
         // Results may lie in the registers of inputs: move all at once.
-        double* next = r + m.forward.registers * L;
+        double* next = r + m.forward.registers() * L;
         for (int64_t i = 0; i < m.varying_count; ++i) std::memcpy(next + i * L, result(m.forward, 1, i), sizeof(double) * L);
         load(m.forward, 0, m.varying_count, [&](int64_t, int lane, int64_t i) { return next[i * L + lane]; });
       }
@@ -167,11 +152,12 @@ struct Runner {
   }
 
   // Gradient of the varying channels; that of the constant ones is what their copies receive.
-  // again, derivatives: room for the step that is computed again; gradient: of the varying channels.
-  void adjoint(double* again, T* derivatives, double* gradient, T* const* of_weights, T* const* of_tables) const {
+  // again, room: for the step that is computed again; gradient: of the varying channels; of_weights, of_tables: added to,
+  // if given.
+  void pull(double* again, T* room, double* gradient, T* of_weights, T* of_tables) const {
     const int64_t rows = call.steps + call.with_start, A = m.actions, n = m.varying_count;
     std::fill_n(gradient, n * L, 0.0);
-    load_parameters(m.adjoint);
+    load_numbers(m.adjoint);
     auto incoming = [&](int64_t s, int64_t row, int64_t channel) {
       return call.out.get((s * rows + row) * m.result_size + channel);
     };
@@ -180,19 +166,19 @@ struct Runner {
         return call.states.get(s * call.state_stride + t * m.size + m.varying[i]);
       };
       auto action = [&](int64_t s, int, int64_t i) { return call.actions.get((s * call.steps + t) * A + i); };
-      const T* kept = stored(t);
+      const T* derivatives = kept(t);
       const T* output = network.output(ws, count);
       if (whole) {
-        std::copy_n(kept + count * network.stored(), network.activation_count(count), network.activations(ws));
-      } else if (kept) {
-        output = kept + count * network.stored();
+        std::copy_n(derivatives + count * network.stored(), network.activation_count(count), network.activations(ws));
+      } else if (derivatives) {
+        output = derivatives + count * network.stored();
       } else {
         Runner forward{m, network, call, first, count, again, ws, nullptr};
-        forward.load_parameters(m.forward);
+        forward.load_numbers(m.forward);
         forward.load(m.forward, 0, n, state);
         forward.load(m.forward, 1, A, action);
-        forward.predict(m.forward, derivatives);
-        kept = derivatives;
+        forward.predict(m.forward, room);
+        derivatives = room;
       }
       load(m.adjoint, 0, n, state);
       load(m.adjoint, 1, A, action);
@@ -202,8 +188,8 @@ struct Runner {
       });
       run_tape<W, C>(m.adjoint, 0, r);
       to_network(m.adjoint, 0, 0, m.outputs, m.output_width, network.grad_output(ws, count));
-      network.backward(ws, count, kept);
-      if (of_weights) network.weight_gradients(ws, count, kept, of_weights, of_tables);
+      network.backward(ws, count, derivatives);
+      if (of_weights) network.weight_gradients(ws, count, derivatives, of_weights, of_tables);
       from_network(m.adjoint, 5, 0, m.node_inputs, m.node_width, network.grad_nodes(ws, count));
       from_network(m.adjoint, 5, m.node_inputs, m.edge_inputs, m.edge_width, network.grad_edges(ws, count));
       run_tape<W, C>(m.adjoint, 1, r);
@@ -226,62 +212,54 @@ struct Runner {
   }
 };
 
-// T's that a tile of a training call keeps for its adjoint.
+// T's that a tile keeps for its adjoint, if it keeps all of its only step.
 template <class Net>
 int64_t tile_store(const Net& network, const Call& call) {
   return network.stored() * call.tile + network.activation_count(call.tile);
 }
 
-// Gradients of the weights, added up in as many parts as do not depend on the threads.
+// T's that a call keeps for its adjoint.
+template <class Net>
+int64_t stored_count(const Net& network, const Maths& m, const Call& call) {
+  if (call.keeps_all) return tile_store(network, call) * ((call.batch + call.tile - 1) / call.tile);
+  return (network.stored() + m.outputs) * call.batch * call.steps;
+}
+
+// Gradients of weights and tables, added up in as many parts as do not depend on the threads.
 template <class T>
 struct WeightGradients {
   static constexpr int64_t kMostParts = 4;
-  WeightGradients(const Call& call, const std::vector<int64_t>& weights, const std::vector<int64_t>& tables, int64_t tiles)
-      : parts(call.train ? std::min(tiles, kMostParts) : 0), numbers(parts), of_weights(parts), of_tables(parts) {
-    for (int64_t part = 0; part < parts; ++part) {
-      int64_t total = 0;
-      for (size_t i = 0; i < weights.size(); ++i) total += weights[i] + tables[i];
-      numbers[part].assign(total, T(0));
-      T* at = numbers[part].data();
-      for (size_t i = 0; i < weights.size(); ++i) {
-        of_weights[part].push_back(at);
-        of_tables[part].push_back(call.grad_tables[i] ? at + weights[i] : nullptr);
-        at += weights[i] + tables[i];
-      }
-    }
-  }
-  void write(const Call& call, const std::vector<int64_t>& weights, const std::vector<int64_t>& tables) const {
+  WeightGradients(const Call& call, const NetworkWords& words, int64_t tiles)
+      : parts(call.grad_weights ? std::min(tiles, kMostParts) : 0), weights(words.plain_weights), tables(words.tables),
+        numbers(parts * (weights + tables), T(0)) {}
+  T* of_weights(int64_t part) { return parts ? numbers.data() + part * (weights + tables) : nullptr; }
+  T* of_tables(int64_t part) { return parts ? of_weights(part) + weights : nullptr; }
+  template <class Net>
+  void write(const Call& call, const Net& network) {
     if (!parts) return;
-    for (size_t i = 0; i < weights.size(); ++i) {
-      sum(static_cast<T*>(call.grad_weights[i]), of_weights, i, weights[i]);
-      if (call.grad_tables[i]) sum(static_cast<T*>(call.grad_tables[i]), of_tables, i, tables[i]);
-    }
-  }
-  void sum(T* to, const std::vector<std::vector<T*>>& from, size_t i, int64_t size) const {
-    std::copy_n(from[0][i], size, to);
     for (int64_t part = 1; part < parts; ++part)
-      for (int64_t j = 0; j < size; ++j) to[j] += from[part][i][j];
+      for (int64_t j = 0; j < weights + tables; ++j) numbers[j] += numbers[part * (weights + tables) + j];
+    network.pack_gradients(of_weights(0), static_cast<T*>(call.grad_weights));
+    std::copy_n(of_tables(0), tables, static_cast<T*>(call.grad_tables));
   }
 
-  int64_t parts;
-  std::vector<std::vector<T>> numbers;
-  std::vector<std::vector<T*>> of_weights, of_tables;
+  int64_t parts, weights, tables;
+  std::vector<T> numbers;
 };
 
 template <class Net, int W, int C>
 void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoint) {
   using T = typename Net::Number;
   const int64_t tiles = (call.batch + call.tile - 1) / call.tile;
-  const bool trains = adjoint && call.train;
-  const std::vector<int64_t> none;
-  const auto weights = trains ? network.weight_sizes() : none, tables = trains ? network.table_sizes() : none;
-  WeightGradients<T> gradients(call, weights, tables, trains ? tiles : 0);
+  WeightGradients<T> gradients(call, m.structure.network(), adjoint ? tiles : 0);
   // Each part's tiles are handled in order by one thread; without parts, a tile is a part.
   const int64_t parts = gradients.parts ? gradients.parts : tiles;
   std::atomic<int64_t> next{0};
+  std::mutex lock;
+  std::exception_ptr failed;
   auto work = [&]() {
     constexpr int L = W * C;
-    const int64_t most = std::max(m.forward.registers, adjoint ? m.adjoint.registers : 0) + m.varying_count;
+    const int64_t most = std::max(m.forward.registers(), adjoint ? m.adjoint.registers() : 0) + m.varying_count;
     const bool again = adjoint && !call.stored;
     const size_t registers = L * most, ws = network.workspace(call.tile, adjoint);
     const size_t derivatives = again ? network.stored() * call.tile : 0, gradient = adjoint ? L * m.varying_count : 0;
@@ -291,27 +269,36 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
     double* const r = arena.take<double>(registers);
     double* const more = again ? arena.take<double>(registers) : nullptr;
     T* const scratch = arena.take<T>(ws);
-    T* const kept = arena.take<T>(derivatives);
+    T* const room = arena.take<T>(derivatives);
     double* const sums = arena.take<double>(gradient);
     for (int64_t part; (part = next++) < parts;)
       for (int64_t tile = part; tile < tiles; tile += parts) {
         const int64_t first = tile * call.tile, count = std::min(call.tile, call.batch - first);
         T* const whole =
-            call.train ? static_cast<T*>(call.stored) + tile * tile_store(network, call) : nullptr;
+            call.keeps_all && call.stored ? static_cast<T*>(call.stored) + tile * tile_store(network, call) : nullptr;
         Runner<Net, W, C> runner{m, network, call, first, static_cast<int>(count), r, scratch, whole};
         if (!adjoint) runner.forward();
-        else if (!call.train) runner.adjoint(more, kept, sums, nullptr, nullptr);
-        else runner.adjoint(more, kept, sums, gradients.of_weights[part].data(), gradients.of_tables[part].data());
+        else runner.pull(more, room, sums, gradients.of_weights(part), gradients.of_tables(part));
       }
+  };
+  auto careful = [&]() {  // an exception that left a thread would end the process
+    try {
+      work();
+    } catch (...) {
+      std::lock_guard<std::mutex> guard(lock);
+      failed = std::current_exception();
+      next = parts;
+    }
   };
   std::vector<std::thread> others;
   try {
-    for (int64_t i = 1; i < std::min(call.threads, parts); ++i) others.emplace_back(work);
-  } catch (const std::system_error&) {  // the system has no more: those that there are do all tiles
+    for (int64_t i = 1; i < std::min(call.threads, parts); ++i) others.emplace_back(careful);
+  } catch (const std::exception&) {  // the system has no more: those that there are do all tiles
   }
-  work();
+  careful();
   for (auto& other : others) other.join();
-  gradients.write(call, weights, tables);
+  if (failed) std::rethrow_exception(failed);
+  if (adjoint) gradients.write(call, network);
 }
 
 template <class Net>
@@ -321,32 +308,6 @@ void run(const Maths& m, const Net& network, const Call& call, bool adjoint) {
   else if (call.tile <= 8) run_tiles<Net, 8, 1>(m, network, call, adjoint);
   else if (call.tile <= 16) run_tiles<Net, 8, 2>(m, network, call, adjoint);
   else run_tiles<Net, 8, 3>(m, network, call, adjoint);
-}
-
-// Calls a function with the network of a kind: 0 float32, 1 float64, 2 bfloat16 products summed in float32.
-template <class F>
-auto with_network(const void* network, int64_t kind, F function) {
-  if (kind == 1) return function(*static_cast<const Network<double>*>(network));
-#ifdef __AVX512BF16__
-  if (kind == 2) return function(*static_cast<const Network<float, true>*>(network));
-#endif
-  return function(*static_cast<const Network<float>*>(network));
-}
-
-template <class Net>
-void* make(const int64_t* code, const void* const* weights, const void* const* tables) {
-  using T = typename Net::Number;
-  return new Net(code, reinterpret_cast<const T* const*>(weights), reinterpret_cast<const T* const*>(tables));
-}
-
-// Whether the start states' constant channels are those that the tapes were made for.
-inline bool fits(const Maths& m, const Call& call) {
-  for (int64_t s = 0; s < call.batch; ++s)
-    for (int64_t i = 0; i < m.size - m.varying_count; ++i) {
-      const double difference = call.states.get(s * call.state_stride + m.constant[i]) - m.values[i];
-      if (!(std::fabs(difference) <= TOLERANCE * (1 + std::fabs(m.values[i])))) return false;
-    }
-  return true;
 }
 
 }  // namespace gn

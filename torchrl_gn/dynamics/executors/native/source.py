@@ -1,4 +1,4 @@
-"""One scene's step as C++ source that needs nothing else: the executor's code, then tapes and weights as arrays."""
+"""One scene's step as C++ source that needs nothing else: the executor's code, then structure and weights as arrays."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from torch import Tensor
 
 from torchrl_gn.dynamics.executors.native.build import SOURCES
-from torchrl_gn.dynamics.executors.native.library import TILE
-from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
-from torchrl_gn.dynamics.executors.native.tape import Tape
-from torchrl_gn.networks.layers import LayerList
+from torchrl_gn.networks.packed_layers import PackedLayers
 
-_ORDER = ("kernels.h", "network.h", "tape.h", "call.h", "rollout.h")
-_TRAINING = {"muon.h"}  # no prediction needs it
+_ORDER = ("structure.h", "kernels.h", "network.h", "tape.h", "call.h", "rollout.h")
+_OPERATORS = {"engine.h"}  # what operators need beside it
 _TYPES = {"i": "int32_t", "l": "int64_t", "f": "float", "d": "double"}
 
 
@@ -51,41 +49,26 @@ def example(about: Description) -> str:
     return _filled(_EXAMPLE, about)
 
 
-def source(about: Description, layers: LayerList, maths: StateMaths, rest: np.ndarray) -> str:
+def source(about: Description, structure: Tensor, core: PackedLayers, rest: np.ndarray) -> str:
     """C++ source of the functions; ``rest`` is a state ``[N, C]``."""
-    weights, tables = layers.tensors()
-    last = layers.layers[-1]
-    kind = _TYPES[weights[0].numpy().dtype.char]
-    arrays = [_array("CODE", layers.code().numpy())]
-    arrays += [_array(f"WEIGHT_{i}", each.numpy()) for i, each in enumerate(weights)]
-    arrays += [_array(f"TABLE_{i}", each.numpy()) for i, each in enumerate(tables) if each is not None]
-    arrays += [_array(name.upper(), getattr(maths, name)) for name in ("varying", "constant", "values")]
-    table_names = ["nullptr" if each is None else f"TABLE_{i}" for i, each in enumerate(tables)]
-    arrays.append(f"const {kind}* const WEIGHTS[] = {{{', '.join(f'WEIGHT_{i}' for i in range(len(weights)))}}};")
-    arrays.append(f"const {kind}* const TABLES[] = {{{', '.join(table_names)}}};")
-    arrays += [_tape("FORWARD", maths.forward), _tape("ADJOINT", maths.adjoint)]
-    outputs = last.count * len(last.weight)
-    inputs = (layers.nodes[0] * layers.nodes[1], layers.edges[0] * layers.edges[1])
-    sizes = (maths.is_constant.size, len(maths.varying), maths.result_size, len(maths.results), 1, maths.actions, 0)
-    widths = (layers.nodes[1], layers.edges[1], len(last.weight))
-    numbers = ", ".join(map(str, (*sizes, outputs, *inputs, *widths)))
+    weights, tables = core.weights.numpy(), core.tables.numpy()
+    kind = _TYPES[weights.dtype.char]
+    arrays = {"STRUCTURE": structure.numpy(), "WEIGHTS": weights, "TABLES": tables, "NUMBERS": core.numbers.numpy()}
     includes, engine = _engine()
     return _filled(
         _SOURCE,
         about,
         INCLUDES=includes,
         ENGINE=engine,
-        ARRAYS="\n".join(arrays),
-        MATHS=f"{{{numbers}, VARYING, CONSTANT, VALUES, VARYING, FORWARD, ADJOINT}}",
+        ARRAYS="\n".join(_array(name, each) for name, each in arrays.items()),
         TYPE=kind,
-        TILE=str(TILE),
         REST=_numbers(rest),
     )
 
 
 def _engine() -> tuple[str, str]:
     """Standard headers, and the executor's code without its C interface."""
-    files = {path.name: path.read_text() for path in SOURCES if path.suffix == ".h" and path.name not in _TRAINING}
+    files = {path.name: path.read_text() for path in SOURCES if path.suffix == ".h" and path.name not in _OPERATORS}
     if files.keys() != set(_ORDER):
         raise RuntimeError(f"The native executor has the files {sorted(files)}, not {sorted(_ORDER)}.")
     text = "\n".join(files[name] for name in _ORDER)
@@ -96,22 +79,6 @@ def _engine() -> tuple[str, str]:
     return "\n".join(includes), re.sub(r"\n{3,}", "\n\n", text).strip()
 
 
-def _tape(name: str, tape: Tape) -> str:
-    rows = (f"{{{', '.join(map(str, row))}}}" for row in tape.instructions.tolist())
-    parts = [f"const gn::Instruction {name}_INSTRUCTIONS[] = {{\n{_wrapped(rows)}\n}};"]
-    parts.append(_array(f"{name}_CONSTANTS", tape.constants))
-    parts.append(_array(f"{name}_ENDS", np.array(tape.phases, dtype=np.int32)))
-    for which, tables in (("INPUTS", tape.inputs), ("OUTPUTS", tape.outputs)):
-        parts += [_array(f"{name}_{which}_{i}", each) for i, each in enumerate(tables)]
-        names = ", ".join(f"{name}_{which}_{i}" for i in range(len(tables)))
-        parts.append(f"const int32_t* const {name}_{which}[] = {{{names}}};")
-    parts.append(
-        f"const gn::Tape {name} = {{{name}_INSTRUCTIONS, {name}_CONSTANTS, {name}_ENDS, {tape.registers},"
-        f" {name}_INPUTS, {name}_OUTPUTS}};"
-    )
-    return "\n".join(parts)
-
-
 def _array(name: str, values: np.ndarray) -> str:
     return f"const {_TYPES[values.dtype.char]} {name}[] = {{\n{_numbers(values)}\n}};"
 
@@ -119,7 +86,8 @@ def _array(name: str, values: np.ndarray) -> str:
 def _numbers(values: np.ndarray) -> str:
     """Numbers that are read back bit for bit; a zero for none, as C++ has no empty arrays."""
     form = {"f": "%.9g", "d": "%.17g"}.get(values.dtype.char, "%d")
-    text = _wrapped(form % value for value in values.ravel().tolist() or [0])
+    least = -(2**63)  # which C++ has no literal for
+    text = _wrapped("INT64_MIN" if value == least else form % value for value in values.ravel().tolist() or [0])
     return text.replace("inf", "INFINITY").replace("nan", "NAN")
 
 
@@ -155,8 +123,8 @@ _HEADER = """\
  * Without -march=native (or -mavx2 -mfma) it is three to eight times as slow, and GCC warns of its vector ABI, which
  * does not matter here.
  *
- * Functions may be called from several threads at once. They return 0, or 1 if a channel that cannot move is not as in
- * @NAME@_rest; then they write nothing.
+ * Functions may be called from several threads at once. They return 0, or 1 without memory, or where no maths is known
+ * for states whose channels that cannot move are not as in @NAME@_rest.
  */
 #ifndef @UPPER@_H
 #define @UPPER@_H
@@ -236,21 +204,41 @@ namespace {
 
 // The scene.
 @ARRAYS@
-const gn::Maths MATHS = @MATHS@;
-
-const gn::Network<@TYPE@>& network() {
-  static const gn::Network<@TYPE@> packed(CODE, WEIGHTS, TABLES);
-  return packed;
-}
 
 gn::Array array(const double* data) { return {const_cast<double*>(data), 1}; }
 
-int run(gn::Call call, bool adjoint) {
-  if (!gn::fits(MATHS, call)) return 1;
-  call.threads = std::max<int64_t>(call.threads, 1);
-  call.tile = std::min<int64_t>(@TILE@, (call.batch + call.threads - 1) / call.threads);
-  if (call.batch > 0) gn::run(MATHS, network(), call, adjoint);
+gn::Array from(gn::Array array, int64_t count) {
+  if (array.data) array.data = static_cast<double*>(array.data) + count;
+  return array;
+}
+
+// Runs neighbours that need the same state maths together.
+int run(const gn::Call& whole, bool adjoint) try {
+  const gn::Structure structure{STRUCTURE};
+  const gn::Network<@TYPE@> network(structure, WEIGHTS, TABLES);
+  const gn::Maths special(structure, *structure.maths(0));
+  const int64_t rows = whole.steps + whole.with_start, size = special.size;
+  for (int64_t first = 0, end = 0; first < whole.batch; first = end) {
+    const bool fits = gn::fits(special, whole.states, first * whole.state_stride);
+    for (end = first + 1; end < whole.batch; ++end)
+      if (gn::fits(special, whole.states, end * whole.state_stride) != fits) break;
+    const gn::MathsWords* words = structure.maths(fits ? 0 : 1);
+    if (!words) return 1;
+    gn::Call call = whole;
+    call.batch = end - first;
+    call.threads = std::max<int64_t>(call.threads, 1);
+    call.tile = std::min(gn::kTile, (call.batch + call.threads - 1) / call.threads);
+    call.states = from(call.states, first * call.state_stride);
+    call.actions = from(call.actions, first * call.steps * special.actions);
+    call.out = from(call.out, first * rows * size);
+    call.grad_state = from(call.grad_state, first * size);
+    call.grad_actions = from(call.grad_actions, first * call.steps * special.actions);
+    call.numbers = NUMBERS;
+    gn::run(gn::Maths(structure, *words), network, call, adjoint);
+  }
   return 0;
+} catch (const std::exception&) {
+  return 1;
 }
 
 }  // namespace
@@ -262,23 +250,29 @@ extern const double @NAME@_rest[@UPPER@_STATE] = {
 };
 
 int @NAME@_step(const double* state, const double* action, double* next) {
-  return run({1, 1, 1, 1, array(state), @UPPER@_STATE, array(action), array(next), 0, {}, {}, nullptr, 0, nullptr,
-              nullptr, nullptr, nullptr, 0},
-             false);
+  gn::Call call{};
+  call.batch = call.steps = call.threads = 1;
+  call.states = array(state), call.state_stride = @UPPER@_STATE;
+  call.actions = array(action), call.out = array(next);
+  return run(call, false);
 }
 
 int @NAME@_rollout(int batch, int steps, int threads, const double* start, const double* actions, double* states) {
-  return run({batch, steps, 1, threads, array(start), @UPPER@_STATE, array(actions), array(states), 1, {}, {}, nullptr,
-              0, nullptr, nullptr, nullptr, nullptr, 0},
-             false);
+  gn::Call call{};
+  call.batch = batch, call.steps = steps, call.threads = threads, call.with_start = 1;
+  call.states = array(start), call.state_stride = @UPPER@_STATE;
+  call.actions = array(actions), call.out = array(states);
+  return run(call, false);
 }
 
 int @NAME@_rollout_gradient(int batch, int steps, int threads, const double* states, const double* actions,
                             const double* grad_states, double* grad_start, double* grad_actions) {
-  return run({batch, steps, 1, threads, array(states), (steps + int64_t{1}) * @UPPER@_STATE, array(actions),
-              array(grad_states), 1, array(grad_start), array(grad_actions), nullptr, 0, nullptr, nullptr,
-              nullptr, nullptr, 0},
-             true);
+  gn::Call call{};
+  call.batch = batch, call.steps = steps, call.threads = threads, call.with_start = 1;
+  call.states = array(states), call.state_stride = (steps + int64_t{1}) * @UPPER@_STATE;
+  call.actions = array(actions), call.out = array(grad_states);
+  call.grad_state = array(grad_start), call.grad_actions = array(grad_actions);
+  return run(call, true);
 }
 }
 """

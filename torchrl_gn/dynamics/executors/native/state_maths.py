@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from torchrl_gn.dynamics.executors.native.expressions import Expressions, Scalar
 from torchrl_gn.dynamics.executors.native.samples import ParameterInputs
 from torchrl_gn.dynamics.executors.native.tape import Tape, assemble
 from torchrl_gn.dynamics.executors.native.trace import Array, trace
-from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.dynamics.program import StepProgram, numbers_of, with_numbers
 
 
 class StateMaths:
@@ -27,7 +28,7 @@ class StateMaths:
         constant: ``[N, C]`` which channels may be taken for constant; those that the step changes are not.
         predicted: ``[P]`` nodes that the network predicts.
         width: components of each, ``F_out``.
-        parameters: which physical parameters are inputs.
+        parameters: which physical parameters are inputs, beside the model's numbers.
         change: whether the result is the change ``[N, 12]`` instead of the next state.
 
     Raises:
@@ -53,7 +54,7 @@ class StateMaths:
                 break
             constant = constant & ~changed
         self.is_constant, self.state = constant, state
-        self.actions, self.parameters = len(groups[1]), len(parameters)
+        self.actions, self.numbers = len(groups[1]), len(groups[3])
         flat = constant.ravel()
         self.varying = np.flatnonzero(~flat).astype(np.int32)  # [L] channels of the flat state [N * C] that change
         self.constant = np.flatnonzero(flat).astype(np.int32)  # [N * C - L] the others
@@ -66,7 +67,7 @@ class StateMaths:
             changes = np.array([isinstance(each, Scalar) or each != 0 for each in delta.ravel()], dtype=bool)
             self.results, self.result_size = np.flatnonzero(changes).astype(np.int32), delta.size
             self._after = delta.ravel()[changes].tolist()
-        # Varying channels, action, the network's output, parameters.
+        # Varying channels, action, the network's output, numbers.
         self._groups = groups
         # Phase 0: network inputs from the varying channels and the action; phase 1: the result from the network's
         # output.
@@ -119,20 +120,30 @@ def _forward(
     outputs = np.array(graph.inputs(2, len(predicted) * width), dtype=object)
     full = np.full((len(state), width), 0.0, dtype=object)
     full[predicted] = outputs.reshape(len(predicted), width)
-    read, arrays = parameters.symbols(graph)
+    shapes = [each.shape for each in numbers_of(program)]
+    ends = np.cumsum([0, *(shape.numel() for shape in shapes)])
+    read = graph.inputs(3, int(ends[-1]) + len(parameters))
+    numbers = [
+        np.array(read[start:end], dtype=object).reshape(shape)
+        for start, end, shape in zip(ends, ends[1:], shapes, strict=False)
+    ]
+    arrays = parameters.arrays(read[ends[-1] :])
+
+    def own(symbolic: tuple[Tensor, ...]) -> StepProgram:
+        given = iter(symbolic)
+        changed = with_numbers(program, itertools.islice(given, len(numbers)))
+        return replace(changed, parameters=parameters.complete(given))
 
     def before(state: Tensor, action: Tensor, *symbolic: Tensor) -> tuple[Tensor, ...]:
-        own = replace(program, parameters=parameters.complete(symbolic))
-        canonical = eager.canonical_state(own, state, action)
-        nodes, edges = eager.features(own, canonical, action)
-        return program.nodes(nodes, torch.float64), program.edges(edges, torch.float64)
+        of = own(symbolic)
+        nodes, edges = eager.features(of, eager.canonical_state(of, state, action), action)
+        return of.nodes(nodes, torch.float64), of.edges(edges, torch.float64)
 
     def after(state: Tensor, action: Tensor, predicted: Tensor, *symbolic: Tensor) -> tuple[Tensor, ...]:
-        own = replace(program, parameters=parameters.complete(symbolic))
-        canonical = eager.canonical_state(own, state, action)
-        change = eager.change(own, state, canonical, predicted)
+        of = own(symbolic)
+        change = eager.change(of, state, eager.canonical_state(of, state, action), predicted)
         return program.layout.apply(state, change), change
 
-    inputs = [each for part in trace(before, symbols, actions, *arrays) for each in part.ravel().tolist()]
+    inputs = [each for part in trace(before, symbols, actions, *numbers, *arrays) for each in part.ravel().tolist()]
     groups = [symbols[~constant].tolist(), actions.tolist(), outputs.tolist(), read]
-    return groups, inputs, trace(after, symbols, actions, full, *arrays)
+    return groups, inputs, trace(after, symbols, actions, full, *numbers, *arrays)

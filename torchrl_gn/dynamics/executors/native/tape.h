@@ -5,12 +5,9 @@
 #include <cstdint>
 #include <cstring>
 
-namespace gn {
+#include "structure.h"
 
-struct Instruction {
-  uint16_t code, out, a, b, c, padding;
-  uint32_t k;
-};
+namespace gn {
 
 template <int W>
 struct Lanes {
@@ -69,22 +66,14 @@ inline typename Lanes<W>::Double sine(typename Lanes<W>::Double x, int64_t quart
   return select<V>(out < -1, V{} - 1.0, out);
 }
 
-struct Tape {
-  const Instruction* instructions;
-  const double* constants;
-  const int32_t* ends;  // where each phase ends
-  int64_t registers;
-  const int32_t* const* inputs;  // registers of every group
-  const int32_t* const* outputs;  // and of every phase's outputs
-};
-
 // r holds registers of C vectors of W lanes each.
 template <int W, int C>
 void run_tape(const Tape& tape, int phase, double* registers) {
   using V = typename Lanes<W>::Double;
   V* const r = reinterpret_cast<V*>(registers);
-  const Instruction* at = tape.instructions + (phase ? tape.ends[phase - 1] : 0);
-  const Instruction* const end = tape.instructions + tape.ends[phase];
+  const double* const constants = tape.constants;
+  const Instruction* at = tape.instructions + (phase ? tape.words.ends[phase - 1] : 0);
+  const Instruction* const end = tape.instructions + tape.words.ends[phase];
   // In the order of OPERATIONS in expressions.py. A jump at the end of every instruction: the processor learns what follows which.
   static const void* const labels[] = {
       &&CONSTANT, &&INPUT, &&ADD_C, &&SUB_C, &&MUL_C, &&DIV_C, &&SQRT, &&SIN, &&COS, &&ABS, &&MAX_C, &&MIN_C, &&LESS_C,
@@ -99,12 +88,13 @@ void run_tape(const Tape& tape, int phase, double* registers) {
     const V* const a = r + C * at->a;                 \
     const V* const b = r + C * at->b;                 \
     const V* const c = r + C * at->c;                 \
-    const V k = V{} + tape.constants[at->k];          \
+    const V k = V{} + constants[at->k];          \
     (void)a, (void)b, (void)c, (void)k;               \
     ++at;                                             \
     for (int i = 0; i < C; ++i) out[i] = expression;  \
     NEXT;                                             \
   }
+  static_assert(sizeof labels / sizeof *labels == kOperations, "one label an operation");
   const V one = V{} + 1.0, zero = V{};
   NEXT;
   INSTRUCTION(CONSTANT, k)

@@ -1,0 +1,402 @@
+"""A forward model bound to one scene: predicts with the model's weights as they are at each call."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.nn.functional import hardshrink, pad
+
+from torchrl_gn.dynamics.constraints import make_projection, position_weight
+from torchrl_gn.dynamics.executors import EagerExecutor, NativeExecutor, eager
+from torchrl_gn.dynamics.features.controls import ControlInputs
+from torchrl_gn.dynamics.features.feature import graph_edges
+from torchrl_gn.dynamics.parameters import ParameterReader
+from torchrl_gn.dynamics.predictor import Predictor, check_shapes
+from torchrl_gn.dynamics.program import InputScaling, OutputScaling, PreparedStep, StepProgram, structure_key
+from torchrl_gn.finite import is_traced, require_finite
+from torchrl_gn.maths import quaternion
+from torchrl_gn.networks.core import Core, FoldedCore, ReducibleCore, UnfoldedCore, dtype_of
+from torchrl_gn.networks.graph import Graph
+from torchrl_gn.networks.incidence import Incidence
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
+from torchrl_gn.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.model import ForwardModel
+    from torchrl_gn.maths.state_layout import StateLayout
+    from torchrl_gn.scenes import ParameterNames
+
+# Standard deviations below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
+DYNAMIC_FLOOR = 1e-9
+# Steps of samples from which C++ pays: folding and packing take as long as some hundreds, tracing once more.
+_PAYS = 512
+
+
+class UnseenParameterWarning(UserWarning):
+    """A scene has a physical parameter that the model never saw vary in training."""
+
+
+class BoundPredictor(Predictor):
+    """Predict one scene with a forward model's shared weights; made by :meth:`ForwardModel.bind`.
+
+    Live: it folds the weights for the scene at each call (once a rollout), so whatever changes them shows in the next
+    prediction. Differentiable in states, actions and weights. Long rollouts and large batches run in C++.
+
+    Options are those of :meth:`ForwardModel.bind`.
+
+    Raises:
+        ValueError: if the scene lacks parameters that the model reads, its graph has another size than the core reads,
+            or it is a variant whose parameters must be hidden from the model; or with ``strict``.
+    """
+
+    model: ForwardModel
+    movable: Tensor
+    reference_state: Tensor  # [N, C]
+
+    def __init__(
+        self,
+        model: ForwardModel,
+        scene: Scene,
+        *,
+        strict: bool = False,
+        reference: bool = False,
+        state_key: NestedKey = "state",
+        action_key: NestedKey = "action",
+        parameters_key: NestedKey | None = None,
+        parameter_names: ParameterNames | None = None,
+    ) -> None:
+        keys = {"state_key": state_key, "action_key": action_key, "parameters_key": parameters_key}
+        super().__init__(scene, model.layout, recurrent=model.core.recurrent, **keys)
+        _check_scene(model, scene, varies=parameters_key is not None)
+        self.model, self.strict, self.reference = model, strict, reference
+        self._executors: dict[tuple, NativeExecutor] = {}  # by the structures they run
+
+        self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
+        self.register_buffer("reference_state", reference_state(scene, model.layout), persistent=False)
+        predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
+        self.incidence = Incidence(graph_edges(scene, model.features), scene.num_nodes, predicted)
+        self.canonicalizer = model.canonicalizer.bind(scene, model.layout)
+        self.controls = ControlInputs(scene)
+        self.features = nn.ModuleDict({"nodes": nn.ModuleList(), "edges": nn.ModuleList()})
+        for feature in model.features:
+            bound = feature.bind(scene, model.layout, self.canonicalizer)
+            self.features[feature.part].append(bound)  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
+        # Bodies that rotate about one fixed point have nothing to project.
+        joined = scene.joint_anchors.root != np.arange(scene.num_nodes)
+        constrained = bool((scene.movable[:, :3].any(1) & joined).any())
+        # Anchors follow from lengths, which are hidden from a model of variants that does not read them.
+        hidden = parameters_key is not None and model.parameter_source == "none"
+        self.projection = make_projection(scene) if model.project and constrained and not hidden else None
+        self.parameter_reader = ParameterReader(
+            model, scene, parameters_key, project=self.projection is not None, brought=parameter_names
+        )
+        self.to(model.residual_normalizer.mean.device)
+        _warn_of_unseen(self, self.scene_parameters, scene.name, stacklevel=4)
+
+    @property
+    def scene_parameters(self) -> PhysicalParameters:
+        """The scene's physical parameters, without batch."""
+        return self.parameter_reader.own
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return dtype_of(self.model.core)
+
+    @property
+    def _edge_index(self) -> Tensor:
+        return self.incidence.edge_index
+
+    def own_parameters(self) -> TensorDict:
+        return self.parameter_reader.entries()
+
+    def parameters_of(self, scene: Scene) -> TensorDict:
+        here, there = topology(self.scene), topology(scene)
+        differs = [what for what in here if here[what] != there[what]]
+        if differs:
+            raise ValueError(
+                f"Scene {scene.name!r} is no variant of {self.scene.name!r}: {', '.join(differs)} differ."
+                " Bind the model to it instead."
+            )
+        values = self.model.parameters_of(scene)
+        _warn_of_unseen(self, values, scene.name, stacklevel=3)
+        return self.parameter_reader.of(scene, values)
+
+    def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        return self.parameter_reader.find(tensordict)
+
+    def initial_hidden_state(self) -> TensorDict | None:
+        if not self.recurrent:
+            return None
+        return self.model.core.start(static_graph(self, self.scene_parameters)).tensordict()
+
+    def recentered(self, states: Tensor) -> Tensor:
+        return self.canonicalizer.recentered(states)
+
+    def training_squares(self) -> dict[str, Tensor]:
+        normalizer = self.model.node_normalizer
+        second_moment, columns = normalizer.mean.square() + normalizer.std.square(), self.model.state_columns()
+        adding = (each.name for each in self.layout.components if each.kind == "add" and each.name in columns)
+        return {name: second_moment[columns[name]].sum() for name in adding}
+
+    def program(
+        self,
+        parameters: TensorDictBase | None = None,
+        *,
+        reference: bool | None = None,
+        reduced: bool = False,
+        rows: Tensor | None = None,
+        core: Core | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> StepProgram:
+        """The step as it is now, differentiable in the weights.
+
+        Args:
+            parameters: physical parameters of each sample; default: the scene's.
+            reference: whether not to fold the core; default: as bound.
+            reduced: leave out features that never vary, and take scales into the network's layers.
+            rows: components of the change to predict, the others keep their mean; default: all, so that a loss of
+                weights that are not finite is not finite.
+            core: another core with the same weights.
+            dtype: of the network; default: that of the core.
+        """
+        model, values = self.model, self.parameter_reader.read(parameters)
+        core = model.core if core is None else core
+        static = static_graph(self, values, dtype_of(core))
+        unfolded = self.reference if reference is None else reference
+        folded = UnfoldedCore(core, static) if unfolded else core.fold(self.incidence, static)
+        if reduced and rows is None:
+            rows = torch.arange(model.residual_normalizer.size, device=self.movable.device)
+        folded, nodes, edges, output = _scaled(self, folded, rows if reduced else None)
+        return StepProgram(
+            layout=self.layout,
+            # Physics know how rates integrate.
+            timestep=float(self.scene.timestep) if model.integrate and model.physics is None else None,
+            movable=self.movable,
+            edge_index=self.incidence.edge_index,
+            reference=self.reference_state,
+            standard=self.scene_parameters,
+            parameters=values,
+            canonicalizer=self.canonicalizer,
+            controls=self.controls,
+            node_features=self.features["nodes"],
+            edge_features=self.features["edges"],
+            projection=self.projection,
+            nodes=nodes,
+            edges=edges,
+            recurrent=core if self.recurrent else None,
+            static=static if self.recurrent else None,
+            core=folded,
+            output=output,
+            position_weight=None if self.projection is None else position_weight(model.delta_normalizer.std),
+            dtype=dtype or dtype_of(core),
+            physics=model.physics,
+        )
+
+    def prepared(self, parameters: TensorDictBase | None = None, *, size: int = 1) -> PreparedStep:
+        if size < _PAYS or not self._may_run_natively(parameters):
+            program = self.program(parameters)
+            return PreparedStep(EagerExecutor(program), program)
+        return self._prepared_natively(parameters, change=False)
+
+    def prepared_for_training(self, parameters: TensorDictBase | None = None) -> PreparedStep:
+        """The step for :meth:`PreparedStep.delta`, differentiable in states, actions and weights."""
+        if not self._may_run_natively(parameters):
+            program = self.program(parameters)
+            return PreparedStep(EagerExecutor(program), program)
+        return self._prepared_natively(parameters, change=True)
+
+    def _may_run_natively(self, parameters: TensorDictBase | None) -> bool:
+        # What is traced cannot ask which features vary; C++ has no gradient in parameters of physics or samples.
+        if is_traced() or self.reference or (self.model.physics is not None and self.model.physics.trained):
+            return False
+        return self.movable.is_cpu and (parameters is None or not torch.is_grad_enabled())
+
+    def _prepared_natively(self, parameters: TensorDictBase | None, *, change: bool) -> PreparedStep:
+        program = self.program(parameters, reduced=True)
+        key = (change, *structure_key(program))
+        if (executor := self._executors.get(key)) is None:
+            executor = self._executors[key] = NativeExecutor(program, change=change)
+        return PreparedStep(executor, executor.pack(program))
+
+
+def reference_state(scene: Scene, layout: StateLayout) -> Tensor:
+    """A scene's reference pose at rest, ``[N, C]`` float64; of a robot known by its joints, all angles zero."""
+    if not isinstance(scene, Scene):
+        return torch.eye(layout.size, dtype=torch.float64)[0].repeat(scene.num_nodes, 1)
+    data = mujoco.MjData(scene.model)
+    for stage in ("kinematics", "comPos", "comVel", "sensorPos", "sensorVel"):
+        getattr(mujoco, f"mj_{stage}")(scene.model, data)
+    return torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, scene.state_size).copy())
+
+
+def static_graph(predictor: BoundPredictor, parameters: PhysicalParameters, dtype: torch.dtype | None = None) -> Graph:
+    """Normalised static graph of physical parameters, in the network's dtype by default."""
+    model, dtype = predictor.model, dtype or predictor.dtype
+    if model.parameter_source == "inferred":  # comes from a network already
+        nodes, edges, globals_ = (part.to(dtype) for part in parameters[:3])
+        if model.project:
+            own = predictor.scene_parameters
+            change = (parameters.parent_anchor - own.parent_anchor, parameters.child_anchor - own.child_anchor)
+            offsets = (torch.cat(change, dim=-1) / predictor.scene.joint_anchors.anchor_scale).to(dtype)
+            nodes = torch.cat((nodes, offsets.expand(*nodes.shape[:-1], 6)), dim=-1)
+    else:
+        normalizers = model.parameter_normalizers.items()
+        nodes, edges, globals_ = (normalizer(getattr(parameters, part), dtype) for part, normalizer in normalizers)
+        if model.marks_edges:
+            edges = pad(edges, (0, 1, 0, predictor.incidence.num_edges - edges.shape[-2]))
+            added = torch.arange(edges.shape[-2], device=edges.device) >= predictor.scene.num_edges
+            edges = torch.cat((edges[..., :-1], added.to(dtype).unsqueeze(-1).expand_as(edges[..., -1:])), dim=-1)
+    return Graph(nodes, edges, globals_, predictor.incidence.edge_index)
+
+
+def dynamic_graph(predictor: BoundPredictor, state: Tensor, action: Tensor) -> Graph:
+    """Normalised dynamic graph ``[*B, ...]`` of states and actions, in the network's dtype."""
+    check_shapes(predictor.scene, state, action)
+    program = predictor.program(reference=True)
+    return eager.dynamic_graph(program, eager.canonical_state(program, state, action), action)
+
+
+def residual(program: StepProgram, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    """Target of the network for transitions: change ``[*B, N, 12]`` in the yaw frame, less what is known of it.
+
+    That is what the rates explain, or what physics predict.
+    """
+    layout, canonical = program.layout, eager.canonical_state(program, state, action)
+    change = layout.delta(state, next_state)
+    if program.timestep is not None:
+        change = layout.residual(state, change, program.timestep)
+    if (rotation := canonical.rotation) is not None:
+        change = layout.rotate_delta(change, quaternion.conjugate(rotation.quaternion), rotation.matrix.mT)
+    # What differs by rounding alone is to be corrected by exactly nothing.
+    return change if canonical.change is None else hardshrink(change - canonical.change, DYNAMIC_FLOOR)
+
+
+def update_parameter_normalizers(predictor: BoundPredictor, parameters: TensorDictBase | None = None) -> None:
+    """Take physical parameters, by default the scene's, into the model's statistics: once, before training.
+
+    An inferred graph has no statistics. ValueError, and no change, if one is not finite.
+    """
+    if parameters is not None:
+        require_finite(parameters, "parameters")
+    if predictor.model.parameter_source == "inferred":
+        return
+    values = predictor.parameter_reader.read(parameters)
+    for part, normalizer in predictor.model.parameter_normalizers.items():
+        normalizer.update(getattr(values, part))
+
+
+def update_dynamic_normalizers(
+    predictor: BoundPredictor, state: Tensor, action: Tensor, next_state: Tensor, parameters: TensorDictBase | None = None
+) -> None:
+    """Take transitions into the model's statistics (paper, "One step of the training algorithm").
+
+    ``state`` ``[*B, N, 13]`` has the input noise that training adds, ``next_state`` none; ``parameters`` are by default
+    the scene's. ValueError, and no change, if a shape does not fit or a number is not finite.
+    """
+    check_shapes(predictor.scene, state, action, parameters)
+    given = {"state": state, "action": action, "next state": next_state, "parameters": parameters}
+    for what, value in given.items():
+        if value is not None:
+            require_finite(value, what)
+    model, movable, program = predictor.model, predictor.movable, predictor.program(parameters, reference=True)
+    nodes, edges = eager.features(program, eager.canonical_state(program, state, action), action)
+    for part, given in (("nodes", nodes), ("edges", edges)):
+        if given.shape[-1] != (size := getattr(model.dynamic_size, part)):
+            raise ValueError(f"Features of {part} give {given.shape[-1]} numbers, but their size() says {size}.")
+    model.node_normalizer.update(nodes)
+    model.edge_normalizer.update(edges)
+    model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)
+    model.residual_normalizer.update(residual(program, state, action, next_state), movable)
+
+
+def _scaled(
+    predictor: BoundPredictor, core: FoldedCore, rows: Tensor | None
+) -> tuple[FoldedCore, InputScaling, InputScaling, OutputScaling]:
+    """A folded core with the scaling of its nodes, edges and output.
+
+    With ``rows``, the components to predict, the core takes the scaling in and drops features that never vary, if
+    it can.
+    """
+    model = predictor.model
+    node, edge, residual = model.node_normalizer, model.edge_normalizer, model.residual_normalizer
+    # A hidden state is updated from all features.
+    if rows is None or predictor.recurrent or not isinstance(core, ReducibleCore):
+        return core, InputScaling.of(node), InputScaling.of(edge), OutputScaling.of(residual)
+    nodes, edges = InputScaling.folded(node), InputScaling.folded(edge)
+    assert nodes.columns is not None and edges.columns is not None
+    core = core.reduced(
+        (nodes.columns, node.inverse_std[nodes.columns]),
+        (edges.columns, edge.inverse_std[edges.columns]),
+        (rows, residual.std[rows]),
+        residual.mean[rows],
+    )
+    return core, nodes, edges, OutputScaling.folded(residual, rows)
+
+
+def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
+    """ValueError if the graph has another size than the core reads, or shows parameters hidden from the model.
+
+    ``varies``: whether each sample may be another variant of the scene.
+    """
+    counts, size = model.core.counts, (scene.num_nodes, graph_edges(scene, model.features).shape[1])
+    if counts is not None and counts != size:
+        raise ValueError(
+            f"The model reads graphs of {counts[0]} nodes and {counts[1]} edges alone; scene {scene.name!r} has"
+            f" {size[0]} and {size[1]}. Train another, or a graph network."
+        )
+    if varies and model.marks_edges:
+        raise ValueError(
+            "PairContacts has the geoms of one scene, but each sample may be another variant: leave the feature out."
+        )
+    if model.parameter_source != "scene" and "parameters" in getattr(scene, "origin", ()):
+        raise ValueError(
+            f"The model must not see true parameters (parameters={model.parameter_source!r}), and {scene.name!r} is a"
+            " variant, whose joint anchors would show its lengths. Bind the model to the standard scene."
+        )
+
+
+def _warn_of_unseen(predictor: BoundPredictor, values: PhysicalParameters, name: str, *, stacklevel: int) -> None:
+    """Warn, or raise ValueError with ``strict``, where a scene differs in a parameter constant in training."""
+    model, unseen = predictor.model, []
+    if predictor.movable.is_meta:  # there are no numbers to compare with
+        return
+    for part, normalizer in model.parameter_normalizers.items() if model.parameter_source == "scene" else ():
+        mean = normalizer.mean
+        given = getattr(values, part).to(mean.device)
+        if given.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
+            continue
+        # 1e-6: the same scene compiled on another machine may differ in the last digits.
+        differs = ((given - mean).abs() > 1e-6 * mean.abs().clamp(min=1e-12)).reshape(-1, given.shape[-1]).any(0)
+        for index in (normalizer.constant & differs).nonzero().flatten().tolist():
+            unseen.append(getattr(model.parameter_names, part)[index])
+    residual = model.residual_normalizer
+    if model.physics is None and bool((residual.count > 0).any()):
+        fixed = (predictor.movable & residual.constant).any(0).tolist()
+        unseen += itertools.compress(_change_names(model.layout), fixed)
+    if not unseen:
+        return
+    message = (
+        f"Scene {name!r} has values that the model never saw, in features that never varied in its"
+        f" training: {', '.join(unseen)}. They are ignored and predictions may be wrong."
+    )
+    if predictor.strict:
+        raise ValueError(message)
+    warnings.warn(message, UnseenParameterWarning, stacklevel=stacklevel)
+
+
+def _change_names(layout: StateLayout) -> list[str]:
+    """Names of the channels of a state change."""
+    axes = {1: ("",), 3: (" x", " y", " z")}
+    return [
+        f"change of {component.name.replace('_', ' ')}{axis}"
+        for component in layout.components
+        for axis in axes.get(component.delta_size, [f" {index}" for index in range(component.delta_size)])
+    ]

@@ -1,0 +1,35 @@
+#include "engine.h"
+
+#include "rollout.h"
+
+namespace gn {
+
+// Calls a function with the network of a structure.
+template <class F>
+auto with_network(const Structure& structure, const Weights& given, F function) {
+  if (given.type == kFloat64)
+    return function(Network<double>(structure, given.weights, static_cast<const double*>(given.tables)));
+#ifdef __AVX512BF16__
+  if (given.type == kBfloat16Pairs)
+    return function(Network<float, true>(structure, given.weights, static_cast<const float*>(given.tables)));
+#endif
+  return function(Network<float>(structure, given.weights, static_cast<const float*>(given.tables)));
+}
+
+bool has_bfloat16() {
+#ifdef __AVX512BF16__
+  return true;
+#else
+  return false;
+#endif
+}
+
+void run(const Maths& maths, const Weights& weights, const Call& call, bool adjoint) {
+  with_network(maths.structure, weights, [&](const auto& network) { run(maths, network, call, adjoint); });
+}
+
+int64_t stored_count(const Maths& maths, const Weights& weights, const Call& call) {
+  return with_network(maths.structure, weights, [&](const auto& network) { return stored_count(network, maths, call); });
+}
+
+}  // namespace gn

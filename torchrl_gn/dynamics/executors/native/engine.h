@@ -1,0 +1,22 @@
+// The engine for all types of numbers, without PyTorch: what operators.cpp calls of engine.cpp.
+#pragma once
+
+#include "call.h"
+
+namespace gn __attribute__((visibility("hidden"))) {
+
+// Numbers of a network's weights and tables.
+enum Type : int64_t { kFloat32, kFloat64, kBfloat16Pairs };
+
+// A network: packed weights of some type, tables of float32 or, with float64 weights, float64.
+struct Weights {
+  Type type;
+  const void *weights, *tables;
+};
+
+// Errors are C++ exceptions: std::bad_alloc if there is no memory.
+bool has_bfloat16();
+void run(const Maths& maths, const Weights& weights, const Call& call, bool adjoint);
+int64_t stored_count(const Maths& maths, const Weights& weights, const Call& call);
+
+}  // namespace gn

@@ -1,0 +1,552 @@
+// The native executor as PyTorch operators: pure functions of tensors, with shapes for compilers and gradients.
+//
+// rollout(state [*B, N, C], actions [*B, (T,) A], ...) gives the next state, or with `many` the states [*B, T + 1, N, C].
+// `structure` is the array of structure.h; `weights` and `tables` are packed by pack(), `sample_tables` and `numbers`
+// by executor.py. Gradients are of first order, in state, actions, weights and tables.
+#include <ATen/Parallel.h>
+#include <ATen/core/dispatch/Dispatcher.h>
+#include <ATen/core/grad_mode.h>
+#include <ATen/ops/arange.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/empty_like.h>
+#include <ATen/ops/index_select.h>
+#include <ATen/ops/zeros.h>
+#include <ATen/ops/zeros_like.h>
+#include <torch/csrc/autograd/custom_function.h>
+#include <torch/library.h>
+
+#include <mutex>
+#include <new>
+#include <tuple>
+#include <vector>
+
+#include "engine.h"
+
+namespace {
+
+using at::Tensor;
+using OptionalTensor = std::optional<Tensor>;
+using torch::autograd::AutogradContext;
+using torch::autograd::variable_list;
+
+constexpr int64_t kMostStored = int64_t(1) << 28;  // bytes that are kept for a gradient; else steps are computed again
+
+// Memory of large results that is used again: fresh pages cost as much as filling them.
+class Pool {
+ public:
+  static Tensor take(int64_t count, at::ScalarType type) {
+    const size_t bytes = count * c10::elementSize(type);
+    if (bytes < (size_t(1) << 16)) return empty({count}, type);
+    auto [data, size] = find(bytes);
+    auto give_back = [data = data, size = size](void*) { add(data, size); };
+    return at::from_blob(data, {count}, give_back, at::TensorOptions().dtype(type));
+  }
+  // at::empty, but MemoryError and not RuntimeError if there is no memory.
+  static Tensor empty(at::IntArrayRef shape, at::ScalarType type) {
+    try {
+      return at::empty(shape, at::TensorOptions().dtype(type));
+    } catch (const c10::Error&) {
+      throw std::bad_alloc();
+    }
+  }
+
+ private:
+  struct Block {
+    void* data;
+    size_t size;
+  };
+  static std::mutex& lock() { static auto* one = new std::mutex; return *one; }
+  static std::vector<Block>& free() { static auto* blocks = new std::vector<Block>; return *blocks; }
+  static std::pair<void*, size_t> find(size_t bytes) {
+    {
+      std::lock_guard<std::mutex> guard(lock());
+      for (auto block = free().begin(); block != free().end(); ++block)
+        if (bytes <= block->size && block->size <= 2 * bytes) {
+          auto found = std::pair(block->data, block->size);
+          free().erase(block);
+          return found;
+        }
+    }
+    const size_t size = (bytes + 63) / 64 * 64;
+    void* data = std::aligned_alloc(64, size);
+    if (!data) throw std::bad_alloc();
+    return {data, size};
+  }
+  static void add(void* data, size_t size) {
+    std::lock_guard<std::mutex> guard(lock());
+    free().push_back({data, size});
+    if (free().size() > 2) {
+      std::free(free().front().data);
+      free().erase(free().begin());
+    }
+  }
+};
+
+// What all operators take beside states and actions.
+struct Model {
+  const Tensor &structure, &weights, &tables;
+  const OptionalTensor& sample_tables;
+  const Tensor& numbers;
+};
+
+gn::Structure words_of(const Tensor& structure) {
+  TORCH_CHECK_VALUE(structure.is_cpu() && structure.scalar_type() == at::kLong && structure.is_contiguous() &&
+                        structure.dim() == 1 && structure.numel() > int64_t(sizeof(gn::HeaderWords) / 8),
+                    "The structure of a native step must be contiguous int64 numbers on the processor.");
+  const gn::Structure words{structure.const_data_ptr<int64_t>()};
+  const gn::HeaderWords& header = words.header();
+  TORCH_CHECK_VALUE(header.magic == gn::kMagic && header.format == gn::kFormat &&
+                        header.operations == gn::kOperations && header.words == structure.numel(),
+                    "The structure of a native step is damaged, or of another version: specialise the model again.");
+  return words;
+}
+
+bool is_number(const Tensor& tensor) { return tensor.scalar_type() == at::kFloat || tensor.scalar_type() == at::kDouble; }
+
+void check_model(const gn::Structure& words, const Model& model, int64_t batch) {
+  const gn::NetworkWords& network = words.network();
+  const bool paired = model.weights.scalar_type() == at::kBFloat16;
+  const int64_t count = paired ? 2 * network.paired_weights : network.weights;
+  TORCH_CHECK_VALUE((is_number(model.weights) || paired) && model.weights.numel() == count &&
+                        model.tables.numel() == network.tables && model.weights.is_contiguous() &&
+                        model.tables.is_contiguous() && model.weights.is_cpu() && model.tables.is_cpu() &&
+                        model.tables.scalar_type() == (paired ? at::kFloat : model.weights.scalar_type()),
+                    "The packed weights do not fit the structure of the native step.");
+  const auto& own = model.sample_tables;
+  const bool has_own = own.has_value() && own->defined();
+  TORCH_CHECK_VALUE(has_own == (network.sample_tables > 0) &&
+                        (!has_own || (own->numel() == batch * network.sample_tables && own->is_contiguous() &&
+                                      own->scalar_type() == model.tables.scalar_type())),
+                    "There must be tables of each sample.");
+  const Tensor& numbers = model.numbers;
+  TORCH_CHECK_VALUE(numbers.scalar_type() == at::kDouble && numbers.is_contiguous() && numbers.dim() == 2 &&
+                        (numbers.size(0) == 1 || numbers.size(0) == batch) && numbers.size(1) == words.maths(0)->numbers,
+                    "The numbers of the native step have another shape than its structure.");
+  TORCH_CHECK(!paired || gn::has_bfloat16(), "This processor multiplies no bfloat16.");
+}
+
+gn::Array array(const Tensor& tensor) {
+  return {const_cast<void*>(tensor.const_data_ptr()), tensor.scalar_type() == at::kDouble};
+}
+
+gn::Weights weights_of(const Model& model) {
+  const auto type = model.weights.scalar_type();
+  return {type == at::kDouble ? gn::kFloat64 : type == at::kBFloat16 ? gn::kBfloat16Pairs : gn::kFloat32,
+          model.weights.const_data_ptr(), model.tables.const_data_ptr()};
+}
+
+int64_t thread_count(int64_t threads) { return threads > 0 ? threads : at::get_num_threads(); }
+
+// A call for contiguous states and actions, and which state maths its samples need: 0, 1, or 2 for both.
+struct Prepared {
+  gn::Structure words;
+  gn::Call call{};
+  int which;
+
+  Prepared(const Tensor& states, const Tensor& actions, const Model& model, bool starts_alone, bool many, int64_t threads)
+      : words(words_of(model.structure)) {
+    const gn::MathsWords& maths = *words.maths(0);
+    const int64_t rows = many && !starts_alone ? actions.size(-2) + 1 : 1;
+    call.batch = states.numel() / (maths.size * rows);
+    call.steps = many ? actions.size(-2) : 1;
+    TORCH_CHECK_VALUE(states.dim() >= 2 && states.numel() == call.batch * rows * maths.size && call.batch > 0 &&
+                          call.steps > 0 && actions.numel() == call.batch * call.steps * maths.actions &&
+                          is_number(states) && is_number(actions),
+                      "States or actions do not fit the native step: ", states.sizes(), " and ", actions.sizes(), ".");
+    check_model(words, model, call.batch);
+    call.threads = thread_count(threads);
+    call.tile = std::min(gn::kTile, (call.batch + call.threads - 1) / call.threads);  // such that all threads have some
+    call.states = array(states);
+    call.state_stride = maths.size * rows;
+    call.actions = array(actions);
+    call.with_start = many;
+    call.numbers = model.numbers.const_data_ptr<double>();
+    call.number_stride = model.numbers.size(0) > 1 ? model.numbers.size(1) : 0;
+    if (words.network().sample_tables) call.sample_tables = model.sample_tables->const_data_ptr();
+    which = find_maths(gn::Maths(words, maths));
+  }
+  gn::Maths maths() const { return gn::Maths(words, *words.maths(which)); }
+
+  bool fits(const gn::Maths& special, int64_t sample) const {
+    return gn::fits(special, call.states, sample * call.state_stride);
+  }
+  int find_maths(const gn::Maths& special) const {
+    const bool first = fits(special, 0);
+    for (int64_t s = 1; s < call.batch; ++s)
+      if (fits(special, s) != first) return 2;
+    TORCH_CHECK_NOT_IMPLEMENTED(first || words.maths(1), "The native step has no state maths for such states.");
+    return first ? 0 : 1;
+  }
+};
+
+// Runs a function for the samples of each state maths alone, and puts the results in their places.
+template <class F>
+std::vector<Tensor> apart(const Prepared& prepared, int64_t batch_dims, const std::vector<Tensor>& given,
+                          const Model& model, F function) {
+  std::vector<int64_t> places[2];
+  const gn::Maths special(prepared.words, *prepared.words.maths(0));
+  for (int64_t s = 0; s < prepared.call.batch; ++s) places[prepared.fits(special, s) ? 0 : 1].push_back(s);
+  std::vector<Tensor> results;
+  for (const auto& group : places) {
+    const Tensor at = at::empty({int64_t(group.size())}, at::kLong);
+    std::copy(group.begin(), group.end(), at.data_ptr<int64_t>());
+    std::vector<Tensor> parts;
+    for (const Tensor& each : given) parts.push_back(each.flatten(0, batch_dims - 1).index_select(0, at));
+    OptionalTensor own = model.sample_tables;
+    if (prepared.call.sample_tables) {
+      // Every layer's [I, B, width]: rows of kPanel numbers, of which a table has as many for each item and sample.
+      std::vector<Tensor> layers;
+      const gn::NetworkWords& network = prepared.words.network();
+      const auto* words = prepared.words.at<gn::LayerWords>(network.layers);
+      for (int64_t i = 0; i < network.layer_count; ++i) {
+        if (!words[i].sampled) continue;
+        const int64_t width = (words[i].width + gn::kPanel - 1) / gn::kPanel * gn::kPanel, batch = prepared.call.batch;
+        const int64_t count = words[i].items * width;
+        layers.push_back(own->narrow(0, words[i].table * batch, count * batch)
+                             .view({words[i].items, batch, width}).index_select(1, at).flatten());
+      }
+      own = at::cat(layers);
+    }
+    const Tensor numbers = model.numbers.size(0) > 1 ? model.numbers.index_select(0, at) : model.numbers;
+    const std::vector<Tensor> found = function(parts, Model{model.structure, model.weights, model.tables, own, numbers});
+    for (size_t i = 0; i < found.size(); ++i) {
+      if (results.size() <= i) {
+        auto shape = found[i].sizes().vec();
+        shape[0] = prepared.call.batch;
+        results.push_back(at::empty(shape, found[i].options()));
+      }
+      results[i].index_copy_(0, at, found[i]);
+    }
+  }
+  return results;
+}
+
+std::vector<int64_t> result_shape(const Tensor& state, const Tensor& actions, int64_t channels, bool many) {
+  std::vector<int64_t> shape = state.sizes().vec();
+  if (many) shape.insert(shape.end() - 2, actions.size(-2) + 1);
+  shape.back() = channels;
+  return shape;
+}
+
+enum Keep : int64_t { kNothing, kSlopes, kAll };
+
+// What a gradient needs: `keep` says whether slopes, for that in states, or the only step's activations too.
+std::tuple<Tensor, Tensor> rollout_keeping(const Tensor& state_, const Tensor& actions_, const Tensor& structure,
+                                           const Tensor& weights, const Tensor& tables,
+                                           const OptionalTensor& sample_tables, const Tensor& numbers, int64_t channels,
+                                           bool many, int64_t threads, int64_t keep) {
+  const Tensor state = state_.contiguous(), actions = actions_.contiguous();
+  const Model model{structure, weights, tables, sample_tables, numbers};
+  Prepared prepared(state, actions, model, true, many, threads);
+  if (prepared.which == 2) {  // a gradient computes the steps again
+    auto alone = [&](const std::vector<Tensor>& parts, const Model& of) {
+      return std::vector<Tensor>{std::get<0>(rollout_keeping(parts[0], parts[1], of.structure, of.weights, of.tables,
+                                                             of.sample_tables, of.numbers, channels, many, threads,
+                                                             kNothing))};
+    };
+    const Tensor out = apart(prepared, state.dim() - 2, {state, actions}, model, alone)[0];
+    return {out.view(result_shape(state, actions, channels, many)), at::empty({0}, tables.options())};
+  }
+  gn::Call& call = prepared.call;
+  const gn::Maths maths = prepared.maths();
+  TORCH_CHECK_VALUE(maths.result_size == state.size(-2) * channels, "The native step gives no ", channels, " channels.");
+  const Tensor out = many || channels != state.size(-1)
+                         ? Pool::empty(result_shape(state, actions, channels, many), state.scalar_type())
+                         : at::empty_like(state);
+  call.out = array(out);
+  Tensor stored;
+  if (keep == kAll) call.keeps_all = true, call.tile = std::min(gn::kTile, call.batch);  // so the sums, whatever the threads
+  if (keep != kNothing) {
+    const int64_t count = gn::stored_count(maths, weights_of(model), call);
+    if (keep == kAll || count * tables.element_size() <= kMostStored) stored = Pool::take(count, tables.scalar_type());
+  }
+  if (stored.defined()) call.stored = stored.data_ptr();
+  gn::run(maths, weights_of(model), call, false);
+  return {out, stored.defined() ? stored : at::empty({0}, tables.options())};
+}
+
+Tensor rollout(const Tensor& state, const Tensor& actions, const Tensor& structure, const Tensor& weights,
+               const Tensor& tables, const OptionalTensor& sample_tables, const Tensor& numbers, int64_t channels,
+               bool many, int64_t threads) {
+  return std::get<0>(rollout_keeping(state, actions, structure, weights, tables, sample_tables, numbers, channels, many,
+                                     threads, kNothing));
+}
+
+// Gradients in state, actions, packed weights and tables; the last two empty without `of_weights`. `states` is the start
+// state, with `many` the rollout's result.
+std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradient_, const Tensor& states_,
+                                                           const Tensor& actions_, const Tensor& structure,
+                                                           const Tensor& weights, const Tensor& tables,
+                                                           const OptionalTensor& sample_tables, const Tensor& numbers,
+                                                           const Tensor& stored, bool many, int64_t threads,
+                                                           bool of_weights) {
+  const Tensor gradient = gradient_.contiguous(), states = states_.contiguous(), actions = actions_.contiguous();
+  const Model model{structure, weights, tables, sample_tables, numbers};
+  Prepared prepared(states, actions, model, false, many, threads);
+  TORCH_CHECK_VALUE(is_number(gradient), "A native step takes no gradient of such numbers.");
+  const Tensor nothing = at::empty({0}, tables.options());
+  std::vector<int64_t> shape = states.sizes().vec();
+  if (many) shape.erase(shape.end() - 3);
+  if (prepared.which == 2) {
+    Tensor of_packed = nothing, of_tables = nothing;
+    auto alone = [&](const std::vector<Tensor>& parts, const Model& of) {
+      auto [of_state, of_actions, first, second] =
+          rollout_adjoint(parts[0], parts[1], parts[2], of.structure, of.weights, of.tables, of.sample_tables, of.numbers,
+                          nothing, many, threads, of_weights);
+      of_packed = of_packed.numel() ? of_packed.add_(first) : first;
+      of_tables = of_tables.numel() ? of_tables.add_(second) : second;
+      return std::vector<Tensor>{of_state, of_actions};
+    };
+    const auto found = apart(prepared, shape.size() - 2, {gradient, states, actions}, model, alone);
+    return {found[0].view(shape), found[1].view(actions.sizes()), of_packed, of_tables};
+  }
+  gn::Call& call = prepared.call;
+  const gn::Maths maths = prepared.maths();
+  const Tensor of_state = Pool::empty(shape, states.scalar_type()), of_actions = at::empty_like(actions);
+  const Tensor of_packed = of_weights ? at::zeros_like(weights) : nothing;
+  const Tensor of_tables = of_weights ? at::zeros_like(tables) : nothing;
+  call.out = array(gradient);
+  call.grad_state = array(of_state), call.grad_actions = array(of_actions);
+  if (of_weights) {
+    TORCH_CHECK_VALUE(weights.scalar_type() == tables.scalar_type(), "There is no gradient of bfloat16 weights.");
+    call.grad_weights = of_packed.data_ptr(), call.grad_tables = of_tables.data_ptr();
+    call.keeps_all = stored.numel() > 0;
+    call.tile = std::min(gn::kTile, call.batch);
+  }
+  TORCH_CHECK_VALUE(stored.numel() == 0 || stored.numel() == gn::stored_count(maths, weights_of(model), call),
+                    "What the native step kept for its gradient is of another call.");
+  if (stored.numel()) call.stored = stored.data_ptr();
+  gn::run(maths, weights_of(model), call, true);
+  return {of_state, of_actions, of_packed, of_tables};
+}
+
+int64_t panels(int64_t width) { return (width + gn::kPanel - 1) / gn::kPanel; }
+
+// Matrices [rows, columns] of `shapes`, whose numbers come one after the other, as the engine reads them. Weights as
+// panels of 16 rows, [rows / 16][columns][16], then the same of their transpose; other tables row by row. Both padded
+// with zeros to whole panels.
+Tensor pack(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
+  constexpr int64_t P = gn::kPanel;
+  int64_t given = 0, count = 0;
+  for (size_t i = 0; i + 1 < shapes.size(); i += 2) {
+    const int64_t rows = shapes[i], columns = shapes[i + 1];
+    given += rows * columns;
+    count += P * (weights ? panels(rows) * columns + panels(columns) * rows : rows * panels(columns));
+  }
+  TORCH_CHECK_VALUE(is_number(numbers) && numbers.numel() == given, "Numbers to pack do not have the shapes given.");
+  const Tensor plain = numbers.contiguous(), packed = at::zeros({count}, numbers.options());
+  auto fill = [&](auto zero) {
+    using T = decltype(zero);
+    const T* from = plain.const_data_ptr<T>();
+    T* to = packed.data_ptr<T>();
+    auto put = [&](int64_t rows, int64_t columns, int64_t row_step, int64_t column_step) {
+      for (int64_t panel = 0; panel < panels(rows); panel++)
+        for (int64_t c = 0; c < columns; c++, to += P)
+          for (int64_t r = 0; r < std::min(P, rows - panel * P); r++)
+            to[r] = from[(panel * P + r) * row_step + c * column_step];
+    };
+    for (size_t i = 0; i + 1 < shapes.size(); i += 2) {
+      const int64_t rows = shapes[i], columns = shapes[i + 1];
+      if (weights) {
+        put(rows, columns, columns, 1);
+        put(columns, rows, 1, columns);
+      } else {
+        for (int64_t r = 0; r < rows; r++, to += panels(columns) * P) std::copy_n(from + r * columns, columns, to);
+      }
+      from += rows * columns;
+    }
+  };
+  if (numbers.scalar_type() == at::kDouble) fill(0.0);
+  else fill(0.0f);
+  return packed;
+}
+
+// The gradient of pack(): transposed weights have none.
+Tensor unpack(const Tensor& packed, at::IntArrayRef shapes, bool weights) {
+  constexpr int64_t P = gn::kPanel;
+  std::vector<Tensor> parts;
+  int64_t at = 0;
+  for (size_t i = 0; i + 1 < shapes.size(); i += 2) {
+    const int64_t rows = shapes[i], columns = shapes[i + 1];
+    if (weights) {
+      const Tensor own = packed.narrow(0, at, panels(rows) * P * columns).view({panels(rows), columns, P});
+      parts.push_back(own.transpose(1, 2).flatten(0, 1).narrow(0, 0, rows).flatten());
+      at += P * (panels(rows) * columns + panels(columns) * rows);
+    } else {
+      parts.push_back(packed.narrow(0, at, rows * panels(columns) * P).view({rows, -1}).narrow(1, 0, columns).flatten());
+      at += rows * panels(columns) * P;
+    }
+  }
+  return at::cat(parts);
+}
+
+// Shapes without numbers, for compilers.
+
+Tensor rollout_shape(const Tensor& state, const Tensor& actions, const Tensor&, const Tensor&, const Tensor&,
+                     const OptionalTensor&, const Tensor&, int64_t channels, bool many, int64_t) {
+  std::vector<c10::SymInt> shape = state.sym_sizes().vec();
+  if (many) shape.insert(shape.end() - 2, actions.sym_size(-2) + 1);
+  shape.back() = channels;
+  return at::empty_symint(shape, state.options());
+}
+
+std::tuple<Tensor, Tensor> rollout_keeping_shape(const Tensor& state, const Tensor& actions, const Tensor& structure,
+                                                 const Tensor& weights, const Tensor& tables,
+                                                 const OptionalTensor& sample_tables, const Tensor& numbers,
+                                                 int64_t channels, bool many, int64_t threads, int64_t) {
+  // Compiled code keeps nothing, as how much that is depends on the states: its gradients compute the steps again.
+  return {rollout_shape(state, actions, structure, weights, tables, sample_tables, numbers, channels, many, threads),
+          at::empty({0}, tables.options())};
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint_shape(const Tensor&, const Tensor& states,
+                                                                 const Tensor& actions, const Tensor&,
+                                                                 const Tensor& weights, const Tensor& tables,
+                                                                 const OptionalTensor&, const Tensor&, const Tensor&,
+                                                                 bool many, int64_t, bool of_weights) {
+  std::vector<c10::SymInt> shape = states.sym_sizes().vec();
+  if (many) shape.erase(shape.end() - 3);
+  const Tensor nothing = at::empty({0}, tables.options());
+  return {at::empty_symint(shape, states.options()), at::empty_symint(actions.sym_sizes(), actions.options()),
+          of_weights ? at::empty_like(weights) : nothing, of_weights ? at::empty_like(tables) : nothing};
+}
+
+// Gradients.
+
+template <class F>
+auto typed(const char* name) {
+  return c10::Dispatcher::singleton().findSchemaOrThrow(name, "").typed<F>();
+}
+
+// Refuses to be differentiated.
+struct FirstOrder : torch::autograd::Function<FirstOrder> {
+  static variable_list forward(AutogradContext*, const Tensor& a, const Tensor& b, const Tensor& c, const Tensor& d,
+                               const Tensor& gradient, const Tensor& states, const Tensor& actions,
+                               const Tensor& weights, const Tensor& tables) {
+    return {a.view_as(a), b.view_as(b), c.view_as(c), d.view_as(d)};
+  }
+  static variable_list backward(AutogradContext*, variable_list) {
+    TORCH_CHECK(false, "Native gradients are of first order; specialise with executor='eager' for those of second.");
+  }
+};
+
+bool needs(const Tensor& tensor) { return tensor.defined() && tensor.requires_grad(); }
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> adjoint_autograd(const Tensor& gradient, const Tensor& states,
+                                                            const Tensor& actions, const Tensor& structure,
+                                                            const Tensor& weights, const Tensor& tables,
+                                                            const OptionalTensor& sample_tables, const Tensor& numbers,
+                                                            const Tensor& stored, bool many, int64_t threads,
+                                                            bool of_weights) {
+  static const auto op = typed<decltype(rollout_adjoint)>("torchrl_gn::rollout_adjoint");
+  auto found = [&] {
+    at::AutoDispatchBelowADInplaceOrView guard;
+    return op.call(gradient, states, actions, structure, weights, tables, sample_tables, numbers, stored, many, threads,
+                   of_weights);
+  }();
+  const bool differentiable = needs(gradient) || needs(states) || needs(actions) || needs(weights) || needs(tables);
+  if (!at::GradMode::is_enabled() || !differentiable) return found;
+  auto [a, b, c, d] = found;
+  const variable_list out = FirstOrder::apply(a, b, c, d, gradient, states, actions, weights, tables);
+  return {out[0], out[1], out[2], out[3]};
+}
+
+struct Rollout : torch::autograd::Function<Rollout> {
+  static Tensor forward(AutogradContext* context, const Tensor& state, const Tensor& actions, const Tensor& structure,
+                        const Tensor& weights, const Tensor& tables, const OptionalTensor& sample_tables,
+                        const Tensor& numbers, int64_t channels, bool many, int64_t threads) {
+    static const auto op = typed<decltype(rollout_keeping)>("torchrl_gn::rollout_keeping");
+    const bool of_weights = needs(weights) || needs(tables);
+    TORCH_CHECK(!needs(numbers) && !(sample_tables.has_value() && needs(*sample_tables)),
+                "There is no native gradient in physical parameters: use executor='eager'.");
+    const int64_t keep = !of_weights ? kSlopes : many ? kNothing : kAll;
+    at::AutoDispatchBelowADInplaceOrView guard;
+    auto [out, stored] = op.call(state, actions, structure, weights, tables, sample_tables, numbers, channels, many,
+                                 threads, keep);
+    const Tensor own = sample_tables.has_value() ? *sample_tables : Tensor();
+    context->save_for_backward({many ? out : state, actions, structure, weights, tables, own, numbers});
+    context->saved_data["stored"] = stored;
+    context->saved_data["many"] = many;
+    context->saved_data["threads"] = threads;
+    context->saved_data["of_weights"] = of_weights;
+    return out;
+  }
+  static variable_list backward(AutogradContext* context, variable_list gradients) {
+    static const auto op = typed<decltype(rollout_adjoint)>("torchrl_gn::rollout_adjoint");
+    const variable_list saved = context->get_saved_variables();
+    const OptionalTensor own = saved[5].defined() ? OptionalTensor(saved[5]) : std::nullopt;
+    const bool many = context->saved_data["many"].toBool();
+    auto [of_state, of_actions, of_weights, of_tables] =
+        op.call(gradients[0], saved[0], saved[1], saved[2], saved[3], saved[4], own, saved[6],
+                context->saved_data["stored"].toTensor(), many, context->saved_data["threads"].toInt(),
+                context->saved_data["of_weights"].toBool());
+    const bool trained = context->saved_data["of_weights"].toBool();
+    return {of_state, of_actions, Tensor(), trained ? of_weights : Tensor(), trained ? of_tables : Tensor(),
+            Tensor(), Tensor(), Tensor(), Tensor(), Tensor()};
+  }
+};
+
+Tensor rollout_autograd(const Tensor& state, const Tensor& actions, const Tensor& structure, const Tensor& weights,
+                        const Tensor& tables, const OptionalTensor& sample_tables, const Tensor& numbers,
+                        int64_t channels, bool many, int64_t threads) {
+  static const auto op = typed<decltype(rollout)>("torchrl_gn::rollout");
+  if (at::GradMode::is_enabled() && (needs(state) || needs(actions) || needs(weights) || needs(tables) ||
+                                     needs(numbers) || (sample_tables.has_value() && needs(*sample_tables))))
+    return Rollout::apply(state, actions, structure, weights, tables, sample_tables, numbers, channels, many, threads);
+  at::AutoDispatchBelowADInplaceOrView guard;
+  return op.call(state, actions, structure, weights, tables, sample_tables, numbers, channels, many, threads);
+}
+
+struct Pack : torch::autograd::Function<Pack> {
+  static Tensor forward(AutogradContext* context, const Tensor& numbers, const std::vector<int64_t>& shapes, bool weights) {
+    static const auto op = typed<decltype(pack)>("torchrl_gn::pack");
+    context->saved_data["shapes"] = shapes;
+    context->saved_data["weights"] = weights;
+    at::AutoDispatchBelowADInplaceOrView guard;
+    return op.call(numbers, shapes, weights);
+  }
+  static variable_list backward(AutogradContext* context, variable_list gradients) {
+    const auto shapes = context->saved_data["shapes"].toIntVector();
+    return {unpack(gradients[0], shapes, context->saved_data["weights"].toBool()), Tensor(), Tensor()};
+  }
+};
+
+Tensor pack_autograd(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
+  return Pack::apply(numbers, shapes.vec(), weights);
+}
+
+}  // namespace
+
+TORCH_LIBRARY(torchrl_gn, library) {
+  library.def(
+      "rollout(Tensor state, Tensor actions, Tensor structure, Tensor weights, Tensor tables, Tensor? sample_tables,"
+      " Tensor numbers, int channels, bool many, int threads) -> Tensor");
+  library.def(
+      "rollout_keeping(Tensor state, Tensor actions, Tensor structure, Tensor weights, Tensor tables,"
+      " Tensor? sample_tables, Tensor numbers, int channels, bool many, int threads, int keep) -> (Tensor, Tensor)");
+  library.def(
+      "rollout_adjoint(Tensor gradient, Tensor states, Tensor actions, Tensor structure, Tensor weights, Tensor tables,"
+      " Tensor? sample_tables, Tensor numbers, Tensor stored, bool many, int threads, bool of_weights)"
+      " -> (Tensor, Tensor, Tensor, Tensor)");
+  library.def("pack(Tensor numbers, int[] shapes, bool weights) -> Tensor");
+  library.def("has_bfloat16() -> bool", gn::has_bfloat16);
+}
+
+TORCH_LIBRARY_IMPL(torchrl_gn, CPU, library) {
+  library.impl("rollout", rollout);
+  library.impl("rollout_keeping", rollout_keeping);
+  library.impl("rollout_adjoint", rollout_adjoint);
+  library.impl("pack", pack);
+}
+
+TORCH_LIBRARY_IMPL(torchrl_gn, Meta, library) {
+  library.impl("rollout", rollout_shape);
+  library.impl("rollout_keeping", rollout_keeping_shape);
+  library.impl("rollout_adjoint", rollout_adjoint_shape);
+}
+
+TORCH_LIBRARY_IMPL(torchrl_gn, Autograd, library) {
+  library.impl("rollout", rollout_autograd);
+  library.impl("rollout_adjoint", adjoint_autograd);
+  library.impl("pack", pack_autograd);
+}

@@ -1,0 +1,142 @@
+"""The structure of a step as one array of int64 numbers: layers and tapes, as structure.h reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics.executors.native.expressions import OPERATIONS
+from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
+from torchrl_gn.dynamics.executors.native.tape import Tape
+from torchrl_gn.networks.layers import Gather, LayerList
+from torchrl_gn.networks.linear import ACTIVATIONS
+from torchrl_gn.networks.packed_layers import PANEL
+
+MAGIC, FORMAT = 0x676E5F73746570, 1  # as in structure.h
+_HEADER = 7
+_GROUPS, _PHASES = 6, 2
+
+
+def structure(layers: LayerList, special: StateMaths, general: StateMaths | None) -> Tensor:
+    """Words ``[W]`` int64 of a network and the state maths of a scene's usual states, and of all others if there are."""
+    words = _Words(_HEADER)
+    network = words.network(layers)
+    maths = [-1 if each is None else words.maths(each, layers) for each in (special, general)]
+    header = [MAGIC, FORMAT, words.count, len(OPERATIONS), network, *maths]
+    return torch.from_numpy(np.concatenate([np.array(header, dtype=np.int64), *words.parts]))
+
+
+class _Words:
+    """Collects words behind a header, and says where they lie."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.parts: list[np.ndarray] = []
+
+    def add(self, numbers: Iterable[int] | np.ndarray) -> int:
+        part = np.asarray(numbers if isinstance(numbers, np.ndarray) else list(numbers), dtype=np.int64).ravel()
+        self.parts.append(part)
+        self.count += len(part)
+        return self.count - len(part)
+
+    def doubles(self, numbers: np.ndarray) -> int:
+        return self.add(np.ascontiguousarray(numbers, dtype=np.float64).view(np.int64))
+
+    def network(self, layers: LayerList) -> int:
+        buffers, total = [], 0
+        for items, width in (layers.nodes, layers.edges, *((each.count, len(each.weight)) for each in layers.layers)):
+            buffers.append((items, width, total))
+            total += -(-items * width // 16) * 16
+        gathers, direct, unread = _backward_order(layers, [items for items, _, _ in buffers])
+        rows, stored, deepest = [], 0, 0
+        places = dict.fromkeys(("weights", "paired", "plain", "tables", "sample_tables"), 0)
+        for index, layer in enumerate(layers.layers):
+            out, depth = layer.weight.shape
+            column, lists = 0, []
+            for part in gathers[index]:
+                fields = []
+                for gather, flags in part:
+                    width = buffers[gather.source][1]
+                    offsets, items = self.add(gather.offsets.numpy()), self.add(gather.items.numpy())
+                    fields += [gather.source, width, column, *map(int, flags), offsets, items]
+                    column += width
+                lists += [self.add(fields), len(part)]
+            activation = 0 if layer.activation is None else 1 + list(ACTIVATIONS).index(layer.activation)
+            sampled = layer.table is not None and layer.table.ndim == 3
+            shared = layer.table is not None and not sampled
+            forward, backward = _padded(out) * depth, _padded(depth) * out
+            paired = _padded(out) * (-(-depth // 2)), _padded(depth) * (-(-out // 2))
+            rows += [layer.count, out, depth, activation, stored, shared, sampled, direct[index], *lists]
+            rows += [places["weights"], places["weights"] + forward, places["paired"], places["paired"] + paired[0]]
+            rows += [places["sample_tables" if sampled else "tables"], places["plain"]]
+            places["weights"] += forward + backward
+            places["paired"] += sum(paired)
+            places["plain"] += out * depth
+            places["sample_tables"] += sampled * layer.count * _padded(out)
+            places["tables"] += shared * layer.count * _padded(out)
+            stored += layer.count * out * (activation > 0)
+            deepest = max(deepest, _padded(out), _padded(depth))
+        lists = [len(buffers), self.add(np.array(buffers)), len(layers.layers), self.add(rows), len(unread)]
+        return self.add([*lists, self.add(unread), total, stored, deepest, *places.values()])
+
+    def maths(self, maths: StateMaths, layers: LayerList) -> int:
+        last = layers.layers[-1]
+        sizes = [maths.is_constant.size, len(maths.varying), maths.result_size, len(maths.results), not maths.change]
+        sizes += [maths.actions, maths.numbers, last.count * len(last.weight)]
+        sizes += [layers.nodes[0] * layers.nodes[1], layers.edges[0] * layers.edges[1]]
+        sizes += [layers.nodes[1], layers.edges[1], len(last.weight)]
+        lists = [self.add(maths.varying), self.add(maths.constant), self.doubles(maths.values), self.add(maths.results)]
+        return self.add([*sizes, *lists, *self.tape(maths.forward), *self.tape(maths.adjoint)])
+
+    def tape(self, tape: Tape) -> list[int]:
+        instructions = self.add(np.ascontiguousarray(tape.instructions).view(np.int64))
+        inputs = [self.add(each) for each in tape.inputs]
+        outputs = [self.add(each) for each in tape.outputs]
+        inputs += [-1] * (_GROUPS - len(inputs))
+        return [instructions, self.doubles(tape.constants), *tape.phases, tape.registers, *inputs, *outputs]
+
+
+_Flagged = tuple[Gather, tuple[bool, bool, bool, bool]]  # in_order, clears, writes, apart
+
+
+def _backward_order(
+    layers: LayerList, items: Sequence[int]
+) -> tuple[list[tuple[list[_Flagged], list[_Flagged]]], list[bool], list[int]]:
+    """Every layer's inputs and added gathers with their flags, whether it is direct, and buffers without gradient.
+
+    A buffer's gradient is begun by the first gather that reaches it backwards: it overwrites it if it has each item
+    once, else clears it first.
+    """
+    reached, flags, direct = [False] * len(items), {}, [False] * len(layers.layers)
+    reached[-1] = True
+    for index, layer in reversed(list(enumerate(layers.layers))):
+        gathers = [*layer.inputs, *layer.added]
+        for place, gather in enumerate(gathers):
+            apart = sum(each.source == gather.source for each in gathers) == 1
+            in_order = _in_order(gather)
+            first, reached[gather.source] = not reached[gather.source], True
+            order = np.sort(gather.items.numpy())
+            once = first and apart and np.array_equal(order, np.arange(items[gather.source]))
+            flags[index, place] = in_order, first and not once, once, apart
+            direct[index] |= once and in_order and len(gathers) == len(layer.inputs) == 1
+    found = []
+    for index, layer in enumerate(layers.layers):
+        marked = [(each, flags[index, place]) for place, each in enumerate((*layer.inputs, *layer.added))]
+        found.append((marked[: len(layer.inputs)], marked[len(layer.inputs) :]))
+    return found, direct, [index for index, each in enumerate(reached) if not each]
+
+
+def _in_order(gather: Gather) -> bool:
+    """Whether row i is one item, the first one's number plus i."""
+    offsets, items = gather.offsets.numpy(), gather.items.numpy()
+    count = len(offsets) - 1
+    if not np.array_equal(offsets, np.arange(count + 1)):
+        return False
+    return count == 0 or np.array_equal(items, items[0] + np.arange(count))
+
+
+def _padded(size: int) -> int:
+    return -(-size // PANEL) * PANEL

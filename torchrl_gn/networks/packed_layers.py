@@ -1,0 +1,162 @@
+"""A layer list whose weights lie packed in two tensors, as the native executor reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchrl_gn.networks.folded_gn_core import items_first
+from torchrl_gn.networks.graph import Graph
+from torchrl_gn.networks.incidence import Rows
+from torchrl_gn.networks.layers import Gather, LayerList
+from torchrl_gn.networks.linear import ACTIVATIONS
+
+PANEL = 16  # columns of a panel
+
+
+class _Gather(NamedTuple):
+    source: int  # buffer
+    items: Tensor  # [J]
+    rows: Tensor | None  # [J], to which each is added; None: each to its own
+    count: int  # rows
+
+    def __call__(self, buffers: Sequence[Tensor]) -> Tensor:
+        """Rows ``[I, B, F]``."""
+        buffer = buffers[self.source]
+        items = buffer[self.items.to(buffer.device)]
+        if self.rows is None:
+            return items
+        return buffer.new_zeros(self.count, *buffer.shape[1:]).index_add(0, self.rows.to(buffer.device), items)
+
+
+class _Layer(NamedTuple):
+    inputs: tuple[_Gather, ...]
+    added: tuple[_Gather, ...]
+    weight: tuple[int, int]  # rows and columns
+    table: int | None  # rows; None without
+    sampled: bool  # each sample has a table of its own
+    activation: str | None
+
+
+class LayerShapes:
+    """All of a layer list but the numbers of its weights and tables; not to be changed."""
+
+    def __init__(self, layers: LayerList) -> None:
+        def gathers(given: Sequence[Gather]) -> tuple[_Gather, ...]:
+            found = []
+            for gather in given:
+                lengths = gather.offsets.diff().cpu()
+                alone = bool((lengths == 1).all())
+                rows = None if alone else torch.arange(len(lengths), device="cpu").repeat_interleave(lengths)
+                found.append(_Gather(gather.source, gather.items.cpu(), rows, len(lengths)))
+            return tuple(found)
+
+        self.num_nodes = layers.nodes[0]
+        self.layers = tuple(
+            _Layer(
+                gathers(layer.inputs),
+                gathers(layer.added),
+                (layer.weight.shape[0], layer.weight.shape[1]),
+                None if layer.table is None else len(layer.table),
+                layer.table is not None and layer.table.ndim == 3,
+                layer.activation,
+            )
+            for layer in layers.layers
+        )
+
+    @property
+    def weights(self) -> list[int]:
+        """Rows and columns of every layer's weight, one after the other."""
+        return [size for layer in self.layers for size in layer.weight]
+
+    @property
+    def tables(self) -> list[int]:
+        """Rows and columns of every shared table."""
+        shared = [layer for layer in self.layers if layer.table is not None and not layer.sampled]
+        return [size for layer in shared for size in (layer.table, layer.weight[0]) if size is not None]
+
+
+@dataclass(frozen=True)
+class PackedLayers:
+    """A folded core for one scene, of a :class:`~torchrl_gn.networks.layers.LayerList`."""
+
+    shapes: LayerShapes
+    predicted: Rows  # nodes
+    weights: Tensor  # panels [out / 16, K, 16] of every layer's weight, then of its transpose; bfloat16: pairs of columns
+    tables: Tensor  # rows of whole panels of every shared table
+    numbers: Tensor  # [1 or B, P] float64, what the state maths reads of the model and of samples
+    sample_tables: Tensor | None = None  # [I, B, out padded to 16] of every table that each sample has
+
+    def predict(self, dynamic: Graph) -> Tensor:
+        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, by torch operations."""
+        batch, dtype = dynamic.nodes.shape[:-2], dynamic.nodes.dtype
+        buffers = [items_first(dynamic.nodes), items_first(dynamic.edges)]
+        for layer, weight, table in zip(self.shapes.layers, self.plain_weights(), self._plain_tables(), strict=True):
+            out = F.linear(torch.cat([gather(buffers) for gather in layer.inputs], -1), weight.to(dtype))
+            for gather in layer.added:
+                out = out + gather(buffers)
+            out = out if table is None else out + table.to(dtype)
+            buffers.append(out if layer.activation is None else ACTIVATIONS[layer.activation]()(out))
+        out, count = buffers[-1], self.shapes.num_nodes
+        nodes = torch.arange(count, device=out.device)[self.predicted]
+        out = out.transpose(0, 1).reshape(out.shape[1], len(nodes), -1)  # an MLP's one item holds all nodes
+        full = out.new_zeros(out.shape[0], count, out.shape[-1]).index_copy(1, nodes, out)
+        return full.reshape(*batch, *full.shape[1:])
+
+    def plain_weights(self) -> Iterator[Tensor]:
+        """Every layer's weight ``[out, K]``."""
+        place, pairs = 0, 2 if self.weights.dtype == torch.bfloat16 else 1
+        for layer in self.shapes.layers:
+            rows, columns = layer.weight
+            depth, across = (-(-size // pairs) for size in (columns, rows))  # in pairs
+            size = _panels(rows) * depth * PANEL * pairs
+            part = self.weights[place : place + size].view(_panels(rows), depth, PANEL, pairs)
+            yield part.permute(0, 2, 1, 3).reshape(_panels(rows) * PANEL, depth * pairs)[:rows, :columns]
+            place += size + _panels(columns) * across * PANEL * pairs
+
+    def _plain_tables(self) -> Iterator[Tensor | None]:
+        """Every layer's table ``[I, 1 or B, out]``."""
+        shared, own = 0, 0
+        every = sum(_panels(each.weight[0]) * PANEL * (each.table or 0) for each in self.shapes.layers if each.sampled)
+        batch = 0 if self.sample_tables is None else self.sample_tables.numel() // max(every, 1)
+        for layer in self.shapes.layers:
+            if layer.table is None:
+                yield None
+                continue
+            width, columns = _panels(layer.weight[0]) * PANEL, layer.weight[0]
+            if not layer.sampled:
+                size = layer.table * width
+                yield self.tables[shared : shared + size].view(layer.table, 1, width)[..., :columns]
+                shared += size
+            else:
+                assert self.sample_tables is not None
+                size = layer.table * batch * width
+                yield self.sample_tables[own : own + size].view(layer.table, -1, width)[..., :columns]
+                own += size
+
+
+def pack_pairs(weights: Sequence[Tensor]) -> Tensor:
+    """Packed weights in bfloat16: as others, but of pairs of columns, odd ones with a zero."""
+    parts = []
+    for weight in weights:
+        for matrix in (weight, weight.T):
+            rows, columns = matrix.shape
+            padded = F.pad(matrix.to(torch.bfloat16), (0, columns % 2, 0, -rows % PANEL))
+            parts.append(padded.view(_panels(rows), PANEL, -1, 2).permute(0, 2, 1, 3).flatten())
+    return torch.cat(parts)
+
+
+def pack_sample_tables(layers: LayerList, dtype: torch.dtype) -> Tensor | None:
+    """``[I, B, out]`` tables of each sample, padded to whole panels; None without any."""
+    tables = [layer.table for layer in layers.layers if layer.table is not None and layer.table.ndim == 3]
+    padded = [F.pad(table.to(dtype), (0, -table.shape[-1] % PANEL)).flatten() for table in tables]
+    return torch.cat(padded) if padded else None
+
+
+def _panels(size: int) -> int:
+    return -(-size // PANEL)

@@ -1,0 +1,75 @@
+"""Tensors and modules inside nested tuples and dataclasses, such as folded cores and programs."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+Leaf = Tensor | nn.Module
+
+
+def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Leaf]]:
+    """Tensors and modules, named by the way to them: ``nodes_mean``, ``core_hidden_0``."""
+    if isinstance(value, Leaf):
+        yield name, value
+        return
+    for part, child in _children(value):
+        yield from leaves(child, f"{name}_{part}" if name else part)
+
+
+def skeleton(value: Any) -> Any:
+    """What :func:`rebuild` makes the same value of, without its leaves."""
+    if isinstance(value, Leaf):
+        return _LEAF
+    children = list(_children(value))
+    if not any(True for _ in leaves(value)):
+        return _Fixed(value)
+    return _Branch(type(value), tuple((name, skeleton(each)) for name, each in children))
+
+
+def rebuild(of: Any, given: Iterator[Any]) -> Any:
+    """The value of a skeleton with leaves, in the order of :func:`leaves`."""
+    if of == _LEAF:  # not the same object after unpickling
+        return next(given)
+    if isinstance(of, _Fixed):
+        return of.value
+    children = {name: rebuild(each, given) for name, each in of.children}
+    return tuple(children.values()) if of.kind is tuple else of.kind(**children)
+
+
+def in_dtype(value: Any, dtype: torch.dtype) -> Any:
+    """Nested tuples and dataclasses with their floating-point numbers in another dtype, detached."""
+
+    def cast(part: Any) -> Any:
+        if isinstance(part, Tensor):
+            return part.detach().to(dtype) if part.is_floating_point() else part
+        return copy.deepcopy(part).to(dtype).requires_grad_(False)
+
+    return rebuild(skeleton(value), (cast(part) for _, part in leaves(value)))
+
+
+_LEAF = "leaf"
+
+
+@dataclass(frozen=True)
+class _Fixed:
+    value: Any  # without leaves
+
+
+@dataclass(frozen=True)
+class _Branch:
+    kind: type
+    children: tuple[tuple[str, Any], ...]
+
+
+def _children(value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, tuple):
+        names = getattr(value, "_fields", None) or map(str, range(len(value)))
+        yield from zip(names, value, strict=True)
+    elif is_dataclass(value) and not isinstance(value, type):
+        yield from ((field.name, getattr(value, field.name)) for field in fields(value))
