@@ -51,8 +51,8 @@ from _common.speed_table import least_times, report
 from _common.speed_work import make_works, pull, train_work
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.executors import EXECUTORS
 from torchrl_gn.dynamics.bound import update_parameter_normalizers
+from torchrl_gn.dynamics.executors import EXECUTORS
 from torchrl_gn.evaluation import plot_loglog
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import product_speeds, usable_cores

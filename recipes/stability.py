@@ -81,9 +81,12 @@ def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
     exact = copy.deepcopy(loaded.model).double().requires_grad_(False).bind(scene)
     single = loaded.model.requires_grad_(False).bind(scene)
     rounded = checks.specialize_at(single, torch.bfloat16)
-    models = {"float32": single, "float64": exact, "bfloat16": rounded}
-    inputs = scene, states[:, -2], actions[:, -1], largest, cfg
-    return {name: Setting(model, exact, *inputs) for name, model in models.items()}
+    inputs = exact, scene, states[:, -2], actions[:, -1], largest, cfg
+    return {
+        "float32": Setting(single, single.model, *inputs),
+        "float64": Setting(exact, exact.model, *inputs),
+        "bfloat16": Setting(rounded, single.model, *inputs),
+    }
 
 
 @with_help

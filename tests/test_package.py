@@ -38,7 +38,6 @@ APART = {
 ALLOWED = {folder: {*ORDER[:index], folder} - APART.get(folder, set()) for index, folder in enumerate(ORDER)}
 ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders, which import none of them
 ABOVE = {"__init__", "__main__", "doctor"}  # these may import all folders, and no folder imports them
-LONGEST = 300
 LATER = (ast.FunctionDef, ast.AsyncFunctionDef)  # what is imported in there is not when the package is
 WITH_PILLOW = {"panels.py"}  # imported to draw a video, once Pillow was found
 # The names of ``import torchrl_gn``.
@@ -107,11 +106,6 @@ def test_no_module_imports_itself_through_others():
     graph = {module: set(at_import(ast.parse(file.read_text()))) & set(MODULES) for module, file in MODULES.items()}
     assert sum(map(len, graph.values())) > len(graph)
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
-
-
-@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
-def test_files_are_short(file):
-    assert len(file.read_text().splitlines()) <= LONGEST
 
 
 def is_for_types(node: ast.AST) -> bool:

@@ -15,7 +15,7 @@ from torch import Tensor
 from _common.actor_critic import ActorCriticOptimizer, TargetSquares, play, played_windows, windows
 from _common.tensor_files import load_tensors, save_tensors
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
+from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.objectives import SHACLoss
 from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue, task_invariances
@@ -47,7 +47,7 @@ class Task:
         folder: of its files in a run and in a round.
     """
 
-    model: Predictor
+    model: BoundPredictor
     value: StateValue
     loss: SHACLoss
 
@@ -84,7 +84,7 @@ class Task:
         else:
             self.model = load_pretrained(begun.of("model", self)).bind(self.scene)
             self.value = load_pretrained(begun.of("value", self)).value
-        imagined = ModelEnv(specialize(self.model), self.reward)
+        imagined = ModelEnv(self.model, self.reward)  # until the model has learned: learn_model() takes a snapshot
         self.loss = SHACLoss(policy, self.value, imagined, steps=cfg.horizon, lmbda=cfg.lmbda)
 
     @property
@@ -97,6 +97,10 @@ class Task:
         cfg, first = self.cfg, index == 0
         steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
         fit(self.model, cast(TensorDict, torch.cat(cast(Any, self.data))), steps=steps, lr=lr, seed=cfg.seed + index)
+        if isinstance(snapshot := self.loss.env.world_model, SpecializedPredictor):
+            snapshot.refresh(self.model)
+        else:
+            self.loss.env.world_model = cast(Any, specialize(self.model))
         newest, rewards = self.newest, None
         if first:
             before, after = newest["state"][:, :-1], newest["state"][:, 1:]

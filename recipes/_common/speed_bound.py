@@ -30,7 +30,7 @@ class Bound:
     def measure(cls, model: SpecializedPredictor, repeats: int) -> Bound:
         """Bound in the model's dtype on this processor, from ``repeats`` rounds of short measurements."""
         dtype, repeats = model.dtype, _ROUNDS * repeats
-        size = _weight_bytes(model.executor().program.core)
+        size = _weight_bytes(model.program().core)
         rate = max(gemm_rate(_SIZE, _SIZE, dtype, fast, repeats) for fast in (False, True))
         return cls(1e3 * model.skipped()["kFLOP"][1], rate, size, read_rate(size, repeats))
 

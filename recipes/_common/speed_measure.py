@@ -18,6 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_gn.dynamics import Predictor
+from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.maths import fast_matmul
 
 R = TypeVar("R")
@@ -31,7 +32,7 @@ class OwnParameters:
 
     def __init__(self, predictor: Predictor, parameters: TensorDict) -> None:
         self._predictor, self._parameters = predictor, parameters
-        self._of_batch: dict[int, TensorDict] = {}
+        self._of_batch: dict[int, PreparedStep] = {}
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._predictor, name)
@@ -40,15 +41,15 @@ class OwnParameters:
         return str(self._predictor)
 
     def step(self, state: Tensor, action: Tensor) -> tuple[Tensor, Any]:
-        return self._predictor.step(state, action, self._first(len(state)))
+        return self._first(len(state)).step(state, action)
 
     def rollout(self, state: Tensor, actions: Tensor) -> tuple[Tensor, Any]:
-        return self._predictor.rollout(state, actions, self._first(len(state)))
+        return self._first(len(state)).rollout(state, actions)
 
-    def _first(self, count: int) -> TensorDict:
-        # The same tensors at every call, as in a planner.
+    def _first(self, count: int) -> PreparedStep:
+        # Folded once, as by a planner.
         if count not in self._of_batch:
-            self._of_batch[count] = cast(TensorDict, self._parameters[:count].clone())
+            self._of_batch[count] = self._predictor.prepared(cast(TensorDict, self._parameters[:count].clone()))
         return self._of_batch[count]
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from _common.speed_baselines import Baseline
 from _common.speed_measure import Way, Work
-from torchrl_gn.dynamics import ForwardModel, Predictor
+from torchrl_gn.dynamics import BoundPredictor, ForwardModel, Predictor
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training import make_optimizer
 
@@ -115,7 +115,7 @@ def train_work(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) ->
     losses: dict[int, ForwardModelLoss] = {}
 
     def run(way: Way) -> None:
-        loss = losses.setdefault(id(way), ForwardModelLoss(way.model))
+        loss = losses.setdefault(id(way), ForwardModelLoss(cast(BoundPredictor, way.model)))
         optimizer.zero_grad()
         loss(batch)["loss_forward_model"].backward()
         optimizer.step(0, 1.0)  # the schedule has ended: the weights stay as they are

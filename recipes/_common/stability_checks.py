@@ -16,7 +16,14 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.data import Simulator, collect_trajectories, sample_start_states, spline_controls, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel, Predictor, SpecializedPredictor, UnseenParameterWarning, specialize
+from torchrl_gn.dynamics import (
+    BoundPredictor,
+    ForwardModel,
+    Predictor,
+    SpecializedPredictor,
+    UnseenParameterWarning,
+    specialize,
+)
 from torchrl_gn.evaluation import guarded_rollout, kinetic_energy
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
@@ -35,7 +42,7 @@ SMALL_SCENES = (
 )
 
 
-def specialize_at(bound: Predictor, dtype: torch.dtype | None) -> SpecializedPredictor:
+def specialize_at(bound: BoundPredictor, dtype: torch.dtype | None) -> SpecializedPredictor:
     """A predictor in a dtype, without a warning: its digits are wanted here, however slow it is."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SlowDtypeWarning)
@@ -47,7 +54,8 @@ class Setting:
     """What the checks of one dtype work on."""
 
     model: Predictor
-    exact: Predictor
+    weights: ForwardModel  # that it predicts with
+    exact: BoundPredictor
     scene: Scene
     state: Tensor
     action: Tensor
@@ -173,7 +181,7 @@ def variants_at_corners(s: Setting) -> tuple[float, float]:
     """Largest change, and error against float64, of variants at the ends of the paper's random ranges."""
     parameters = corners(s.exact, len(s.state), s.cfg.seed)
     models = (
-        s.bind(s.model.model, s.scene, parameters_key="parameters"),
+        s.bind(s.weights, s.scene, parameters_key="parameters"),
         s.exact.model.bind(s.scene, parameters_key="parameters"),
     )
     delta, exact = (model.delta(s.state, s.action, parameters) for model in models)
@@ -202,7 +210,7 @@ def small_scenes(s: Setting) -> float:
 
 def unstable_model(s: Setting) -> float:
     """Share of 1,000 steps that are predicted of a model that blows up; infinite if a sample is not flagged."""
-    weights, predicted = copy.deepcopy(s.model.model), []
+    weights, predicted = copy.deepcopy(s.weights), []
     with torch.no_grad():
         for parameter in weights.core.parameters():
             parameter *= 2

@@ -15,7 +15,7 @@ from _common import as_list
 from _common.progress import dataset_with_progress
 from _common.tensor_files import load_tensors
 from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
-from torchrl_gn.dynamics import ForwardModel, Predictor
+from torchrl_gn.dynamics import BoundPredictor, ForwardModel
 from torchrl_gn.scenes import Scene, has_variants
 from torchrl_gn.training import Workers
 
@@ -39,7 +39,7 @@ class Task:
         """Whether its sequences are of random variants."""
         return "parameters" in self.train.keys()
 
-    def bind(self, model: ForwardModel) -> Predictor:
+    def bind(self, model: ForwardModel) -> BoundPredictor:
         """Bind the weights to the scene, or to its variants, whose parameters come with the samples."""
         if not self.parametrized:
             return model.bind(self.scene)

@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 from torch.utils.flop_counter import FlopCounterMode
+from torchrl_gn.dynamics.executors.native.binding import load_binding
 
 from torchrl_gn.dynamics import specialize
-from torchrl_gn.dynamics.executors.native.binding import load_binding
 from torchrl_gn.dynamics.predictor import Predictor
 
 pytestmark = pytest.mark.skipif(load_binding() is None, reason="there are no headers or no C++ compiler")

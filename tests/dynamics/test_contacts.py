@@ -7,8 +7,8 @@ import torch
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, JointAxes
-from torchrl_gn.dynamics.features import CanonicalState, StepInputs
 from torchrl_gn.dynamics.bound import dynamic_graph
+from torchrl_gn.dynamics.features import CanonicalState, StepInputs
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.contact_points import SLOTS, contact_slots

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import BodyState, Controls, Feature, ForwardModel, JointAxes, specialize
-from torchrl_gn.dynamics.features import FEATURES, StepInputs
 from torchrl_gn.dynamics.bound import dynamic_graph
+from torchrl_gn.dynamics.features import FEATURES, StepInputs
 from torchrl_gn.networks import CORES, Core, GNCore, Graph, GraphSize
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import ParameterNames, load_scene

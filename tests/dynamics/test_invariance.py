@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from torchrl_gn.dynamics import BodyState, Canonicalizer, Contacts, Controls, JointAxes, Predictor, specialize
+from torchrl_gn.dynamics.bound import dynamic_graph
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.features.contacts import BoundContacts
 from torchrl_gn.dynamics.features.feature import StepInputs
-from torchrl_gn.dynamics.bound import dynamic_graph
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
 

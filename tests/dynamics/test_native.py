@@ -24,13 +24,13 @@ import pytest
 import torch
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl_gn.dynamics.executors.native.binding import load_binding
+from torchrl_gn.dynamics.executors.native.pool import Pool
 
 from torchrl_gn.dynamics import BodyState, Contacts, Controls, ForwardModel, JointAxes, SpecializedPredictor, specialize
 from torchrl_gn.dynamics.executors import NativeExecutor
 from torchrl_gn.dynamics.executors.native import build, library
 from torchrl_gn.dynamics.executors.native import executor as native_executor
-from torchrl_gn.dynamics.executors.native.binding import load_binding
-from torchrl_gn.dynamics.executors.native.pool import Pool
 from torchrl_gn.dynamics.features import Feature
 
 from .. import zoo

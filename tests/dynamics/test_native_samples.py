@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.dynamics import BodyState, Controls, ForwardModel, JointAxes, SpecializedPredictor, specialize
+from torchrl_gn.dynamics.bound import update_parameter_normalizers
 from torchrl_gn.dynamics.executors import NativeExecutor
 from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, batch_of
 from torchrl_gn.dynamics.features import Feature
-from torchrl_gn.dynamics.bound import update_parameter_normalizers
 from torchrl_gn.scenes import sample_variants
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 

@@ -11,10 +11,10 @@ import torch
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import BodyState, Contacts, Controls, ForwardModel, JointAxes, PairContacts, specialize
+from torchrl_gn.dynamics.bound import static_graph, update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.dynamics.executors import NativeExecutor, eager
 from torchrl_gn.dynamics.features import graph_edges
 from torchrl_gn.dynamics.features.pair_contacts import BoundPairContacts
-from torchrl_gn.dynamics.bound import static_graph, update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene, sample_variants
 from torchrl_gn.scenes.contact_pairs import _configurations

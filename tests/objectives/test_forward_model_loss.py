@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchrl_gn.data import create_dataset, trajectory_buffer
 from torchrl_gn.dynamics import Canonicalizer, ForwardModel, Predictor
-from torchrl_gn.dynamics.executors import EagerExecutor
 from torchrl_gn.dynamics.bound import dynamic_graph
+from torchrl_gn.dynamics.executors import EagerExecutor
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss

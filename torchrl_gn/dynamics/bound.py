@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import mujoco
 import numpy as np
@@ -186,8 +186,8 @@ class BoundPredictor(Predictor):
             parameters=values,
             canonicalizer=self.canonicalizer,
             controls=self.controls,
-            node_features=self.features["nodes"],
-            edge_features=self.features["edges"],
+            node_features=cast(nn.ModuleList, self.features["nodes"]),
+            edge_features=cast(nn.ModuleList, self.features["edges"]),
             projection=self.projection,
             nodes=nodes,
             edges=edges,
@@ -294,7 +294,11 @@ def update_parameter_normalizers(predictor: BoundPredictor, parameters: TensorDi
 
 
 def update_dynamic_normalizers(
-    predictor: BoundPredictor, state: Tensor, action: Tensor, next_state: Tensor, parameters: TensorDictBase | None = None
+    predictor: BoundPredictor,
+    state: Tensor,
+    action: Tensor,
+    next_state: Tensor,
+    parameters: TensorDictBase | None = None,
 ) -> None:
     """Take transitions into the model's statistics (paper, "One step of the training algorithm").
 

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_gn.atomic import atomic_path
-from torchrl_gn.dynamics.executors import eager
-from torchrl_gn.dynamics.executors.native import source
 from torchrl_gn.dynamics.bound import BoundPredictor
-from torchrl_gn.dynamics.executors.native import NativeExecutor
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.executors.native import NativeExecutor, source
 from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.dynamics.specialized import SpecializedPredictor, specialize
 from torchrl_gn.networks.packed_layers import PackedLayers

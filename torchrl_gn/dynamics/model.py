@@ -11,6 +11,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_gn.dynamics.bound import DYNAMIC_FLOOR, BoundPredictor
 from torchrl_gn.dynamics.features import (
     FEATURES,
     BodyState,
@@ -23,7 +24,6 @@ from torchrl_gn.dynamics.features import (
     Wrenches,
     graph_edges,
 )
-from torchrl_gn.dynamics.bound import DYNAMIC_FLOOR, BoundPredictor
 from torchrl_gn.dynamics.physics import as_physics, physics_from_description
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
@@ -42,7 +42,7 @@ _PARAMETER_LIMIT = 20.0
 class ForwardModel(nn.Module):
     """Weights of a forward model: features, core and normalisers (paper, "Forward models", SM "Forward prediction").
 
-    Knows no scene; :meth:`bind` joins it to one and gives the 
+    Knows no scene; :meth:`bind` joins it to one and gives the
     :class:`~torchrl_gn.dynamics.BoundPredictor`. Any number of
     scenes share the same weights. :meth:`for_scene` builds one without typing a scene's facts.
 

@@ -122,9 +122,9 @@ def with_numbers(program: StepProgram, numbers: Iterable[Tensor]) -> StepProgram
     given = iter(numbers)
 
     def changed(scaling: Any) -> Any:
-        return scaling._replace(**{
-            name: next(given) for name in scaling._fields[1:] if getattr(scaling, name) is not None
-        })
+        return scaling._replace(
+            **{name: next(given) for name in scaling._fields[1:] if getattr(scaling, name) is not None}
+        )
 
     return replace(
         program,

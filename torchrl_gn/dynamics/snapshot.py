@@ -24,9 +24,9 @@ _NUMBERS = ("nodes_mean", "nodes_scale", "edges_mean", "edges_scale", "output_me
 class Snapshot(nn.Module):
     """Hold a packed program: its tensors are buffers, its modules are submodules, and its only copies.
 
-    What PyTorch does to buffers (``to``, ``load_state_dict``, ``share_memory``, copies, stacks, weights that a collector
-    sends) so happens to the program, and shows in the next :meth:`program`. A cast changes the network's dtype; state
-    maths keeps float64.
+    What PyTorch does to buffers (``to``, ``load_state_dict``, ``share_memory``, copies, stacks, weights that a
+    collector sends) so happens to the program, and shows in the next :meth:`program`. A cast changes the
+    network's dtype; state maths keeps float64.
     """
 
     def __init__(self, program: StepProgram) -> None:
@@ -51,7 +51,9 @@ class Snapshot(nn.Module):
             assert isinstance(program.core, PackedLayers)
             row, sizes = program.core.numbers[0], [shape.numel() for shape in self._shapes]
             views = row.split([*sizes, row.numel() - sum(sizes)])
-            program = with_numbers(program, (view.view(shape) for view, shape in zip(views, self._shapes, strict=False)))
+            program = with_numbers(
+                program, (view.view(shape) for view, shape in zip(views, self._shapes, strict=False))
+            )
         return replace(program, dtype=self.dtype)
 
     def get(self, name: str) -> Any:

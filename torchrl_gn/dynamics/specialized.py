@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from dataclasses import replace
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -27,8 +28,8 @@ class SpecializedPredictor(Predictor):
     """Predictor with everything constant in its scene folded away; made by :func:`specialize`.
 
     A value: it predicts what the given predictor predicted when it was made, and never changes by itself. Its folded
-    weights are its buffers and its only copy, so what is done to a module (``to``, ``load_state_dict``, copies, pickles,
-    shared memory, a collector's weight update, ``functional_call``) is done to the model. After training,
+    weights are its buffers and its only copy, so what is done to a module (``to``, ``load_state_dict``, copies,
+    pickles, shared memory, a collector's weight update, ``functional_call``) is done to the model. After training,
     :meth:`refresh` takes the new weights, in place.
 
     Differentiable in states and actions, never in weights. Native gradients are of first order; that in a component of
@@ -230,8 +231,8 @@ def specialize(
     Args:
         predictor: a model bound to a scene.
         executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"native"`` runs steps, rollouts and their
-            gradients in C++ that is built once, a minute, and kept; where it cannot (a GPU, a recurrent core, float16, no
-            compiler), as ``"eager"``, and ``print`` says why. ``"eager"`` runs torch operations anywhere.
+            gradients in C++ that is built once, a minute, and kept; where it cannot (a GPU, a recurrent core, float16,
+            no compiler), as ``"eager"``, and ``print`` says why. ``"eager"`` runs torch operations anywhere.
             ``"compiled"``, for GPUs and what native cannot run, compiles at the first call with every new shape: half a
             minute, minutes for a gradient.
         dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster where the processor

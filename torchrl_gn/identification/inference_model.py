@@ -11,9 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_gn.dynamics import ForwardModel, Predictor
-from torchrl_gn.dynamics.constraints import AnchorEstimator
+from torchrl_gn.dynamics import BoundPredictor, ForwardModel
 from torchrl_gn.dynamics.bound import dynamic_graph, residual
+from torchrl_gn.dynamics.constraints import AnchorEstimator
 from torchrl_gn.networks.gn_block import GNBlock
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat, graph_split
 from torchrl_gn.scenes import Scene
@@ -103,7 +103,7 @@ class BoundInferenceModel(TensorDictModuleBase):
     def __init__(
         self,
         model: InferenceModel,
-        predictor: Predictor,
+        predictor: BoundPredictor,
         *,
         observed_key: NestedKey = "identification",
         parameters_key: NestedKey = "parameters",
@@ -208,7 +208,7 @@ class IdentifyingModel(nn.Module):
         observed = forward_model.dynamic_size + GraphSize(forward_model.layout.delta_size, 0, 0)
         self.inference = InferenceModel(observed, **options)
 
-    def bind(self, scene: Scene, **options) -> tuple[Predictor, BoundInferenceModel]:
+    def bind(self, scene: Scene, **options) -> tuple[BoundPredictor, BoundInferenceModel]:
         """Both models joined to a scene, whose own physical parameters neither reads; see :meth:`ForwardModel.bind`.
 
         The forward model reads at ``"parameters"`` what the other writes there.

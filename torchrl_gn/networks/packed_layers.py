@@ -87,7 +87,9 @@ class PackedLayers:
 
     shapes: LayerShapes
     predicted: Rows  # nodes
-    weights: Tensor  # panels [out / 16, K, 16] of every layer's weight, then of its transpose; bfloat16: pairs of columns
+    weights: (
+        Tensor  # panels [out / 16, K, 16] of every layer's weight, then of its transpose; bfloat16: pairs of columns
+    )
     tables: Tensor  # rows of whole panels of every shared table
     numbers: Tensor  # [1 or B, P] float64, what the state maths reads of the model and of samples
     sample_tables: Tensor | None = None  # [I, B, out padded to 16] of every table that each sample has

@@ -13,10 +13,10 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.features.controls import present_actions
 from torchrl_gn.dynamics.predictor import check_shapes, require_bound
 from torchrl_gn.dynamics.program import PreparedStep
-from torchrl_gn.dynamics.features.controls import present_actions
-from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.objectives.checks import read_entries, require_fitted

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import LossModule
 
-from torchrl_gn.dynamics import Predictor
+from torchrl_gn.dynamics import BoundPredictor
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.objectives.checks import read_entries, require_fitted
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
@@ -65,7 +65,7 @@ class IdentificationLoss(LossModule):
         return self.identifying
 
     @property
-    def bound(self) -> Predictor:
+    def bound(self) -> BoundPredictor:
         """The forward model, bound to the scene."""
         return self.prediction.model
 

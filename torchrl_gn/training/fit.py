@@ -11,7 +11,7 @@ from torch import nn
 from tqdm import tqdm
 
 from torchrl_gn.data import trajectory_buffer
-from torchrl_gn.dynamics import Predictor
+from torchrl_gn.dynamics import BoundPredictor
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training.budget import Budget
@@ -42,7 +42,7 @@ class History:
 
 
 def fit(
-    model: Predictor,
+    model: BoundPredictor,
     trajectories: TensorDictBase,
     *,
     minutes: float | None = None,

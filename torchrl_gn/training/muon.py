@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -9,6 +10,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from torchrl_gn.dynamics.executors.native import NoCompilerError, load_operators
+from torchrl_gn.processor import native_threads
 
 # Odd quintics (linear, cubic, quintic), each optimal after the one before for singular values in [0.002, 1] (N. Amsel
 # et al., "The Polar Express", 2025). Four of them reach [0.68, 1.32], like five of Muon's usual equal ones.
@@ -54,8 +58,29 @@ class Muon(torch.optim.Optimizer):
                 if not self.state[parameter]:
                     self.state[parameter]["momentum_buffer"] = torch.zeros_like(parameter)
             moments = [self.state[parameter]["momentum_buffer"] for parameter in parameters]
-            self._update(parameters, moments, group)
+            by_torch = list(range(len(parameters)))
+            with contextlib.suppress(NoCompilerError):
+                by_torch = self._update_natively(parameters, moments, group)
+            if by_torch:
+                self._update([parameters[i] for i in by_torch], [moments[i] for i in by_torch], group)
         return loss
+
+    def _update_natively(
+        self, parameters: Sequence[Tensor], moments: Sequence[Tensor], group: dict[str, Any]
+    ) -> list[int]:
+        """Update matrices in C++, which halves symmetric products; return the indices of those that it cannot."""
+        operators, polynomials = load_operators(), [number for each in _POLYNOMIALS for number in each]
+        rest, kinds = [], {dtype: [] for dtype in (torch.float32, torch.float64)}
+        for index, parameter in enumerate(parameters):
+            tensors = (parameter, parameter.grad, moments[index])
+            plain = parameter.dtype in kinds and all(_is_plain(each, parameter) for each in tensors)
+            (kinds[parameter.dtype] if plain else rest).append(index)
+        for indices in filter(None, kinds.values()):
+            changed = [parameters[index] for index in indices]
+            gradients, means = [each.grad for each in changed], [moments[index] for index in indices]
+            operators.muon_(changed, gradients, means, group["momentum"], group["lr"], polynomials, native_threads())
+            torch.autograd.graph.increment_version(changed)
+        return rest
 
     def _update(self, parameters: Sequence[Tensor], moments: Sequence[Tensor], group: dict[str, Any]) -> None:
         """Update matrices by torch operations."""
@@ -65,6 +90,19 @@ class Muon(torch.optim.Optimizer):
         for parameter, update in zip(parameters, _orthogonalize_all(nesterov), strict=True):
             rows, columns = parameter.shape
             parameter.sub_(update, alpha=group["lr"] * math.sqrt(max(1, rows / columns)))
+
+
+def _is_plain(tensor: Tensor | None, like: Tensor) -> bool:
+    """Whether it is numbers in a row on the processor, of a parameter's shape and dtype."""
+    return (
+        tensor is not None
+        and tensor.shape == like.shape
+        and tensor.dtype == like.dtype
+        and tensor.is_cpu
+        and tensor.layout == torch.strided
+        and tensor.is_contiguous()
+        and tensor.numel() > 0
+    )
 
 
 def orthogonalize(matrices: Tensor) -> Tensor:

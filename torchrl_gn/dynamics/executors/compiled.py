@@ -31,7 +31,8 @@ class CompiledExecutor:
         TypeError: of a core that is evaluated by message passing, or physics outside torch.
     """
 
-    fixed_batch, reason = True, None
+    fixed_batch = True
+    reason: str | None = None
 
     def __init__(self, program: StepProgram) -> None:
         check_compiling(program.movable.device)
@@ -92,7 +93,7 @@ class _Compiled:
         def run(*inputs: Tensor) -> tuple[Tensor, ...]:
             tensors, others = iter(inputs[dynamic:]), iter(modules)
             now: StepProgram = rebuild(of, (next(tensors) if kind else next(others) for kind in kinds))
-            hidden = None if dynamic == 2 else Graph(*inputs[2:5], now.edge_index)
+            hidden = None if dynamic == 2 else Graph(inputs[2], inputs[3], inputs[4], now.edge_index)
             after, hidden = eager.step(now, inputs[0], inputs[1], hidden)
             return (after,) if hidden is None else (after, *hidden.features)
 

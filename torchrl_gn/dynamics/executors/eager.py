@@ -16,7 +16,8 @@ from torchrl_gn.networks.graph import Graph, graph_concat
 class EagerExecutor:
     """Interpret a program operation by operation; differentiable in all that the program is."""
 
-    fixed_batch, reason = False, None
+    fixed_batch = False
+    reason: str | None = None
 
     def __init__(self, program: StepProgram) -> None:
         pass  # any structure

@@ -2,3 +2,4 @@
 
 from torchrl_gn.dynamics.executors.native.build import NoCompilerError as NoCompilerError
 from torchrl_gn.dynamics.executors.native.executor import NativeExecutor as NativeExecutor
+from torchrl_gn.dynamics.executors.native.operators import load_operators as load_operators

@@ -48,8 +48,8 @@ def load(
 ) -> L:
     """What ``opened`` makes of the library of sources beside this file, built where none is kept.
 
-    ``sources`` are file names with the options to compile them, ``link`` options to link, ``what`` says what is built. A
-    library is kept for its sources, compiler, options and ``parts``.
+    ``sources`` are file names with the options to compile them, ``link`` options to link, ``what`` says what is built.
+    A library is kept for its sources, compiler, options and ``parts``.
 
     Raises:
         NoCompilerError: without a working C++ compiler.
@@ -93,10 +93,15 @@ def _build(
     with atomic_path(file) as temporary, tempfile.TemporaryDirectory(prefix="torchrl_gn-") as objects:
         places = {source: str(Path(objects) / f"{source}.o") for source in sources}
         with ThreadPoolExecutor(len(sources)) as pool:
-            list(pool.map(_run, [
-                [*compiler, str(Path(__file__).parent / source), *options, "-c", "-o", places[source]]
-                for source, options in sources.items()
-            ]))
+            list(
+                pool.map(
+                    _run,
+                    [
+                        [*compiler, str(Path(__file__).parent / source), *options, "-c", "-o", places[source]]
+                        for source, options in sources.items()
+                    ],
+                )
+            )
         _run([*compiler, *places.values(), "-shared", "-pthread", *link, "-o", str(temporary)])
         with temporary.open("ab") as out:
             out.write(hashlib.sha256(temporary.read_bytes()).digest())

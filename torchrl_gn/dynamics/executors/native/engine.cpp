@@ -1,5 +1,6 @@
 #include "engine.h"
 
+#include "muon.h"
 #include "rollout.h"
 
 namespace gn {
@@ -30,6 +31,10 @@ void run(const Maths& maths, const Weights& weights, const Call& call, bool adjo
 
 int64_t stored_count(const Maths& maths, const Weights& weights, const Call& call) {
   return with_network(maths.structure, weights, [&](const auto& network) { return stored_count(network, maths, call); });
+}
+
+void muon(Type type, const std::vector<MuonMatrix>& matrices, const MuonOptions& options, int64_t threads) {
+  (type == kFloat64 ? muon<double> : muon<float>)(matrices.data(), matrices.size(), options, threads);
 }
 
 }  // namespace gn

@@ -3,6 +3,8 @@
 
 #include "call.h"
 
+#include <vector>
+
 namespace gn __attribute__((visibility("hidden"))) {
 
 // Numbers of a network's weights and tables.
@@ -14,9 +16,23 @@ struct Weights {
   const void *weights, *tables;
 };
 
+struct MuonMatrix {
+  void* parameter;
+  const void* gradient;
+  void* moment;
+  int64_t rows, columns;  // row-major
+};
+
+struct MuonOptions {
+  double momentum, rate;
+  const double* polynomials;  // linear, cubic and quintic coefficient of each
+  int64_t count;
+};
+
 // Errors are C++ exceptions: std::bad_alloc if there is no memory.
 bool has_bfloat16();
 void run(const Maths& maths, const Weights& weights, const Call& call, bool adjoint);
 int64_t stored_count(const Maths& maths, const Weights& weights, const Call& call);
+void muon(Type type, const std::vector<MuonMatrix>& matrices, const MuonOptions& options, int64_t threads);
 
 }  // namespace gn

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -88,9 +87,13 @@ class NativeExecutor:
         else:
             plain = torch.cat([weight.reshape(-1) for weight in weights]).to(sums)
             packed = operators.pack(plain, self.shapes.weights, True)
-        tables = [layer.table.reshape(-1) for layer in layers.layers if layer.table is not None and layer.table.ndim == 2]
+        tables = [
+            layer.table.reshape(-1) for layer in layers.layers if layer.table is not None and layer.table.ndim == 2
+        ]
         rows = torch.cat([*tables, packed.new_empty(0, dtype=sums)]).to(sums)
-        numbers = torch.cat([part.reshape(-1) for part in numbers_of(program)] or [torch.empty(0)]).double().unsqueeze(0)
+        numbers = (
+            torch.cat([part.reshape(-1) for part in numbers_of(program)] or [torch.empty(0)]).double().unsqueeze(0)
+        )
         given = self.parameters.read(program.parameters)
         if given.shape[1]:
             numbers = torch.cat((numbers.expand(len(given), -1), given), 1)
@@ -161,7 +164,11 @@ class NativeExecutor:
             constant = may_be_constant(program, reference)
             batch, moved = batch_of(program.parameters), _example(program, torch.from_numpy(constant), False)
             after = eager.step(program, moved.expand(*batch, -1, -1), _action(program).expand(*batch, -1))[0]
-            constant &= (np.abs(after.numpy() - reference) <= 1e-9 * (1 + np.abs(reference))).reshape(-1, *constant.shape).all(0)
+            constant &= (
+                (np.abs(after.numpy() - reference) <= 1e-9 * (1 + np.abs(reference)))
+                .reshape(-1, *constant.shape)
+                .all(0)
+            )
             special = self._state_maths(program, layers, reference, constant)
             try:
                 general = self._state_maths(program, layers, reference, np.zeros_like(constant))

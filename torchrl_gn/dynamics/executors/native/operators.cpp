@@ -380,6 +380,27 @@ Tensor unpack(const Tensor& packed, at::IntArrayRef shapes, bool weights) {
   return at::cat(parts);
 }
 
+// Muon's update of matrices [rows, columns] and their momentum, in place: see training/muon.py.
+void muon(at::TensorList parameters, at::TensorList gradients, at::TensorList moments, double momentum, double rate,
+          at::ArrayRef<double> polynomials, int64_t threads) {
+  TORCH_CHECK_VALUE(parameters.size() == gradients.size() && parameters.size() == moments.size() &&
+                        polynomials.size() % 3 == 0,
+                    "Muon needs a gradient and a moment of each parameter, and three coefficients a polynomial.");
+  std::vector<gn::MuonMatrix> matrices;
+  for (size_t i = 0; i < parameters.size(); ++i) {
+    const Tensor& parameter = parameters[i];
+    for (const Tensor& each : {parameter, gradients[i], moments[i]})
+      TORCH_CHECK_VALUE(each.is_cpu() && each.dim() == 2 && each.is_contiguous() && each.sizes() == parameter.sizes() &&
+                            each.scalar_type() == parameters[0].scalar_type() && is_number(each) && each.numel() > 0,
+                        "Native Muon updates contiguous matrices of one dtype.");
+    matrices.push_back({parameter.data_ptr(), gradients[i].const_data_ptr(), moments[i].data_ptr(), parameter.size(0),
+                        parameter.size(1)});
+  }
+  const gn::MuonOptions options{momentum, rate, polynomials.data(), int64_t(polynomials.size() / 3)};
+  const bool is_double = !parameters.empty() && parameters[0].scalar_type() == at::kDouble;
+  gn::muon(is_double ? gn::kFloat64 : gn::kFloat32, matrices, options, thread_count(threads));
+}
+
 // Shapes without numbers, for compilers.
 
 Tensor rollout_shape(const Tensor& state, const Tensor& actions, const Tensor&, const Tensor&, const Tensor&,
@@ -529,6 +550,9 @@ TORCH_LIBRARY(torchrl_gn, library) {
       " Tensor? sample_tables, Tensor numbers, Tensor stored, bool many, int threads, bool of_weights)"
       " -> (Tensor, Tensor, Tensor, Tensor)");
   library.def("pack(Tensor numbers, int[] shapes, bool weights) -> Tensor");
+  library.def(
+      "muon_(Tensor(a!)[] parameters, Tensor[] gradients, Tensor(b!)[] moments, float momentum, float rate,"
+      " float[] polynomials, int threads) -> ()");
   library.def("has_bfloat16() -> bool", gn::has_bfloat16);
 }
 
@@ -537,6 +561,7 @@ TORCH_LIBRARY_IMPL(torchrl_gn, CPU, library) {
   library.impl("rollout_keeping", rollout_keeping);
   library.impl("rollout_adjoint", rollout_adjoint);
   library.impl("pack", pack);
+  library.impl("muon_", muon);
 }
 
 TORCH_LIBRARY_IMPL(torchrl_gn, Meta, library) {

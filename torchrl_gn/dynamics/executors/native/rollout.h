@@ -6,18 +6,14 @@
 #pragma once
 
 #include <algorithm>
-#include <atomic>
 #include <cstdlib>
-#include <exception>
-#include <mutex>
 #include <new>
-#include <system_error>
-#include <thread>
 #include <vector>
 
 #include "call.h"
 #include "network.h"
 #include "tape.h"
+#include "threads.h"
 
 namespace gn __attribute__((visibility("hidden"))) {
 
@@ -254,10 +250,7 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
   WeightGradients<T> gradients(call, m.structure.network(), adjoint ? tiles : 0);
   // Each part's tiles are handled in order by one thread; without parts, a tile is a part.
   const int64_t parts = gradients.parts ? gradients.parts : tiles;
-  std::atomic<int64_t> next{0};
-  std::mutex lock;
-  std::exception_ptr failed;
-  auto work = [&]() {
+  on_threads(call.threads, parts, [&](std::atomic<int64_t>& next) {
     constexpr int L = W * C;
     const int64_t most = std::max(m.forward.registers(), adjoint ? m.adjoint.registers() : 0) + m.varying_count;
     const bool again = adjoint && !call.stored;
@@ -280,24 +273,7 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
         if (!adjoint) runner.forward();
         else runner.pull(more, room, sums, gradients.of_weights(part), gradients.of_tables(part));
       }
-  };
-  auto careful = [&]() {  // an exception that left a thread would end the process
-    try {
-      work();
-    } catch (...) {
-      std::lock_guard<std::mutex> guard(lock);
-      failed = std::current_exception();
-      next = parts;
-    }
-  };
-  std::vector<std::thread> others;
-  try {
-    for (int64_t i = 1; i < std::min(call.threads, parts); ++i) others.emplace_back(careful);
-  } catch (const std::exception&) {  // the system has no more: those that there are do all tiles
-  }
-  careful();
-  for (auto& other : others) other.join();
-  if (failed) std::rethrow_exception(failed);
+  });
   if (adjoint) gradients.write(call, network);
 }
 

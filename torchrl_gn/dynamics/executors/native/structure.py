@@ -21,7 +21,7 @@ _GROUPS, _PHASES = 6, 2
 
 
 def structure(layers: LayerList, special: StateMaths, general: StateMaths | None) -> Tensor:
-    """Words ``[W]`` int64 of a network and the state maths of a scene's usual states, and of all others if there are."""
+    """Words ``[W]`` int64 of a network, the state maths of a scene's usual states, and of all others if it is known."""
     words = _Words(_HEADER)
     network = words.network(layers)
     maths = [-1 if each is None else words.maths(each, layers) for each in (special, general)]
