@@ -482,13 +482,13 @@ def test_a_compiled_model_sees_one_number_of_rows(monkeypatch):
     """Each other one would take minutes to compile for."""
     env = point_env(20.0)
     monkeypatch.setattr(ModulePredictor, "fixed_batch", True)
-    rows, imagine = [], env.imagine
+    rows, imagine = [], env.imagine_steps
 
     def watched(entries, actions):
         rows.append(len(actions))
         return imagine(entries, actions)
 
-    monkeypatch.setattr(env, "imagine", watched)
+    monkeypatch.setattr(env, "imagine_steps", watched)
     start = at(1.0, -0.5)
     GradientPlanner(env, HORIZON, 2, warm_up=3, samples=9, candidates=2, seed=0)(start)
     assert set(rows) == {4} and len(rows) == 9 // 2 + 3 + 1

@@ -32,13 +32,13 @@ def test_weights_get_no_gradients():
     """Not even computed: they are frozen while it plans, and only then."""
     bound = trained(load_scene("pendulum"))
     env = ModelEnv(bound, make_reward("balance", bound.scene))
-    required, imagine = [], env.imagine
+    required, imagine = [], env.imagine_steps
 
     def watched(*inputs):
         required.append(any(weight.requires_grad for weight in bound.parameters()))
         return imagine(*inputs)
 
-    env.imagine = watched
+    env.imagine_steps = watched
     GradientPlanner(env, 3, 1, warm_up=2, samples=2, seed=0)(env.reset(TensorDict(batch_size=[2])))
     assert required and not any(required)
     assert all(weight.requires_grad and weight.grad is None for weight in bound.parameters())

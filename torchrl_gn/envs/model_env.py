@@ -19,6 +19,7 @@ from torchrl_gn.drawing import draw_states
 from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
 from torchrl_gn.dynamics.predictor import require_bound
+from torchrl_gn.envs.episode_ends import Imagined, imagined_steps
 from torchrl_gn.envs.specs import (
     DoneFunction,
     RewardFunction,
@@ -28,10 +29,9 @@ from torchrl_gn.envs.specs import (
     reward_of,
     set_specs,
     spec_of,
-    step_reward,
 )
 from torchrl_gn.envs.starts import StartSampler, StartStates
-from torchrl_gn.envs.terminal import TerminalValue, plan_rewards, step_entries, terminal_of
+from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
@@ -41,7 +41,7 @@ class ModelEnv(ModelBasedEnvBase):
 
     Stateless, batched over any leading batch, and differentiable in ``state``, ``action`` and the weights of
     ``world_model``. A prediction that is not finite keeps the last good state, sets ``done`` and ``terminated`` and
-    gives ``unstable_reward``. Rollouts do not check ``done``; ``TransformedEnv`` around the environment does.
+    gives ``unstable_reward``. Rollouts and collectors reset at every end, as those of any environment of TorchRL.
 
     ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state``, ``reset()`` from drawn ones. Physical
     parameters come from the TensorDict, else from the scene (zeros if inferred); TorchRL does not carry them across
@@ -195,9 +195,14 @@ class ModelEnv(ModelBasedEnvBase):
     def imagine(self, tensordict: TensorDictBase, actions: Tensor) -> tuple[Tensor, Tensor]:
         """States ``[*B, H + 1, N, 13]`` and rewards ``[*B, H, 1]`` of action sequences ``[*B, H, A]``; differentiable.
 
-        Equals stepping a TensorDict ``[*B]``, but is faster; predictions that are not finite are returned as they are.
-        With a terminal value the rewards are those of :func:`~torchrl_gn.envs.terminal.plan_rewards`.
+        Equals stepping a TensorDict ``[*B]`` until ``done``, but is faster; rewards after that are 0. States are
+        returned as they are predicted, also after the end and where they are not finite. With a terminal value the
+        rewards are those of :func:`~torchrl_gn.envs.terminal.plan_rewards`.
         """
+        return self.imagine_steps(tensordict, actions)[:2]
+
+    def imagine_steps(self, tensordict: TensorDictBase, actions: Tensor) -> Imagined:
+        """What :meth:`imagine` returns, and which of the steps count."""
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
         if actions.shape != shape or shape[-2] < 1:
             raise ValueError(
@@ -208,19 +213,7 @@ class ModelEnv(ModelBasedEnvBase):
         model = self.predictor
         inputs = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
         states, _ = model.rollout(state, self._with_past(tensordict, actions), *inputs)  # pyright: ignore[reportArgumentType]
-        tasks = task = cast("Tensor | None", tensordict.get("task", None))
-        if task is not None:
-            batch = tensordict.ndim
-            tasks = task.unsqueeze(batch).expand(*task.shape[:batch], shape[-2], *task.shape[batch:])
-        before, after = states[..., :-1, :, :], states[..., 1:, :, :]
-        rewards = step_reward(self.reward, before, actions, after, tasks)
-        return states, plan_rewards(self.terminal, rewards, states[..., -1, :, :], task)
-
-    def any_done(self, tensordict: TensorDictBase) -> bool:
-        return False  # rollouts run their full length, without waiting for a GPU
-
-    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict
+        return imagined_steps(self, tensordict, states, actions)
 
     def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:
         """Pictures ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``, as of :class:`SceneEnv`.

@@ -113,17 +113,28 @@ def finite_reward(value: float | None) -> float:
 def step_reward(
     reward: RewardFunction | None, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None
 ) -> Tensor:
-    """A step's reward ``[*B, 1]`` in float32, zero without a function; ValueError for another shape, or NaN."""
+    """A step's reward ``[*B, 1]`` in float32, zero without a function; ValueError for another shape, or NaN.
+
+    TypeError if it is no tensor.
+    """
     shape = (*next_state.shape[:-2], 1)
     if reward is None:
         return next_state.new_zeros(shape, dtype=torch.float32)
-    value = reward(state, action, next_state, task)
-    if value.shape != shape:
-        raise ValueError(f"the reward must be {list(shape)}, {reward} returned {list(value.shape)}")
+    value = require_shape(reward(state, action, next_state, task), shape, "the reward", reward)
     # A GPU would have to be waited for.
     if value.device.type == "cpu" and not is_traced() and bool(value.isnan().any()):
         _refuse_nan(reward, value, state, action, next_state, task)
     return value.to(torch.float32)
+
+
+def require_shape(value: Any, shape: tuple[int, ...], what: str, source: Any) -> Tensor:
+    """The value of a user's function, ``source``; TypeError for what is no tensor, ValueError for another shape."""
+    if not isinstance(value, Tensor):
+        given = f"{value!r:.40}" if isinstance(value, (bool, int, float)) else type(value).__name__
+        raise TypeError(f"{what} must be a tensor {list(shape)}, {source} returned {given}")
+    if value.shape != shape:
+        raise ValueError(f"{what} must be {list(shape)}, {source} returned {list(value.shape)}")
+    return value
 
 
 def _refuse_nan(reward: Any, value: Tensor, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> None:
@@ -137,29 +148,39 @@ def _refuse_nan(reward: Any, value: Tensor, state: Tensor, action: Tensor, next_
     raise ValueError(f"the reward {name} returned NaN for a finite state and action")
 
 
+def unstable_reward(env: Any, staying: Tensor) -> Tensor | float:
+    """Reward of a step that is not stable: the environment's, or, where that is None, what ``staying`` would cost."""
+    return (_STAYING * staying).clamp(max=0) if env.unstable_reward is None else env.unstable_reward
+
+
 def outcome(
     env: Any, tensordict: TensorDictBase, state: Tensor, action: Tensor, next_state: Tensor, stable: Tensor
 ) -> dict[str, Tensor]:
-    """Entries that a step writes; where it is not ``stable`` ``[*B, 1]``, the last state and ``unstable_reward``.
-
-    Where that is None, what staying in the last state would cost.
-    """
+    """Entries that a step writes; where it is not ``stable`` ``[*B, 1]``, the last state and ``unstable_reward``."""
     next_state = torch.where(stable.unsqueeze(-1), next_state, state)
     reward = step_reward(env.reward, state, action, next_state, tensordict.get("task", None))
-    unstable = (_STAYING * reward).clamp(max=0) if env.unstable_reward is None else env.unstable_reward
-    entries = {"state": next_state, "reward": torch.where(stable, reward, unstable)}
-    terminated = ~stable if env.ends is None else ~stable | _ended(env, tensordict, entries)
+    entries = {"state": next_state, "reward": torch.where(stable, reward, unstable_reward(env, reward))}
+    terminated = ~stable
+    if env.ends is not None:
+        reads = isinstance(env.ends, TensorDictModuleBase)
+        terminated = terminated | ended_by(
+            env, next_state, tensordict.exclude("next").update(entries) if reads else None
+        )
     return {**entries, "done": terminated, "terminated": terminated.clone()}
 
 
-def _ended(env: Any, tensordict: TensorDictBase, entries: dict[str, Tensor]) -> Tensor:
-    """Whether an environment's ``done`` function ends the episode, ``[*B, 1]``; ValueError for another result."""
+def ended_by(env: Any, next_state: Tensor, entries: TensorDictBase | None = None) -> Tensor:
+    """Whether an environment's ``done`` ends the episode after a step, ``[*B, 1]``; ValueError for another result.
+
+    A module reads ``entries`` ``[*B]``: those of the step's input, updated by what it wrote.
+    """
     if isinstance(env.ends, TensorDictModuleBase):
-        ended = env.ends(tensordict.exclude("next").update(entries)).get("terminated", None)
+        assert entries is not None
+        ended = env.ends(entries).get("terminated", None)
     else:
-        ended = env.ends(entries["state"])
-    shape = (*tensordict.shape, 1)
-    if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape not in (shape, tensordict.shape):
+        ended = env.ends(next_state)
+    batch, shape = next_state.shape[:-2], (*next_state.shape[:-2], 1)
+    if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape not in (shape, batch):
         given = f"{ended.dtype} {list(ended.shape)}" if isinstance(ended, Tensor) else repr(ended)
-        raise ValueError(f"done= must give 'terminated', bool {list(tensordict.shape)} or {list(shape)}, got {given}")
+        raise ValueError(f"done= must give 'terminated', bool {list(batch)} or {list(shape)}, got {given}")
     return ended.reshape(shape)

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchrl_gn.envs.specs import DIVERGED, on_device
+from torchrl_gn.envs.specs import DIVERGED, on_device, require_shape
 from torchrl_gn.finite import is_traced
 from torchrl_gn.scenes.scene import Scene
 
@@ -49,8 +49,7 @@ def _reads_task(terminal: TerminalValue) -> bool:
 def terminal_value(terminal: TerminalValue, state: Tensor, task: Any) -> Tensor:
     """Values ``[*B, 1]`` of states ``[*B, N, 13]``; ValueError for another shape, or NaN of a finite state."""
     value = terminal(state, task) if _reads_task(terminal) else terminal(state)
-    if value.shape != (shape := (*state.shape[:-2], 1)):
-        raise ValueError(f"the terminal value must be {list(shape)}, {terminal} returned {list(value.shape)}")
+    value = require_shape(value, (*state.shape[:-2], 1), "the terminal value", terminal)
     # A GPU would have to be waited for.
     if value.device.type == "cpu" and not is_traced() and bool((nan := value.isnan().squeeze(-1)).any()):
         if bool((nan & (state.abs() < DIVERGED).flatten(-2).all(-1)).any()):
@@ -58,15 +57,19 @@ def terminal_value(terminal: TerminalValue, state: Tensor, task: Any) -> Tensor:
     return value
 
 
-def plan_rewards(terminal: TerminalValue | None, rewards: Tensor, last_state: Tensor, task: Any) -> Tensor:
+def plan_rewards(
+    terminal: TerminalValue | None, rewards: Tensor, last_state: Tensor, task: Any, alive: Tensor
+) -> Tensor:
     r"""Discounted rewards ``[*B, H, 1]`` of a plan's steps, the last with the value of its last state ``[*B, N, 13]``.
 
-    Their sum is :math:`\sum_{t<H} \gamma^t r_t + \gamma^H V(s_H)`. Without a value, the rewards as they are.
+    Their sum is :math:`\sum_{t<H} \gamma^t r_t + \gamma^H V(s_H)`. The value counts where the episode is ``alive``
+    ``[*B, 1]`` after the last step. Without a value, the rewards as they are.
     """
     if terminal is None:
         return rewards
     steps, discount = rewards.shape[-2], discount_of(terminal)
     value = discount**steps * terminal_value(terminal, last_state, task).to(rewards.dtype)
+    value = torch.where(alive, value, 0.0)
     factors = discount ** torch.arange(steps, dtype=rewards.dtype, device=rewards.device)
     return rewards * factors.unsqueeze(-1) + pad(value.unsqueeze(-2), (0, 0, steps - 1, 0))
 

@@ -18,7 +18,17 @@ from torchrl.envs import TensorDictPrimer
 from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.networks.frozen_weights import frozen
-from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
+from torchrl_gn.planners.plan import (
+    KEY,
+    RecedingHorizonPlanner,
+    check_plannable,
+    flat_rows,
+    keep_better,
+    plan_primer,
+    read_plan,
+    repeated,
+    shift_plan,
+)
 from torchrl_gn.planners.proposal import check_proposal, propose
 
 _MIN_STEP_SIZE = 0.01  # as a fraction of the optimiser's
@@ -32,8 +42,8 @@ class GradientPlanner(RecedingHorizonPlanner):
     Paper, SM "MPC planner with learned models". Every control step rolls out ``horizon`` steps and updates the
     actions by the gradient of their summed reward, ``iterations`` times. The first action of the best sequence seen
     is executed; the rest, shifted, warm-starts the next plan: the TensorDict's entry ``plan``. Where episodes
-    auto-reset, append :meth:`make_tensordict_primer` to the environment. Sequences that are not finite are discarded;
-    if all are, the last plan is kept, with a warning.
+    auto-reset, append :meth:`make_tensordict_primer` to the environment. Rewards count until its ``done``. Sequences
+    that are not finite before are discarded; if all are, the last plan is kept, with a warning.
 
     Opens autograd itself, also under ``no_grad``; ``inference_mode`` is refused. Actions are detached.
 
@@ -58,6 +68,9 @@ class GradientPlanner(RecedingHorizonPlanner):
         ValueError: an option is out of range, reward or actions are missing, or the rewards ignore the actions.
         KeyError: when planning, the environment drops a recurrent model's hidden state.
     """
+
+    middle: Tensor
+    half_range: Tensor
 
     def __init__(
         self,
@@ -103,9 +116,6 @@ class GradientPlanner(RecedingHorizonPlanner):
         self.to(env.device)
         self._rng = numpy_generator(seed)
 
-    middle: Tensor
-    half_range: Tensor
-
     @property
     def imagined(self) -> ModelEnv:
         """The learned environment."""
@@ -127,7 +137,7 @@ class GradientPlanner(RecedingHorizonPlanner):
                 "GradientPlanner needs gradients: use torch.no_grad() instead of torch.inference_mode()."
             )
         batch, device = tensordict.shape, self.imagined.device
-        flat = tensordict.reshape(-1)
+        flat = flat_rows(tensordict)
         plan, planned = read_plan(flat, self.plan_shape, torch.float32)
         states_at = cast(Tensor, tensordict.get("state", plan)).device
         plan, planned = self._scaled(plan.to(device)), planned.flatten().to(device)
@@ -159,10 +169,9 @@ class GradientPlanner(RecedingHorizonPlanner):
             executed = entries.copy().set("action", self.env.action_spec.project(actions[:, 0, 0]))
             with torch.no_grad():
                 after = self.imagined.carried(executed)
-            written |= {
-                ("next", key): value.reshape(*batch, *value.shape[1:]).to(states_at) for key, value in after.items()
-            }
-        return actions[:, 0, 0].reshape(*batch, -1).to(states_at), written
+            for key, value in after.items():
+                written["next", key] = value.reshape(*batch, *value.shape[1:]).to(states_at)
+        return plan[..., 0, 0, :].to(states_at), written
 
     def _scaled(self, actions: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in units of half their range, -1 to 1; 0 where they are fixed."""
@@ -176,18 +185,21 @@ class GradientPlanner(RecedingHorizonPlanner):
         """Entries that a rollout reads, detached."""
         self.imagined.predictor.parameters_in(flat)  # refuses other variants, which the entries below no longer show
         keys = [key for key in (*self.imagined.world_model.in_keys, "past_actions", "task") if key != "action"]
-        keys += [] if self.proposal is None else [key for key in self.proposal.in_keys if key not in keys]
+        for reader in (self.proposal, self.imagined.ends):
+            keys += [key for key in getattr(reader, "in_keys", ()) if key not in (*keys, "action", "reward")]
         read = flat.select(*keys, strict=False).detach()
         # Autograd refuses tensors made in inference mode: clone them.
         usable = read.apply(lambda entry: entry.clone() if entry.is_inference() else entry)
         return cast(TensorDictBase, usable).to(self.imagined.device)
 
     def predicted_returns(self, starts: TensorDictBase, plan: Tensor) -> Tensor:
-        """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` from states ``[B K]``; minus infinity if diverged."""
-        states, rewards = self.imagined.imagine(starts, self._actions(plan).flatten(0, 1))
-        finite = states.detach().isfinite().flatten(1).all(1)
-        total = torch.where(finite, rewards.sum((-2, -1)), -torch.inf).reshape(plan.shape[:2])
-        return total - self.action_cost * plan.square().mean(-1).sum(-1) if self.action_cost else total
+        """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` until the end; minus infinity if diverged before."""
+        imagined = self.imagined.imagine_steps(starts, self._actions(plan).flatten(0, 1))
+        total = torch.where(imagined.diverged, -torch.inf, imagined.rewards.sum((-2, -1))).reshape(plan.shape[:2])
+        if self.action_cost:
+            efforts = torch.where(imagined.alive[:, :-1, 0].reshape(plan.shape[:3]), plan.square().mean(-1), 0.0)
+            total = total - self.action_cost * efforts.sum(-1)
+        return total
 
     def initial_plan(self, entries: TensorDictBase) -> Tensor:
         """Return the best random sequences ``[B, K, H, A]``, zero actions and the proposal among them."""
@@ -199,7 +211,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         # A compiled model recompiles, in minutes, for every number of rows: use the later one.
         size = self.candidates if self.imagined.predictor.fixed_batch else self.samples
         drawn = drawn[:, : self.samples // size * size]
-        starts = _repeated(entries, size)
+        starts = repeated(entries, size)
         with torch.no_grad():
             total = torch.cat([self.predicted_returns(starts, part) for part in drawn.split(size, dim=1)], dim=1)
         total = total.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
@@ -223,7 +235,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         """The policy's scaled sequences ``[B, 1, H, A]``."""
         assert self.proposal is not None
         size = self.candidates if self.imagined.predictor.fixed_batch else 1
-        actions = propose(self.proposal, self.imagined, _repeated(entries, size), self.horizon)[::size]
+        actions = propose(self.proposal, self.imagined, repeated(entries, size), self.horizon)[::size]
         return self._scaled(actions.to(self.half_range.dtype)).clamp(-1, 1).unsqueeze(1)
 
     def later_plan(self, entries: TensorDictBase, plan: Tensor) -> Tensor:
@@ -247,7 +259,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         Returns the best sequences seen, best candidate first, and ``[B, 1]`` whether any beats all given ones.
         """
         # The same tensors in every iteration: the model folds their parameters once.
-        starts = _repeated(entries, self.candidates)
+        starts = repeated(entries, self.candidates)
         best, best_return = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
         initial_return, descent = best_return, -torch.ones_like(best_return)
         # The optimiser sees offsets in units of the step size.
@@ -266,7 +278,7 @@ class GradientPlanner(RecedingHorizonPlanner):
                     " lengthen the horizon until actions change the reward, or mend a reward that passes no gradient"
                     " (detach, NumPy, comparisons)."
                 )
-            best, best_return = _keep_better(best, best_return, actions, total)
+            best, best_return = keep_better(best, best_return, actions, total)
             initial_return = best_return if iteration == 0 else initial_return
             # A candidate whose gradient overflows stays where it is.
             finite = gradient.isfinite().flatten(2).all(-1)[..., None, None]
@@ -274,7 +286,7 @@ class GradientPlanner(RecedingHorizonPlanner):
             optimizer.step()
             offset.copy_((torch.addcmul(plan, scale, offset).clamp(-1, 1) - plan) / scale)
         actions = torch.addcmul(plan, scale, offset)
-        best, best_return = _keep_better(best, best_return, actions, self.predicted_returns(starts, actions))
+        best, best_return = keep_better(best, best_return, actions, self.predicted_returns(starts, actions))
         failed = int((best_return == -torch.inf).all(1).sum())
         if failed:
             fallback = "their last plan is kept" if resumed else "there is no plan yet, and nothing is done"
@@ -287,13 +299,3 @@ class GradientPlanner(RecedingHorizonPlanner):
         order = best_return.argsort(dim=1, descending=True, stable=True)
         improved = best_return.amax(1, keepdim=True) > initial_return.amax(1, keepdim=True)
         return best.gather(1, order[..., None, None].expand_as(best)).clamp(-1, 1), improved
-
-
-def _repeated(entries: TensorDictBase, count: int) -> TensorDictBase:
-    return entries if count == 1 else entries.repeat_interleave(count, dim=0)
-
-
-def _keep_better(best: Tensor, best_return: Tensor, actions: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
-    """Update the best candidates and their returns; returns that are not finite never win."""
-    better = total.isfinite() & (total > best_return)
-    return torch.where(better[..., None, None], actions, best), torch.where(better, total, best_return)

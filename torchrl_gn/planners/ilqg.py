@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -20,13 +20,22 @@ from torchrl.envs import TensorDictPrimer
 from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.envs.episode_ends import counted_steps, ended_steps
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.envs.terminal import plan_rewards
 from torchrl_gn.networks.frozen_weights import frozen
-from torchrl_gn.planners.ilqg_solver import ILQGSolver
+from torchrl_gn.planners.ilqg_solver import CountedSteps, ILQGSolver
 from torchrl_gn.planners.linearize import RewardExpansion
-from torchrl_gn.planners.plan import KEY, RecedingHorizonPlanner, check_plannable, plan_primer, read_plan, shift_plan
+from torchrl_gn.planners.plan import (
+    KEY,
+    RecedingHorizonPlanner,
+    check_plannable,
+    flat_rows,
+    plan_primer,
+    read_plan,
+    shift_plan,
+)
 from torchrl_gn.planners.plant import LearnedPlant, Plant, SimulatedPlant
 from torchrl_gn.planners.proposal import check_proposal, propose
 
@@ -42,9 +51,10 @@ class ILQGPlanner(RecedingHorizonPlanner):
     :class:`~torchrl_gn.planners.GradientPlanner` is of first order.
 
     Every control step improves the planned actions by a few iterations, to maximise the sum of ``env.reward`` minus a
-    control cost. The first action is executed; the rest warm-starts the next plan. Where episodes auto-reset, append
-    :meth:`make_tensordict_primer` to the environment. Rows of a batch are planned one by one, in float64, without
-    gradients. A state without any stable sequence keeps its last plan, or zero actions, with a warning.
+    control cost, until the environment's ``done``. The first action is executed; the rest warm-starts the next plan.
+    Where episodes auto-reset, append :meth:`make_tensordict_primer` to the environment. Rows of a batch are planned one
+    by one, in float64, without gradients. A state without any stable sequence keeps its last plan, or zero actions,
+    with a warning.
 
     Reads ``physics`` ``[*B, S]`` float64 (through a model ``state`` ``[*B, N, 13]``), and ``task`` and ``plan`` if
     present; writes ``action`` ``[*B, A]`` and ``plan``: remaining ``actions`` ``[*B, H, A]`` float64 and ``planned``
@@ -152,7 +162,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         variants = [0] * len(starts) if variant is None else variant.flatten().tolist()
         proposed: list[np.ndarray | None] = [None] * len(starts)
         if self.proposal is not None and (self.propose_every_step or not all(resumed)):
-            flat = tensordict.exclude("next", "action", KEY).detach().reshape(-1)
+            flat = flat_rows(tensordict.exclude("next", "action", KEY).detach())
             proposed = list(propose(self.proposal, env, flat, self.horizon).double().cpu().numpy())
         with frozen(env) if isinstance(env, ModelEnv) else contextlib.nullcontext():
             for row, start in enumerate(starts):
@@ -173,14 +183,15 @@ class ILQGPlanner(RecedingHorizonPlanner):
             raise KeyError(f"ILQGPlanner needs an entry {key!r}, the {what}.")
         if found.shape != (*tensordict.shape, *shape):
             raise ValueError(f"{key!r} must be {[*tensordict.shape, *shape]}, got {list(found.shape)}")
-        return found.detach().double().reshape(tensordict.numel(), -1).cpu().numpy()
+        return found.detach().double().reshape(math.prod(tensordict.shape), math.prod(shape)).cpu().numpy()
 
     def _plan_row(
         self, plant: Plant, start: np.ndarray, plan: np.ndarray | None, task: Any, proposed: np.ndarray | None
     ) -> np.ndarray:
         env = self._env
         reward = RewardExpansion(cast(Any, env.reward) if env.terminal is None else self._plan_reward, task, env.device)
-        solver = ILQGSolver(plant, reward, control_cost=self.control_cost)
+        count = None if env.ends is None else partial(self._count, task)
+        solver = ILQGSolver(plant, reward, control_cost=self.control_cost, count=count)
         iterations = self.warm_up if plan is None else self.iterations
         rest = np.zeros((1, *self._plan_shape))
         offered = rest[:0] if proposed is None or not (plan is None or self.propose_every_step) else proposed[None]
@@ -205,11 +216,24 @@ class ILQGPlanner(RecedingHorizonPlanner):
         return solver.actions(solver.controls(rest[0])) if plan is None else plan
 
     def _plan_reward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> Tensor:
-        """Rewards ``[*B, H, 1]`` of the steps of plans."""
-        rewards = cast(Any, self._env.reward)(state, action, next_state, task)
+        """Rewards ``[*B, H, 1]`` of the steps of plans, of which the last alone may end the episode."""
+        env = self._env
+        rewards = cast(Any, env.reward)(state, action, next_state, task)
         if task is not None:
             task = task[(*[slice(None)] * (action.ndim - 2), -1)]  # of the last step
-        return plan_rewards(self._env.terminal, rewards, next_state[..., -1, :, :], task)
+        entries = TensorDict({} if task is None else {"task": task}, action.shape[:-2])
+        last = state[..., -1:, :, :], action[..., -1:, :], next_state[..., -1:, :, :]
+        alive = ~ended_steps(env, entries, *last).squeeze(-2)
+        return plan_rewards(env.terminal, rewards, next_state[..., -1, :, :], task, alive)
+
+    def _count(self, task: Any, bodies: np.ndarray, actions: np.ndarray, stable: np.ndarray) -> CountedSteps:
+        """Steps that count, as the solver reads them, of bodies ``[n, H + 1, N, C]``."""
+        env = self._env
+        tensors = [torch.from_numpy(each).to(env.device) for each in (bodies, actions, stable)]
+        entries = TensorDict({} if task is None else {"task": task.expand(len(actions), *task.shape)}, [len(actions)])
+        with torch.no_grad():
+            *steps, alive = counted_steps(env, entries, *tensors)
+        return tuple(each.cpu().numpy() for each in (*steps[:3], steps[3].squeeze(-1), alive[:, :-1].squeeze(-1)))
 
     @property
     def _env(self) -> SceneEnv | ModelEnv:
@@ -229,5 +253,5 @@ def _flat(task: Any, dims: int) -> Any:
     if isinstance(task, TensorDictBase):
         task = task.copy()
         task.batch_size = task.batch_size[:dims]
-        return task.reshape(-1)
+        return flat_rows(task)
     return task.reshape(-1, *task.shape[dims:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,11 @@ _MIN_DAMPING = 1e-9  # keeps the quadratic model strictly convex
 _STATE_DAMPING = 0.3  # relative to the controls'
 
 
+# States before, actions, states after, which are stable and which count: those after the end are the end's again.
+CountedSteps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Count = Callable[[np.ndarray, np.ndarray, np.ndarray], CountedSteps]  # of bodies, actions and stable, as Paths has them
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """A sequence of ``H`` control steps."""
@@ -26,7 +32,8 @@ class Trajectory:
     controls: np.ndarray  # [H, A], in units of half their range, -1 to 1
     path: np.ndarray  # [H + 1, S], the plant's states
     state: np.ndarray  # [H + 1, N, 13], body states
-    cost: float  # control costs minus rewards, infinite if it was unstable
+    cost: float  # control costs minus rewards until the end, infinite if it was unstable before
+    length: int  # steps until the end, at most H
 
 
 class ILQGSolver:
@@ -35,11 +42,12 @@ class ILQGSolver:
     Every iteration linearises the dynamics, expands the reward (Gauss-Newton), solves the control-limited backward pass
     for several dampings, simulates each policy at several step sizes, and accepts the best trajectory if it improves.
     (Tassa et al. adapt one damping between iterations.) Dampings are relative to the cost gradient's root mean square.
-    ``control_cost`` is that of a control at its bound.
+    ``control_cost`` is that of a control at its bound. ``count`` gives the steps of trajectories that count, those
+    until an episode's end; default: all. Later controls are kept as they are: nothing depends on them.
     """
 
-    def __init__(self, plant: Plant, reward: RewardExpansion, *, control_cost: float):
-        self.plant, self.reward, self.control_cost = plant, reward, control_cost
+    def __init__(self, plant: Plant, reward: RewardExpansion, *, control_cost: float, count: Count | None = None):
+        self.plant, self.reward, self.control_cost, self.count = plant, reward, control_cost, count or _all_steps
         self.scene = plant.scene
         self._middle = 0.5 * (self.scene.action_high + self.scene.action_low)
         self._half = 0.5 * (self.scene.action_high - self.scene.action_low)
@@ -80,9 +88,11 @@ class ILQGSolver:
 
     def expand(self, trajectory: Trajectory) -> tuple[Linearization, QuadraticModel]:
         """Linear model of the dynamics and second-order model of the cost around a trajectory."""
-        actions, state = self.actions(trajectory.controls), trajectory.state
-        local = self.plant.linearize(trajectory.path, actions)
-        size, steps, num = local.bodies.shape[2], len(actions), self.scene.num_actions
+        steps = trajectory.length
+        controls_to_end, state = trajectory.controls[:steps], trajectory.state[: steps + 1]
+        actions = self.actions(controls_to_end)
+        local = self.plant.linearize(trajectory.path[: steps + 1], actions)
+        size, num = local.bodies.shape[2], self.scene.num_actions
         dynamics = local.dynamics.copy()
         dynamics[..., size:] *= self._half
         bodies = np.concatenate([local.bodies[:-1], np.zeros((steps, local.bodies.shape[1], num))], axis=2)
@@ -95,9 +105,9 @@ class ILQGSolver:
         else:
             gradient, hessian = self.reward.derivatives((state[:-1], actions, state[1:]), jacobians)
             gradient, hessian = -gradient, _positive(-hessian)
-            gradient[:, size:] += 2 * self.control_cost * trajectory.controls
+            gradient[:, size:] += 2 * self.control_cost * controls_to_end
             hessian[:, range(size, size + num), range(size, size + num)] += 2 * self.control_cost
-        lower, upper = -1.0 - trajectory.controls, 1.0 - trajectory.controls
+        lower, upper = -1.0 - controls_to_end, 1.0 - controls_to_end
         return local, QuadraticModel(dynamics, gradient, hessian, lower, upper)
 
     def _best_candidate(
@@ -115,6 +125,9 @@ class ILQGSolver:
             controls = np.empty((len(which), *trajectory.controls.shape))
 
             def policy(t: int, states: np.ndarray) -> np.ndarray:
+                if t >= trajectory.length:
+                    controls[:, t] = trajectory.controls[t]
+                    return self.actions(controls[:, t])
                 feedback = (gains[t, which] @ local.deviation(t, states)[..., None])[..., 0]
                 controls[:, t] = np.clip(trajectory.controls[t] + step * changes[t, which] + feedback, -1.0, 1.0)
                 return self.actions(controls[:, t])
@@ -126,14 +139,21 @@ class ILQGSolver:
     def _best(self, controls: np.ndarray, followed: Paths) -> tuple[Trajectory, int]:
         """The cheapest of ``n`` trajectories and its index; unstable ones and rewards not finite cost infinity."""
         paths, states, stable = followed
+        actions = self.actions(controls)
+        before, action, after, stable, counted = self.count(states, actions, stable)
         costs = np.full(len(controls), np.inf)
-        if stable.any():
-            bodies, used = states[stable], controls[stable]
-            rewards = self.reward.value((bodies[:, :-1], self.actions(used), bodies[:, 1:]))
-            costs[stable] = (self.control_cost * np.square(used).sum(axis=-1) - rewards).sum(axis=-1)
+        if (whole := stable.all(axis=1)).any():
+            rewards = self.reward.value((before[whole], action[whole], after[whole]))
+            efforts = self.control_cost * np.square(controls[whole]).sum(axis=-1)
+            costs[whole] = np.where(counted[whole], efforts - rewards, 0.0).sum(axis=-1)
         costs = np.where(np.isfinite(costs), costs, np.inf)
         best = int(costs.argmin())
-        return Trajectory(controls[best], paths[best], states[best], float(costs[best])), best
+        length = int(counted[best].sum())
+        return Trajectory(controls[best], paths[best], states[best], float(costs[best]), length), best
+
+
+def _all_steps(bodies: np.ndarray, actions: np.ndarray, stable: np.ndarray) -> CountedSteps:
+    return bodies[:, :-1], actions, bodies[:, 1:], stable, np.ones_like(stable)
 
 
 def _positive(matrices: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from numbers import Integral
@@ -75,6 +76,22 @@ def check_count(name: str, value: int, least: int) -> None:
         raise ValueError(f"{name} must be a whole number, got {value!r}")
     if value < least:
         raise ValueError(f"{name} must be at least {least}, got {value}")
+
+
+def flat_rows(tensordict: TensorDictBase) -> TensorDictBase:
+    """The rows of a TensorDict ``[*B]`` in one dimension; ``reshape(-1)`` refuses a batch of none."""
+    return tensordict.reshape(math.prod(tensordict.shape))
+
+
+def repeated(rows: TensorDictBase, count: int) -> TensorDictBase:
+    """Each of the rows ``[B]`` ``count`` times, one after the other."""
+    return rows if count == 1 else rows.repeat_interleave(count, dim=0)
+
+
+def keep_better(best: Tensor, best_return: Tensor, actions: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """Update the best candidates and their returns; returns that are not finite never win."""
+    better = total.isfinite() & (total > best_return)
+    return torch.where(better[..., None, None], actions, best), torch.where(better, total, best_return)
 
 
 def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:

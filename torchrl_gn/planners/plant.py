@@ -17,7 +17,8 @@ from torchrl_gn.planners.linearize import Linearization, Tangent, linearize
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
 _COMPONENTS = ("position", "orientation", "linear_velocity", "angular_velocity")
-Paths = tuple[np.ndarray, np.ndarray, np.ndarray]  # states [n, H + 1, S], their bodies [n, H + 1, N, C], stable [n]
+# States [n, H + 1, S], their bodies [n, H + 1, N, C], and which steps are stable [n, H], as are all before them.
+Paths = tuple[np.ndarray, np.ndarray, np.ndarray]
 Policy = Callable[[int, np.ndarray], np.ndarray]  # step and states [n, S] to actions [n, A]
 
 
@@ -48,7 +49,12 @@ class SimulatedPlant:
 
     def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
         simulated = self.simulator.rollout(np.tile(start, (len(actions), 1)), actions)
-        return tuple(simulated[key].numpy() for key in ("physics", "state", "stable"))  # pyright: ignore
+        paths, bodies, whole = (simulated[key].numpy() for key in ("physics", "state", "stable"))
+        stable = np.repeat(whole[:, None], actions.shape[1], axis=1)
+        if not whole.all():  # step by step, to see where
+            some = actions[~whole]
+            stable[~whole] = self.follow(start, len(some), actions.shape[1], lambda t, _: some[:, t])[2]
+        return paths, bodies, stable
 
     def follow(self, start: np.ndarray, count: int, steps: int, policy: Policy) -> Paths:
         paths = np.empty((count, steps + 1, len(start)))
@@ -59,7 +65,8 @@ class SimulatedPlant:
             paths[:, t + 1], bodies[:, t] = self.simulator.step(paths[:, t], actions)
         # One more step observes the last state, and whether it is stable.
         beyond, bodies[:, steps] = self.simulator.step(paths[:, steps], actions)
-        stable = np.asarray(np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(beyond).all(axis=1))
+        stable = _stable_steps(paths)
+        stable[:, -1] &= np.isfinite(beyond).all(axis=1)
         return paths, bodies, stable
 
     def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:
@@ -87,7 +94,8 @@ class LearnedPlant:
         state = torch.from_numpy(np.tile(start, (len(actions), 1))).unflatten(-1, self._shape)
         with torch.no_grad():
             bodies = self.predictor.rollout(state, torch.from_numpy(actions))[0].numpy()
-        return bodies.reshape(*bodies.shape[:2], -1), bodies, np.asarray(np.isfinite(bodies).all(axis=(1, 2, 3)))
+        paths = bodies.reshape(*bodies.shape[:2], -1)
+        return paths, bodies, _stable_steps(paths)
 
     def follow(self, start: np.ndarray, count: int, steps: int, policy: Policy) -> Paths:
         bodies = np.empty((count, steps + 1, *self._shape))
@@ -97,7 +105,7 @@ class LearnedPlant:
             for t in range(steps):
                 actions = torch.from_numpy(policy(t, paths[:, t]))
                 bodies[:, t + 1] = self.predictor.step(torch.from_numpy(bodies[:, t].copy()), actions)[0].numpy()
-        return paths, bodies, np.asarray(np.isfinite(paths).all(axis=(1, 2)))
+        return paths, bodies, _stable_steps(paths)
 
     def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:
         states, steps = path.reshape(-1, *self._shape), len(actions)
@@ -144,3 +152,8 @@ class LearnedPlant:
         flips = np.sign((here.numpy()[:, 0, :, turn] * states[..., turn]).sum(-1, keepdims=True))
         basis[..., turn] *= flips[:, None]
         return basis.reshape(count, 2 * nv, channels).swapaxes(1, 2)
+
+
+def _stable_steps(paths: np.ndarray) -> np.ndarray:
+    """Which steps ``[n, H]`` of states ``[n, H + 1, S]`` reach a finite one, as do all before them."""
+    return np.logical_and.accumulate(np.isfinite(paths).all(axis=2), axis=1)[:, 1:]
