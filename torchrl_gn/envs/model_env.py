@@ -20,6 +20,7 @@ from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.envs.episode_ends import Imagined, imagined_steps
+from torchrl_gn.envs.frame_skip import refuse_frame_skip
 from torchrl_gn.envs.specs import (
     DoneFunction,
     RewardFunction,
@@ -43,10 +44,11 @@ class ModelEnv(ModelBasedEnvBase):
     ``world_model``. A prediction that is not finite keeps the last good state, sets ``done`` and ``terminated`` and
     gives ``unstable_reward``. Rollouts and collectors reset at every end, as those of any environment of TorchRL.
 
-    ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state``, ``reset()`` from drawn ones. Physical
-    parameters come from the TensorDict, else from the scene (zeros if inferred); TorchRL does not carry them across
-    auto-resets. A model that reads past commands (:attr:`KinematicTree.history`) has the further entry
-    ``past_actions`` ``[*B, history, A]``; the action is that of the present.
+    ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state`` and what the model carries from step to
+    step, ``reset()`` from drawn states. Physical parameters come from the TensorDict, else from the scene (zeros if
+    inferred); TorchRL does not carry them across auto-resets. A model that reads past commands
+    (:attr:`KinematicTree.history`) has the further entry ``past_actions`` ``[*B, history, A]``; the action is that of
+    the present.
 
     Args:
         model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
@@ -86,7 +88,7 @@ class ModelEnv(ModelBasedEnvBase):
         if device is None:
             weight = next(itertools.chain(model.parameters(), model.buffers()), None)
             device = torch.device("cpu") if weight is None else weight.device
-        super().__init__(cast(TensorDictModule, model), device=device, allow_done_after_reset=True)
+        super().__init__(cast(TensorDictModule, model), device=device)
         self.scene, self.history = cast(Scene, model.scene), getattr(model.scene, "history", 0)
         if self.history:
             self.scene = cast(Any, model.scene).present
@@ -135,11 +137,13 @@ class ModelEnv(ModelBasedEnvBase):
                 require_finite(parameters, f"{self}: {key!r}")
             reset.set(key, parameters)
         if "hidden_state" in self.world_model.in_keys:
-            if (hidden_state := tensordict.get("hidden_state", None)) is None:
+            hidden_state = tensordict.get("hidden_state", None) if set_state else None  # of another episode
+            if hidden_state is None:
                 hidden_state = cast(Any, self.world_model).initial_hidden_state().expand(shape).clone()
             reset.set("hidden_state", hidden_state)
         if self.history:
-            reset.set("past_actions", self._past_actions(tensordict).clone())
+            known = tensordict if set_state else TensorDict(batch_size=shape)
+            reset.set("past_actions", self._past_actions(known).clone())
         if self.terminal is not None:
             reset.set("discount", torch.ones(*shape, 1))
         return reset.to(self.device)
@@ -160,6 +164,7 @@ class ModelEnv(ModelBasedEnvBase):
         return windows.flip(-1).transpose(-1, -2).flatten(-2)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        refuse_frame_skip(self)
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         predicted = self.world_model(self._inputs(tensordict))["next"]

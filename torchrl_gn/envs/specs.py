@@ -129,6 +129,7 @@ def step_reward(
 
 def require_shape(value: Any, shape: tuple[int, ...], what: str, source: Any) -> Tensor:
     """The value of a user's function, ``source``; TypeError for what is no tensor, ValueError for another shape."""
+    source = source if isinstance(source, nn.Module) else getattr(source, "__qualname__", repr(source))
     if not isinstance(value, Tensor):
         given = f"{value!r:.40}" if isinstance(value, (bool, int, float)) else type(value).__name__
         raise TypeError(f"{what} must be a tensor {list(shape)}, {source} returned {given}")

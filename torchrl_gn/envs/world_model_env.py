@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 from torchrl.envs.model_based import WorldModelEnv
 from torchrl.modules import WorldModel
 
+from torchrl_gn.envs.frame_skip import refuse_frame_skip
 from torchrl_gn.envs.starts import batched
+
+
+class _Dreams(WorldModelEnv):
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        refuse_frame_skip(self)
+        return super()._step(tensordict)
 
 
 def world_model_env(
@@ -30,6 +38,6 @@ def world_model_env(
     if observation_spec is None:
         observation_spec = Composite({latent_key: many.observation_spec[latent_key]}, shape=many.batch_size)
     shared = {"latent_key": latent_key, "observation_spec": observation_spec}
-    dreams = WorldModelEnv(world_model, env, batch_size=many.batch_size, **shared)
+    dreams = _Dreams(world_model, env, batch_size=many.batch_size, **shared)
     dreams.action_spec, dreams.reward_spec = many.action_spec.clone(), many.reward_spec.clone()
     return dreams

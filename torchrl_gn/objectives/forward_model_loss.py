@@ -20,6 +20,7 @@ from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.objectives.checks import read_entries, require_fitted
+from torchrl_gn.objectives.episodes_in_rows import Starts, choose, forget, require_constant, starts_of
 
 FIT_NORMALIZERS = (
     "Call fit_normalizers(transitions) of the loss with thousands of clean transitions [B], once before training;"
@@ -55,6 +56,7 @@ class ForwardModelLoss(LossModule):
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` consecutive steps, ``action`` ``[B, (H,) A]``,
     ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if it reads them.
+    With ``("next", "done")`` ``[B, H, 1]``, as collected, a window starts again after each end: at the true state.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
 
@@ -63,10 +65,11 @@ class ForwardModelLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that :meth:`set_keys` can change; ``state`` is also read under ``"next"``."""
+        """Keys that :meth:`set_keys` can change; ``state`` is also read under ``"next"``, ``done`` only there."""
 
         state: NestedKey = "state"
         action: NestedKey = "action"
+        done: NestedKey = "done"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -193,20 +196,23 @@ class ForwardModelLoss(LossModule):
         state, action, next_state = self._read(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
-        parameters = self._read_parameters(tensordict, windows=state.ndim == 4)
+        layout, steps = self.model.layout, state.shape[1] if state.ndim == 4 else 1
+        done = tensordict.get(unravel_key(("next", self.tensor_keys.done)), None)
+        starts = starts_of(done, steps, self.teacher_forced_steps)
+        parameters = self._read_parameters(tensordict, starts if state.ndim == 4 else None)
         if state.ndim == 3:
-            state, action, next_state = state.unsqueeze(1), action.unsqueeze(1), next_state.unsqueeze(1)
-        layout, steps = self.model.layout, state.shape[1]
+            state, action, next_state = (entry.unsqueeze(1) for entry in (state, action, next_state))
         current, hidden = self.perturb(state[:, 0]), None
         errors = state.new_zeros(len(layout.components))
         prepared = self.model.prepared_for_training(parameters)
         for step in range(steps):
-            target = layout.delta(current, next_state[:, step])
             delta, hidden = prepared.delta(current, action[:, step], hidden)
-            errors = errors + self.component_errors(delta, target)
+            errors = errors + self.component_errors(delta, layout.delta(current, next_state[:, step]))
             if step + 1 < steps:
-                teacher_forced = step + 1 < self.teacher_forced_steps
-                current = self.perturb(state[:, step + 1]) if teacher_forced else layout.apply(current, delta)
+                true, fresh = starts[step + 1]
+                predicted = current if true is True else layout.apply(current, delta)
+                current = predicted if true is False else choose(true, self.perturb(state[:, step + 1]), predicted)
+                hidden = forget(hidden, fresh)
                 if self.bptt_steps is not None and (step + 1) % self.bptt_steps == 0:
                     current, hidden = current.detach(), None if hidden is None else hidden.detach()
         errors, scale = errors / steps, self._scale(self.noise_scale)
@@ -243,15 +249,15 @@ class ForwardModelLoss(LossModule):
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         state, action, next_state = read_entries(self, tensordict, self.in_keys[:3])
         if next_state.shape != state.shape:
-            raise ValueError(
-                f"{self.in_keys[2]!r} must be {list(state.shape)} as {self.in_keys[0]!r}, got {list(next_state.shape)}."
-            )
+            wanted = f"{list(state.shape)} as {self.in_keys[0]!r}"
+            raise ValueError(f"{self.in_keys[2]!r} must be {wanted}, got {list(next_state.shape)}.")
         check_shapes(self.model.scene, state, action)
         return state, action, next_state
 
-    def _read_parameters(self, tensordict: TensorDictBase, *, windows: bool = False) -> TensorDictBase | None:
+    def _read_parameters(self, tensordict: TensorDictBase, starts: list[Starts] | None = None) -> TensorDictBase | None:
         parameters = self.model.parameters_in(tensordict)
-        if parameters is not None and windows:
+        if parameters is not None and starts is not None:  # of windows
+            require_constant(parameters, starts, f"{self.model.parameters_key!r} of the batch:")
             parameters = parameters[:, 0]
         # Inferred parameters come from a network in training: if it diverges, the loss shows it.
         if parameters is not None and self.trained.parameter_source != "inferred":

@@ -110,7 +110,11 @@ class IdentificationLoss(LossModule):
         )
         batch = len(state), window
         parameters = parameters.repeat_interleave(self.num_queries, 0).unsqueeze(1).expand(*batch)
-        entries = {"state": state, "action": action, "next": {"state": next_state}, "parameters": parameters}
+        after = {"state": next_state}
+        if (done := tensordict.get(("next", "done"), None)) is not None:
+            done = done.reshape(*tensordict.shape)[:, self.context_length :]
+            after["done"] = done.unflatten(1, (self.num_queries, window)).flatten(0, 1)
+        entries = {"state": state, "action": action, "next": after, "parameters": parameters}
         return self.prediction(TensorDict(entries, batch_size=batch))
 
     def training_state(self) -> dict:

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import TDLambdaEstimator
 
 from torchrl_gn.envs import ModelEnv
+from torchrl_gn.envs.episode_ends import alive_of
 from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.objectives.checks import read_entries
@@ -33,7 +34,7 @@ class SHACLoss(LossModule):
     and with V instead of Q. The value regresses on TD(:math:`\lambda`) targets of the same imagined steps. The weight
     :math:`\alpha` is learned, so that the entropy of actions, in units of half their range, stays at
     ``target_entropy`` (as in SAC). Where the model diverges the episode ends, at what it costs a
-    learner (:class:`~torchrl_gn.envs.SceneEnv`).
+    learner (:class:`~torchrl_gn.envs.SceneEnv`). Steps after the end of an episode do not count.
 
     Reads ``state`` ``[B, N, 13]``. Writes ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to
     weights of its own; and ``reward``, the mean of imagined steps, and ``entropy``.
@@ -89,12 +90,14 @@ class SHACLoss(LossModule):
         (state,) = read_entries(self, tensordict, ["state"])
         if not (self.policy.fitted and self.value.fitted):
             raise RuntimeError("Normalisers of policy or value have seen no data: call fit_normalizers first.")
-        imagined, entropy = self._imagine(state)
+        imagined, entropies = self._imagine(state)
         final = imagined["next", "state"][:, -1]
         with frozen(self.value):
             last = self.value(final)
         reward, ended = imagined["next", "reward"], imagined["next", "terminated"]
-        alive = 1 - torch.cat((torch.zeros_like(ended[:, :1]), ended), 1).to(reward.dtype).cummax(1).values
+        alive = alive_of(ended).to(reward.dtype)
+        counted = alive[:, :-1] / alive[:, :-1].mean()
+        entropy = (counted.squeeze(-1) * entropies).mean()
         discount = self.value.discount ** torch.arange(self.steps + 1, dtype=reward.dtype, device=reward.device)
         weight = alive * discount.unsqueeze(-1)
         total = (weight[:, :-1] * reward).sum(1) + weight[:, -1] * last.to(reward.dtype)
@@ -104,7 +107,7 @@ class SHACLoss(LossModule):
                 "loss_actor": -(total / scale).mean() - alpha.detach() * entropy,
                 "loss_value": self._value_loss(imagined, alive[:, :-1]),
                 "loss_alpha": alpha * (entropy.detach() - self.target_entropy),
-                "reward": reward.detach().mean(),
+                "reward": (counted * reward.detach()).mean(),
                 "entropy": entropy.detach(),
             }
         )
@@ -117,7 +120,7 @@ class SHACLoss(LossModule):
             self.value.normalizer.update(reward / max(1 - self.value.discount, 1e-3))
 
     def _imagine(self, state: Tensor) -> tuple[TensorDict, Tensor]:
-        """Steps ``[B, H]`` of the policy in the model, and the mean entropy of its actions."""
+        """Steps ``[B, H]`` of the policy in the model, and estimates ``[B, H]`` of the entropy of its actions."""
         now = self.env.reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
         steps, entropies = [], []
         with frozen(self.env.world_model), self.policy.prepared(), set_exploration_type(ExplorationType.RANDOM):
@@ -130,7 +133,7 @@ class SHACLoss(LossModule):
                 now = self.env.step(now.set("action", action))
                 steps.append(now.select("state", ("next", "state"), ("next", "reward"), ("next", "terminated")))
                 now = step_mdp(now, exclude_done=True)
-        return cast(TensorDict, torch.stack(steps, 1)), torch.stack(entropies).mean()
+        return cast(TensorDict, torch.stack(steps, 1)), torch.stack(entropies, 1)
 
     def _value_loss(self, imagined: TensorDict, alive: Tensor) -> Tensor:
         """Squared error of the value on its targets, in variances of its normaliser."""

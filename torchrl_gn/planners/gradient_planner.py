@@ -168,9 +168,8 @@ class GradientPlanner(RecedingHorizonPlanner):
         if self.imagined.carried_keys:
             executed = entries.copy().set("action", self.env.action_spec.project(actions[:, 0, 0]))
             with torch.no_grad():
-                after = self.imagined.carried(executed)
-            for key, value in after.items():
-                written["next", key] = value.reshape(*batch, *value.shape[1:]).to(states_at)
+                for key, value in self.imagined.carried(executed).items():
+                    written["next", key] = value.reshape(*batch, *value.shape[1:]).to(states_at)
         return plan[..., 0, 0, :].to(states_at), written
 
     def _scaled(self, actions: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.envs.specs import require_shape
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]  # state [*B, N, 13], action [*B, A], next state [*B, N, 13]
 
@@ -182,9 +183,7 @@ class RewardExpansion:
         batch = action.shape[:-1]
         task = None if self.task is None else self.task.expand(*batch, *self.task.shape)
         value = self.reward(state, action, next_state, task)
-        if value.shape != (*batch, 1):
-            raise ValueError(f"the reward must be {[*batch, 1]}, {self.reward} returned {list(value.shape)}")
-        return value[..., 0]
+        return require_shape(value, (*batch, 1), "the reward", self.reward)[..., 0]
 
     def _tensors(self, inputs: Inputs) -> tuple[Tensor, ...]:
         return tuple(torch.from_numpy(np.array(x, dtype=np.float64, order="C")).to(self.device) for x in inputs)

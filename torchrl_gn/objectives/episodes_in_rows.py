@@ -1,0 +1,62 @@
+"""Episodes that end inside rows of collected steps: where predictions start again."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.networks import Graph
+
+
+class Starts(NamedTuple):
+    """How the step at one time of a row begins, of every sample or, as ``[B]`` bool, of some."""
+
+    true: bool | Tensor  # from the true state, in place of the predicted one
+    fresh: Tensor | None  # as the first of an episode; None if no sample does
+
+
+def starts_of(done: Tensor | None, steps: int, teacher_forced_steps: int) -> list[Starts]:
+    """How each of a row's ``steps`` begins, given ``done`` ``[B, steps]`` or ``[B, steps, 1]``, if it is known.
+
+    An episode's first ``teacher_forced_steps`` begin from true states. Waits for the device once.
+    """
+    whole = [Starts(step < teacher_forced_steps, None) for step in range(steps)]
+    if done is None or steps == 1:
+        return whole
+    ends = done.reshape(len(done), steps)[:, :-1].bool()
+    fresh = torch.cat((ends.new_ones(len(done), 1), ends), dim=1)
+    any_fresh = fresh.any(0).tolist()
+    if not any(any_fresh[1:]):
+        return whole
+    step = torch.arange(steps, device=fresh.device)
+    age = step - torch.where(fresh, step, 0).cummax(1).values
+    forced = age < teacher_forced_steps
+    return [Starts(forced[:, t], fresh[:, t] if any_fresh[t] else None) for t in range(steps)]
+
+
+def choose(true: bool | Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Samples of ``one`` ``[B, ...]`` where ``true`` ``[B]``, else of ``other``."""
+    if isinstance(true, bool):
+        return one if true else other
+    return torch.where(true.reshape(-1, *[1] * (one.ndim - 1)), one, other)
+
+
+def forget(hidden: Graph | None, fresh: Tensor | None) -> Graph | None:
+    """A recurrent model's hidden state, the initial one, zeros, where an episode is ``fresh`` ``[B]``."""
+    if hidden is None or fresh is None:
+        return hidden
+    return Graph(*(choose(fresh, torch.zeros_like(part), part) for part in hidden.features), hidden.edge_index)
+
+
+def require_constant(parameters: TensorDictBase, starts: list[Starts], what: str) -> None:
+    """Raise ValueError if physical parameters ``[B, steps]`` change where an episode of a row begins."""
+    if all(start.fresh is None for start in starts):
+        return
+    for name, value in parameters.items(True, True):
+        if not bool((value == value[:, :1]).all()):
+            raise ValueError(
+                f"{what} {name!r} change where an episode of a row ends: give windows [B, H] of one episode each"
+            )
