@@ -343,7 +343,7 @@ def test_bad_options_are_named():
         SVGLoss(*networks, bodies, reward, steps=1)
     flat = SVGLoss(*networks, loss.model, lambda x, u, _: reward(x, u, _).squeeze(-1), steps=1)
     flat.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
-    with pytest.raises(ValueError, match=r"The reward must be \[7, 1\], got \[7\]"):
+    with pytest.raises(ValueError, match=r"the reward must be \[7, 1\], .* returned \[7\]"):
         flat(make_batch(7))
 
 
@@ -377,3 +377,20 @@ def test_it_plans_with_the_model_of_a_scene(scenes, windows, special, folds):
     weights = list(policy.parameters())
     found, true = (torch.autograd.grad(each, weights) for each in (out["loss_actor"], expected))
     torch.testing.assert_close(found, true, rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_nothing_counts_after_an_imagined_end(steps):
+    batch, bound = make_batch(64), 0.8
+    loss = make_loss(steps, done=lambda x: x.squeeze(-1).abs() > bound)
+    x, value, discount = batch["observation"], torch.zeros(64, 1, dtype=torch.float64), 1.0
+    alive = torch.ones(64, 1, dtype=torch.float64)
+    for _ in range(steps):
+        value = value + discount * alive * reward(x, K * x, x)
+        x, discount = (A + B * K) * x, GAMMA * discount
+        alive = alive * (x.abs() <= bound)
+    value = value + discount * alive * quadratic(torch.tensor([-2.0, -0.5, -0.8]), x, K * x)
+    assert 0 < alive.sum() < 64
+    torch.testing.assert_close(loss(batch)["loss_actor"], -value.mean(), rtol=1e-6, atol=0)
+    with pytest.raises(ValueError, match=r"done= must give 'terminated', bool \[64\] or \[64, 1\], got"):
+        make_loss(1, done=lambda x: x)(batch)

@@ -180,8 +180,13 @@ def ended_by(env: Any, next_state: Tensor, entries: TensorDictBase | None = None
         ended = env.ends(entries).get("terminated", None)
     else:
         ended = env.ends(next_state)
-    batch, shape = next_state.shape[:-2], (*next_state.shape[:-2], 1)
-    if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape not in (shape, batch):
+    return checked_end(ended, next_state.shape[:-2])
+
+
+def checked_end(ended: Any, batch: tuple[int, ...]) -> Tensor:
+    """What a ``done`` function gave, as bool ``[*B, 1]``; ValueError unless it is bool ``[*B]`` or ``[*B, 1]``."""
+    shape = (*batch, 1)
+    if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape not in (shape, tuple(batch)):
         given = f"{ended.dtype} {list(ended.shape)}" if isinstance(ended, Tensor) else repr(ended)
         raise ValueError(f"done= must give 'terminated', bool {list(batch)} or {list(shape)}, got {given}")
     return ended.reshape(shape)

@@ -48,7 +48,9 @@ def forget(hidden: Graph | None, fresh: Tensor | None) -> Graph | None:
     """A recurrent model's hidden state, the initial one, zeros, where an episode is ``fresh`` ``[B]``."""
     if hidden is None or fresh is None:
         return hidden
-    return Graph(*(choose(fresh, torch.zeros_like(part), part) for part in hidden.features), hidden.edge_index)
+    return Graph(
+        *(choose(fresh, torch.zeros_like(part), part) for part in hidden.features), edge_index=hidden.edge_index
+    )
 
 
 def require_constant(parameters: TensorDictBase, starts: list[Starts], what: str) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss
 
+from torchrl_gn.envs.specs import checked_end, require_shape
 from torchrl_gn.networks.frozen_weights import frozen, with_weights
 from torchrl_gn.objectives.checks import require_fitted
 from torchrl_gn.objectives.observation_model_loss import UPDATE_NORMALIZERS
@@ -29,9 +30,10 @@ class SVGLoss(DDPGLoss):
         \mathbb{E}\Big[\sum_{k=0}^{N-1} \gamma^k r(x_{t+k}, a_{t+k}, x_{t+k+1}) + \gamma^N Q(x_{t+N}, a_{t+N})\Big],
         \quad a_{t+k} \sim \pi(\cdot | x_{t+k}), \quad x_{t+k+1} = g(x_{t+k}, a_{t+k})
 
-    with reparameterised actions. ``steps=0`` is the model-free SVG(0), and DDPG with a deterministic policy. Imagined
-    steps do not end an episode. (Paper: :math:`a_t` as the last action is a misprint.) The value's loss is DDPG's with
-    actions drawn from the target policy. Input, output and ``make_value_estimator`` (gamma) are DDPG's.
+    with reparameterised actions. ``steps=0`` is the model-free SVG(0), and DDPG with a deterministic policy. Rewards
+    and value after an imagined end, ``done``, do not count. (Paper: :math:`a_t` as the last action is a misprint.) The
+    value's loss is DDPG's with actions drawn from the target policy. Input, output and ``make_value_estimator``
+    (gamma) are DDPG's.
 
     Differentiated: the policy's weights in ``loss_actor``, through model, reward and value; the value's in
     ``loss_value``. Model and reward are no submodules: no gradient, and ``parameters()`` and ``to()`` leave them out.
@@ -41,12 +43,15 @@ class SVGLoss(DDPGLoss):
         model: TensorDict module from observation and action to ``("next", observation)``, for example an
             :class:`~torchrl_gn.policies.ObservationModel`. Other inputs of policy and value (a goal) stay constant.
         steps: ``N``, steps through the model.
+        done: function of an imagined next observation ``[*B, O]`` that says where episodes end, bool ``[*B]`` or
+            ``[*B, 1]``. Default: nowhere.
         **options: of :class:`~torchrl.objectives.DDPGLoss`.
     """
 
     deterministic_sampling_mode: Any = ExplorationType.RANDOM  # actions are drawn
     model: TensorDictModuleBase | None
     reward: ObservedReward | None
+    ends: Callable[[Tensor], Tensor] | None
 
     def __init__(
         self,
@@ -56,6 +61,7 @@ class SVGLoss(DDPGLoss):
         reward: ObservedReward | None = None,
         *,
         steps: int = 1,
+        done: Callable[[Tensor], Tensor] | None = None,
         **options: Any,
     ) -> None:
         if steps < 0:
@@ -76,6 +82,7 @@ class SVGLoss(DDPGLoss):
         # Not registered, so that their weights stay out of parameters().
         object.__setattr__(self, "model", model)
         object.__setattr__(self, "reward", reward)
+        object.__setattr__(self, "ends", done)
 
     def _share_statistics(self) -> None:
         """Let target networks read the buffers of their originals: TorchRL's updaters copy weights only."""
@@ -108,18 +115,18 @@ class SVGLoss(DDPGLoss):
         weights = self._maybe_get_priority_weight(tensordict)
         keys = [*self.actor_in_keys, *self.value_exclusive_keys]
         now = tensordict.select(*keys, *self._carried, strict=False).detach()
-        value, discount = cast("Tensor | float", 0.0), 1.0
+        value, weight = cast("Tensor | float", 0.0), cast("Tensor | float", 1.0)  # gamma^k, 0 after the end
         gamma = cast(Tensor, self.value_estimator.gamma) if self.steps else 1.0
         with set_exploration_type(self.deterministic_sampling_mode):
             for _ in range(self.steps):
-                now, reward = self._imagine(self._act(now))
-                value = value + discount * reward
-                discount = discount * gamma
+                now, reward, alive = self._imagine(self._act(now))
+                value = value + weight * reward
+                weight = weight * gamma * alive
             now = self._act(now)
         # One after the other: layers shared by policy and value must have the value's weights here.
         with with_weights(self.value_network, self._cached_detached_value_params):
             now = self.value_network(now)
-        value = value + discount * now.get(self.tensor_keys.state_action_value)
+        value = value + weight * now.get(self.tensor_keys.state_action_value)
         loss = self._reduce_loss(-value.squeeze(-1), tensordict=tensordict, weights=weights)
         weak = [f"{target}{name}_network_params" for target in ("", "target_") for name in ("actor", "value")]
         self._clear_weakrefs(tensordict, loss, *weak)
@@ -139,8 +146,8 @@ class SVGLoss(DDPGLoss):
         keys = self.model.in_keys if self.steps and self.model is not None else []
         return [key for key in keys if key not in self.actor_network.out_keys]
 
-    def _imagine(self, now: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """The next step's entries, and the step's reward ``[*B, 1]``."""
+    def _imagine(self, now: TensorDictBase) -> tuple[TensorDictBase, Tensor, Tensor | float]:
+        """The next step's entries, the step's reward ``[*B, 1]``, and where the episode goes on, 1, or has ended, 0."""
         assert self.model is not None and self.reward is not None
         observation, action = (cast(Tensor, now.get(key)) for key in self.model.in_keys[:2])
         with ExitStack() as stack:
@@ -148,9 +155,10 @@ class SVGLoss(DDPGLoss):
                 if isinstance(module, nn.Module):
                     stack.enter_context(frozen(module))
             predicted = cast(TensorDictBase, self.model(now.copy()).get("next"))
-            reward = self.reward(observation, action, cast(Tensor, predicted.get(self.model.in_keys[0])))
-        if reward.shape != (*now.batch_size, 1):
-            raise ValueError(f"The reward must be {[*now.batch_size, 1]}, got {list(reward.shape)}.")
+            after = cast(Tensor, predicted.get(self.model.in_keys[0]))
+            reward = self.reward(observation, action, after)
+        require_shape(reward, (*now.batch_size, 1), "the reward", self.reward)
+        alive = 1.0 if self.ends is None else (~checked_end(self.ends(after), now.batch_size)).to(reward.dtype)
         # Inputs that are not predicted, a goal for example, stay constant.
         kept = now.select(*self.actor_in_keys, *self.value_exclusive_keys, *self._carried, strict=False)
-        return kept.update(predicted), reward
+        return kept.update(predicted), reward, alive

@@ -232,8 +232,10 @@ class ILQGPlanner(RecedingHorizonPlanner):
         tensors = [torch.from_numpy(each).to(env.device) for each in (bodies, actions, stable)]
         entries = TensorDict({} if task is None else {"task": task.expand(len(actions), *task.shape)}, [len(actions)])
         with torch.no_grad():
-            *steps, alive = counted_steps(env, entries, *tensors)
-        return tuple(each.cpu().numpy() for each in (*steps[:3], steps[3].squeeze(-1), alive[:, :-1].squeeze(-1)))
+            steps = counted_steps(env, entries, *tensors)
+        masks = steps.stable.squeeze(-1), steps.alive[:, :-1].squeeze(-1)
+        found = [each.cpu().numpy() for each in (steps.before, steps.action, steps.after, *masks)]
+        return cast(CountedSteps, tuple(found))
 
     @property
     def _env(self) -> SceneEnv | ModelEnv:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
@@ -49,7 +50,7 @@ class SimulatedPlant:
 
     def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
         simulated = self.simulator.rollout(np.tile(start, (len(actions), 1)), actions)
-        paths, bodies, whole = (simulated[key].numpy() for key in ("physics", "state", "stable"))
+        paths, bodies, whole = (cast(Tensor, simulated[key]).numpy() for key in ("physics", "state", "stable"))
         stable = np.repeat(whole[:, None], actions.shape[1], axis=1)
         if not whole.all():  # step by step, to see where
             some = actions[~whole]
