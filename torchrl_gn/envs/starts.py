@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from functools import partial
 from typing import cast
 
 import numpy as np
@@ -86,9 +85,12 @@ class StartSampler:
         return states
 
 
-def _reset_each(env: EnvBase, size: torch.Size, _: TensorDictBase | None, reset: TensorDictBase) -> TensorDictBase:
-    """Reset every sample of a batch to its own start state: ``BatchSizeTransform`` alone repeats one."""
-    return reset if reset.shape == size else env.reset(TensorDict(batch_size=size))
+class _Batch(BatchSizeTransform):
+    """Reset every sample of a batch to its own start state: TorchRL's transform repeats one."""
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
+        tensordict = super()._reset_env_preprocess(tensordict)  # pyright: ignore[reportArgumentType]
+        return TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
 
 
 def for_learning(env: EnvBase) -> EnvBase:
@@ -114,5 +116,4 @@ def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
     size = torch.Size(batch_size)
     if not size or min(size) < 1:
         raise ValueError(f"batch_size must be numbers of at least 1, got {list(size)}")
-    env = for_learning(env)
-    return TransformedEnv(env, BatchSizeTransform(batch_size=size, reset_func=partial(_reset_each, env, size)))
+    return TransformedEnv(for_learning(env), _Batch(batch_size=size))

@@ -16,7 +16,10 @@ from torchrl_gn.envs.starts import batched
 class _Dreams(WorldModelEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         refuse_frame_skip(self)
-        return super()._step(tensordict)
+        stepped = super()._step(tensordict)
+        for key in self.reward_keys:  # a head has the dtype of its network
+            stepped.set(key, stepped.get(key).to(self.full_reward_spec[key].dtype))
+        return stepped
 
 
 def world_model_env(
@@ -39,5 +42,8 @@ def world_model_env(
         observation_spec = Composite({latent_key: many.observation_spec[latent_key]}, shape=many.batch_size)
     shared = {"latent_key": latent_key, "observation_spec": observation_spec}
     dreams = _Dreams(world_model, env, batch_size=many.batch_size, **shared)
+    dreams._batch_locked = True  # it steps this batch alone, also where some episodes have ended
+    # What transforms hand on when they reset.
+    dreams.state_spec = Composite({latent_key: dreams.observation_spec[latent_key].clone()}, shape=many.batch_size)
     dreams.action_spec, dreams.reward_spec = many.action_spec.clone(), many.reward_spec.clone()
     return dreams
