@@ -93,6 +93,12 @@ class _Batch(BatchSizeTransform):
         return TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
 
 
+class _Pool(TransformedEnv):
+    @property
+    def batch_locked(self) -> bool:
+        return True  # it steps this batch alone, also where some episodes have ended
+
+
 def for_learning(env: EnvBase) -> EnvBase:
     """The environment with the unstable reward that learners bear, a copy as the given one may plan."""
     if not vars(env).get("spares_learners", False):
@@ -116,4 +122,4 @@ def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
     size = torch.Size(batch_size)
     if not size or min(size) < 1:
         raise ValueError(f"batch_size must be numbers of at least 1, got {list(size)}")
-    return TransformedEnv(for_learning(env), _Batch(batch_size=size))
+    return _Pool(for_learning(env), _Batch(batch_size=size))
