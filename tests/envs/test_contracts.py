@@ -318,6 +318,22 @@ def test_transforms_write_what_they_say(name, kind):
         check_steps(kind, data, 2 * data["action"] - 1 if name == "ActionScaling" else None)
 
 
+@pytest.mark.parametrize("kind", ENVS)
+@pytest.mark.parametrize("change", [{"loc": 1.0, "scale": 2.0}, {"loc": 0.1, "scale": 1.0}, {"loc": 0.0, "scale": 0.9}])
+def test_a_transform_over_the_state_is_harmless_or_refused(kind, change):
+    """The model steps from ``state``, the simulation from ``physics``."""
+    env = TransformedEnv(make(kind, 3), ObservationNorm(in_keys=["state"], **change), auto_unwrap=True)
+    if kind.endswith("model"):
+        with pytest.raises(ValueError, match=r"a quaternion of 'state' .* must write them to another key, out_keys="):
+            run(env)
+        return
+    data = run(env)
+    expected = by_hand(kind, data.clone().set("state", Simulator(scene()).observe(data["physics"])), data["action"])
+    torch.testing.assert_close(data["next", "physics"], expected["physics"], rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(data["next", "state"], expected["state"] * change["scale"] + change["loc"])
+    torch.testing.assert_close(data["next", "reward"], expected["reward"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["scene", "model"])
 def test_transforms_around_worker_processes_write_what_they_say(kind):

@@ -33,8 +33,10 @@ from torchrl_gn.envs.specs import (
 )
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
-from torchrl_gn.finite import require_finite
+from torchrl_gn.finite import is_traced, require_finite
 from torchrl_gn.scenes.scene import Scene
+
+_UNIT = 1e-2  # what the squared length of a quaternion may be off 1
 
 
 class ModelEnv(ModelBasedEnvBase):
@@ -167,12 +169,26 @@ class ModelEnv(ModelBasedEnvBase):
         refuse_frame_skip(self)
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
+        self._require_own(state)
         predicted = self.world_model(self._inputs(tensordict))["next"]
         stable = predicted["state"].isfinite().flatten(-2).all(-1, keepdim=True)
         entries: dict[str, Any] = outcome(self, tensordict, state, action, predicted["state"], stable)
         entries |= step_entries(self, tensordict, state, entries)
         entries |= self.carried(tensordict, predicted)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
+
+    def _require_own(self, state: Tensor) -> None:
+        """Raise ValueError if quaternions say that a transform has written over the state that a step starts from."""
+        bodies = isinstance(self.world_model, Predictor) and isinstance(self.scene, Scene)
+        if not bodies or state.device.type != "cpu" or is_traced():
+            return
+        off = (state.detach()[..., 3:7].square().sum(-1) - 1).abs()
+        if bool((off > _UNIT).any()):
+            raise ValueError(
+                f"{self}: a quaternion of 'state' has squared length {float(1 + off.max()):.3g} or as far below 1. A"
+                " transform that changes observations (ObservationNorm, VecNorm) must write them to another key,"
+                " out_keys=[...]: the next step starts from 'state'."
+            )
 
     @property
     def carried_keys(self) -> list[str]:
