@@ -16,6 +16,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.envs.specs import reward_of
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import PhysicalParameters, load_scene
@@ -184,3 +185,21 @@ def test_a_given_start_must_be_given(scene_env, model_env):
     for env, entry in ((scene_env, "physics"), (model_env, "state")):
         with pytest.raises(KeyError, match=f"needs an entry '{entry}'"):
             env.reset(TensorDict(batch_size=[2]), set_state=True)
+
+
+def test_a_recurrent_model_forgets_where_an_episode_begins(swimmer):
+    torch.manual_seed(0)
+    model = ForwardModel.for_scene(swimmer, core="recurrent", hidden_state=[4, 4, 4], **SMALL).bind(swimmer)
+    ends = TensorDictModule(lambda action: action[..., :1] > 0.5, in_keys=["action"], out_keys=["terminated"])
+    env = ModelEnv(model, done=ends, seed=0)
+    played = batched(env, 4).rollout(8, break_when_any_done=False)
+    ended = played["next", "done"][:, :-1, 0]
+    assert ended.any() and not ended.all()
+    for before, after in zip(played["next", "hidden_state"].values(), played["hidden_state"].values(), strict=True):
+        if after[0].numel():
+            assert (after[:, 1:][ended] == 0).all()
+            assert torch.equal(after[:, 1:][~ended], before[:, :-1][~ended]) and (before != 0).any()
+    last = played[:, -1]["next"].select("state", "hidden_state")
+    assert (env.reset(last.clone(), set_state=False)["hidden_state"]["nodes"] == 0).all()
+    kept = env.reset(last.clone(), set_state=True)["hidden_state"]["nodes"]
+    assert torch.equal(kept, last["hidden_state", "nodes"])
