@@ -163,3 +163,29 @@ def test_refuses_what_does_not_fit(model, scenes, starts):
         loss(TensorDict({"observation": starts}, [32]))
     with pytest.raises(ValueError, match="'state' of the batch"):
         loss(TensorDict({"state": starts * math.nan}, [32]))
+
+
+def test_nothing_counts_after_an_end(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts, steps=4)
+    loss.env.ends = lambda state: state[..., 1, 11].abs() > 0.5
+    torch.manual_seed(1)
+    out = loss(TensorDict({"state": starts}, [32]))
+    torch.manual_seed(1)
+    played, entropies = (each.detach() for each in loss._imagine(starts))
+    count, total, entropy, returns = 0, 0.0, 0.0, []
+    with torch.no_grad():
+        for row, estimates in zip(played.unbind(0), entropies, strict=True):
+            counted, alive = 0.0, True
+            for k, step in enumerate(row.unbind(0)):
+                if alive:
+                    reward = step["next", "reward"].item()
+                    count, total, entropy = count + 1, total + reward, entropy + float(estimates[k])
+                    counted, alive = counted + 0.9**k * reward, not step["next", "terminated"].item()
+            last = float(loss.value(row["next", "state"][-1])) if alive else 0.0
+            returns.append(counted + 0.9**4 * last)
+        assert 32 < count < 4 * 32
+        assert out["reward"].item() == pytest.approx(total / count, rel=1e-4)
+        assert out["entropy"].item() == pytest.approx(entropy / count, rel=1e-4)
+        mean = sum(returns) / len(returns) / loss.value.normalizer.std.item()
+        wanted = -mean - loss.log_alpha.exp().item() * entropy / count
+    assert out["loss_actor"].item() == pytest.approx(wanted, rel=1e-4)
