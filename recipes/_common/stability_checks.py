@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -217,16 +217,11 @@ def unstable_model(s: Setting) -> float:
     model = s.bind(weights, s.scene)
     rollout = model.rollout
 
-    def counted(
-        state: Tensor,
-        actions: Tensor,
-        parameters: TensorDictBase | None = None,
-        hidden_state: TensorDictBase | None = None,
-    ) -> tuple[Tensor, TensorDict | None]:
+    def counted(state: Tensor, actions: Tensor, *inputs: TensorDictBase | None) -> tuple[Tensor, TensorDict | None]:
         predicted.append(actions.shape[:-1].numel())
-        return rollout(state, actions, parameters, hidden_state)
+        return rollout(state, actions, *inputs)
 
-    model.rollout = counted
+    model.rollout = cast(Any, counted)
     guarded = guarded_rollout(model, s.state, s.action.unsqueeze(1).expand(-1, 1000, -1))
     return sum(predicted) / (1000 * len(s.state)) if bool(guarded.diverged.all()) else torch.inf
 

@@ -15,7 +15,6 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
-from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.envs.specs import reward_of
 from torchrl_gn.rewards import make_reward

@@ -156,14 +156,17 @@ class Predictor(TensorDictModuleBase):
         actions: Tensor,
         parameters: TensorDictBase | None = None,
         hidden_state: TensorDictBase | None = None,
+        *,
+        prepared: PreparedStep | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
         """States ``[*B, T + 1, N, 13]`` from a start state under actions ``[*B, T, A]``, and the last hidden state.
 
         ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``; the first state is the start. See :meth:`step`.
+        ``prepared`` is what :meth:`prepared` made of these parameters, for many rollouts with the same weights.
         """
         for action in actions[..., :1, :].unbind(-2):
             check_shapes(self.scene, state, action, parameters)
-        step = self.prepared(parameters, size=actions.shape[:-1].numel())
+        step = self.prepared(parameters, size=actions.shape[:-1].numel()) if prepared is None else prepared
         states, hidden = step.rollout(state, actions, self._graph(hidden_state))
         return states, None if hidden is None else hidden.tensordict()
 

@@ -119,11 +119,15 @@ class SpecializedPredictor(Predictor):
         actions: Tensor,
         parameters: TensorDictBase | None = None,
         hidden_state: TensorDictBase | None = None,
+        *,
+        prepared: PreparedStep | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
         states = None
         if parameters is None and hidden_state is None:
             states = self._native(state, actions, True)
-        return super().rollout(state, actions, parameters, hidden_state) if states is None else (states, None)
+        if states is not None:
+            return states, None
+        return super().rollout(state, actions, parameters, hidden_state, prepared=prepared)
 
     def _native(self, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
         """Result of the operator, without the program around it, which takes longer than a step of one state."""

@@ -19,6 +19,7 @@ from torchrl_gn.drawing import draw_states
 from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
 from torchrl_gn.dynamics.predictor import require_bound
+from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.episode_ends import Imagined, imagined_steps
 from torchrl_gn.envs.frame_skip import refuse_frame_skip
 from torchrl_gn.envs.specs import (
@@ -222,7 +223,16 @@ class ModelEnv(ModelBasedEnvBase):
         """
         return self.imagine_steps(tensordict, actions)[:2]
 
-    def imagine_steps(self, tensordict: TensorDictBase, actions: Tensor) -> Imagined:
+    def prepared(self, tensordict: TensorDictBase, horizon: int) -> PreparedStep | None:
+        """The model's step for many calls of :meth:`imagine_steps` with the same weights and physical parameters."""
+        model = self.predictor
+        if not isinstance(model, Predictor):
+            return None
+        return model.prepared(model.parameters_in(tensordict), size=tensordict.numel() * horizon)
+
+    def imagine_steps(
+        self, tensordict: TensorDictBase, actions: Tensor, prepared: PreparedStep | None = None
+    ) -> Imagined:
         """What :meth:`imagine` returns, and which of the steps count."""
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
         if actions.shape != shape or shape[-2] < 1:
@@ -232,8 +242,9 @@ class ModelEnv(ModelBasedEnvBase):
             )
         state = read(tensordict, "state", self._state_shape, self)
         model = self.predictor
-        inputs = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
-        states, _ = model.rollout(state, self._with_past(tensordict, actions), *inputs)  # pyright: ignore[reportArgumentType]
+        inputs: Any = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
+        folded: Any = {} if prepared is None else {"prepared": prepared}
+        states, _ = model.rollout(state, self._with_past(tensordict, actions), *inputs, **folded)
         return imagined_steps(self, tensordict, states, actions)
 
     def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
 from torchrl_gn.data.controls import numpy_generator, spline_controls
+from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.plan import (
@@ -191,9 +192,12 @@ class GradientPlanner(RecedingHorizonPlanner):
         usable = read.apply(lambda entry: entry.clone() if entry.is_inference() else entry)
         return cast(TensorDictBase, usable).to(self.imagined.device)
 
-    def predicted_returns(self, starts: TensorDictBase, plan: Tensor) -> Tensor:
-        """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` until the end; minus infinity if diverged before."""
-        imagined = self.imagined.imagine_steps(starts, self._actions(plan).flatten(0, 1))
+    def predicted_returns(self, starts: TensorDictBase, plan: Tensor, prepared: PreparedStep | None = None) -> Tensor:
+        """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` until the end; minus infinity if diverged before.
+
+        ``prepared``: see :meth:`ModelEnv.prepared`.
+        """
+        imagined = self.imagined.imagine_steps(starts, self._actions(plan).flatten(0, 1), prepared)
         total = torch.where(imagined.diverged, -torch.inf, imagined.rewards.sum((-2, -1))).reshape(plan.shape[:2])
         if self.action_cost:
             efforts = torch.where(imagined.alive[:, :-1, 0].reshape(plan.shape[:3]), plan.square().mean(-1), 0.0)
@@ -212,7 +216,8 @@ class GradientPlanner(RecedingHorizonPlanner):
         drawn = drawn[:, : self.samples // size * size]
         starts = repeated(entries, size)
         with torch.no_grad():
-            total = torch.cat([self.predicted_returns(starts, part) for part in drawn.split(size, dim=1)], dim=1)
+            prepared, parts = self.imagined.prepared(starts, self.horizon), drawn.split(size, dim=1)
+            total = torch.cat([self.predicted_returns(starts, part, prepared) for part in parts], dim=1)
         total = total.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
         best = total.argsort(dim=1, descending=True, stable=True)[:, : self.candidates]
         return drawn.gather(1, best[..., None, None].expand(-1, -1, *drawn.shape[2:]))
@@ -257,8 +262,8 @@ class GradientPlanner(RecedingHorizonPlanner):
 
         Returns the best sequences seen, best candidate first, and ``[B, 1]`` whether any beats all given ones.
         """
-        # The same tensors in every iteration: the model folds their parameters once.
         starts = repeated(entries, self.candidates)
+        prepared = self.imagined.prepared(starts, self.horizon)  # the model folds its weights once
         best, best_return = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
         initial_return, descent = best_return, -torch.ones_like(best_return)
         # The optimiser sees offsets in units of the step size.
@@ -268,7 +273,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         for iteration in range(self.iterations if resumed else self.warm_up):
             actions = torch.addcmul(plan, scale, offset).requires_grad_()
             with torch.enable_grad():
-                total = self.predicted_returns(starts, actions)
+                total = self.predicted_returns(starts, actions, prepared)
             depends = total.requires_grad
             gradient = torch.autograd.grad(total, actions, descent, allow_unused=True)[0] if depends else None
             if gradient is None:
@@ -285,7 +290,7 @@ class GradientPlanner(RecedingHorizonPlanner):
             optimizer.step()
             offset.copy_((torch.addcmul(plan, scale, offset).clamp(-1, 1) - plan) / scale)
         actions = torch.addcmul(plan, scale, offset)
-        best, best_return = keep_better(best, best_return, actions, self.predicted_returns(starts, actions))
+        best, best_return = keep_better(best, best_return, actions, self.predicted_returns(starts, actions, prepared))
         failed = int((best_return == -torch.inf).all(1).sum())
         if failed:
             fallback = "their last plan is kept" if resumed else "there is no plan yet, and nothing is done"
