@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -81,7 +80,11 @@ class Core(nn.Module):
         return hidden
 
     def fold(self, incidence: Incidence, static: Graph) -> FoldedCore:
-        """The core for one topology and one normalised static graph, differentiable in the weights."""
+        """The core for one topology and one normalised static graph, differentiable in the weights.
+
+        It must compute what :meth:`forward` computes, whatever a user has changed in the core since it was made: the
+        cores here fold only what is as they made it, and else return an :class:`UnfoldedCore`.
+        """
         return UnfoldedCore(self, static)
 
 
@@ -96,6 +99,7 @@ class UnfoldedCore:
 
     core: Core
     static: Graph  # normalised static graph
+    reason: str | None = None  # what its fold does not know; None if it has no fold, or is not to be folded
 
     def predict(self, dynamic: Graph) -> Tensor:
         out = self.core(graph_concat(dynamic, self.static))
@@ -105,7 +109,8 @@ class UnfoldedCore:
 
 
 def dtype_of(core: nn.Module) -> torch.dtype:
-    """Dtype of a network's weights."""
-    # Not of parameters() first: under TorchRL's losses weights may be plain tensors.
-    linear = (each.weight for each in core.modules() if isinstance(each, nn.Linear))
-    return next(itertools.chain(linear, core.parameters())).dtype
+    """Dtype of a network's weights; float32 if it has none, as quantised ones."""
+    for layer in (each for each in core.modules() if isinstance(each, nn.Linear)):
+        # A pruned weight has its parameter's dtype only after a call. Under TorchRL's losses there are no parameters.
+        return next((each.dtype for each in layer.parameters()), layer.weight.dtype)
+    return next((each.dtype for each in core.parameters()), torch.float32)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from torchrl_gn.networks.core import Core, layer_sizes
+from torchrl_gn.networks.core import Core, UnfoldedCore, layer_sizes
 from torchrl_gn.networks.fold_gn_core import fold_gn_core
+from torchrl_gn.networks.foldable import change_of_block, change_of_core
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.gn_block import GNBlock, Pool
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
@@ -29,7 +30,7 @@ class GNCore(Core):
         pool: as of :class:`GNBlock`.
 
     Raises:
-        ValueError: if an MLP has no hidden layer, or ``activation`` or ``pool`` is not known.
+        ValueError: if an MLP has no hidden layer, ``latent`` is below 1, or ``activation`` or ``pool`` is not known.
     """
 
     def __init__(
@@ -56,6 +57,8 @@ class GNCore(Core):
                 f"Every MLP of the core needs a hidden layer, got edges {edge}, nodes {node}, globals {last}."
             )
         latent = usual[-1] if latent is None else latent
+        if latent < 1:
+            raise ValueError(f"latent={latent} must be at least 1.")
         graph, between = dynamic + static, GraphSize(latent, latent, latent)
         sizes: dict[str, Any] = {"edge_hidden": edge, "node_hidden": node, "activation": activation}
         self.first = GNBlock(graph, between, global_hidden=last, pool=pool, **sizes)
@@ -64,5 +67,18 @@ class GNCore(Core):
     def forward(self, graph: Graph) -> Graph:
         return self.second(graph_concat(graph, self.first(graph)))
 
-    def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore:
+    def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore | UnfoldedCore:
+        """The same function with fewer operations; by message passing if anything in the core was changed."""
+        if (change := self._change()) is not None:
+            return UnfoldedCore(self, static, change)
         return fold_gn_core(self, self.dynamic, incidence, static)
+
+    def _change(self) -> str | None:
+        """What its fold does not know; None: nothing."""
+        if (change := change_of_core(self, GNCore)) is not None:
+            return change
+        if (change := change_of_block(self.first, ("edge_mlp", "node_mlp", "global_mlp"), self.activation)) is not None:
+            return f"first{change}"
+        if (change := change_of_block(self.second, ("edge_mlp", "node_mlp"), self.activation)) is not None:
+            return f"second{change}"
+        return None

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.modules import MLP
 
-from torchrl_gn.networks.core import Columns, Core, layer_sizes
+from torchrl_gn.networks.core import Columns, Core, UnfoldedCore, layer_sizes
+from torchrl_gn.networks.foldable import change_of_core, change_of_mlp
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.networks.layers import EDGES, NODES, Gather, LayerBuilder, LayerList
@@ -63,8 +64,12 @@ class MLPCore(Core):
         assert self.counts is not None
         return Graph(out.unflatten(-1, (self.counts[0], -1)), empty.unsqueeze(-2), empty, graph.edge_index)
 
-    def fold(self, incidence: Incidence, static: Graph) -> FoldedMLP:
-        """The same function for one scene with all constants in a table."""
+    def fold(self, incidence: Incidence, static: Graph) -> FoldedMLP | UnfoldedCore:
+        """The same function with all constants in a table; as it is if anything in the core was changed."""
+        if (change := change_of_core(self, MLPCore)) is not None:
+            return UnfoldedCore(self, static, change)
+        if (change := change_of_mlp(self.mlp, self.activation)) is not None:
+            return UnfoldedCore(self, static, f"mlp{change}")
         assert self.counts is not None
         first, *hidden, last = (layer for layer in self.mlp if isinstance(layer, nn.Linear))
         counts, sizes = (*self.counts, 1), (astuple(self.dynamic), astuple(self.graph_size))

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from torchrl_gn.networks.core import Core
+from torchrl_gn.networks.core import Core, UnfoldedCore
+from torchrl_gn.networks.foldable import change_of_core
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
@@ -45,7 +46,13 @@ class RecurrentCore(Core):
     def forward(self, graph: Graph) -> Graph:
         return self.core(graph)
 
-    def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore:
+    def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore | UnfoldedCore:
+        """As :meth:`GNCore.fold`; the GRUs are in :meth:`update` and stay as they are."""
+        change = change_of_core(self, RecurrentCore)
+        if change is None and not isinstance(self.core, Core):
+            change = f"core is {type(self.core).__name__}"
+        if change is not None:
+            return UnfoldedCore(self, static, change)
         return self.core.fold(incidence, static)
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics import Canonicalizer
-from torchrl_gn.networks.folded_gn_core import FoldedGNCore
+from torchrl_gn.networks.core import FoldedCore
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.graph import GraphSize
 from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
@@ -48,7 +48,7 @@ class GraphStatePolicy(BoundedPolicy):
     features: BodyFrameFeatures  # pyright: ignore[reportIncompatibleVariableOverride]
     slots: Tensor
     take: Tensor
-    _folded: FoldedGNCore | None = None
+    _folded: FoldedCore | None = None
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class GraphStatePolicy(BoundedPolicy):
         core = self._fold() if self._folded is None else self._folded
         return core.predict(self.features(state, self.log_std.dtype)).flatten(-2)[..., self.take]
 
-    def _fold(self) -> FoldedGNCore:
+    def _fold(self) -> FoldedCore:
         return self.network.fold(self.features.incidence, self.features.static_graph(self.log_std))
 
     @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Literal, TypeVar, cast
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
-from torchrl_gn.networks.core import UnfoldedCore
+from torchrl_gn.networks.core import UnfoldedCore, dtype_of
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
@@ -118,16 +118,9 @@ class ObservationNetwork(nn.Module):
             )
         return self.places.arrange(observation, action if self.actions else None)
 
-    @property
-    def _weight(self) -> Tensor:
-        # Not one of parameters(): under TorchRL's losses weights may be plain tensors.
-        mlp = self.core.mlp if isinstance(self.core, MLPCore) else self.core.first.edge_mlp
-        assert mlp is not None
-        return cast(nn.Linear, mlp[0]).weight
-
     def dynamic_graph(self, observation: Tensor, action: Tensor | None = None) -> Graph:
         """Normalised graph ``[*B, ...]`` of observations ``[*B, O]`` and actions ``[*B, A]`` that fit the graph."""
-        dtype = self._weight.dtype
+        dtype = dtype_of(self.core)
         nodes, edges, globals_ = self._arrange(observation, action)
         nodes = self.node_normalizer(nodes, dtype) * self.places.node_mask
         edges = self.edge_normalizer(edges, dtype) * self.places.edge_mask[:, : edges.shape[-1]]
@@ -135,11 +128,10 @@ class ObservationNetwork(nn.Module):
 
     def static_graph(self) -> Graph:
         """Directions of edges and identities of nodes, equal for every sample."""
-        like = self._weight
-        count = self.graph.num_nodes
-        nodes = torch.eye(count).to(like) if self.graph.identity else like.new_zeros(count, 0)
-        direction = like.new_tensor([1.0, -1.0]).repeat(self.graph.num_edges // 2).unsqueeze(-1)
-        return Graph(nodes, direction, like.new_zeros(0), self.places.incidence.edge_index)
+        count, like = self.graph.num_nodes, {"dtype": dtype_of(self.core), "device": self.places.slots.device}
+        nodes = torch.eye(count, **like)[:, : count if self.graph.identity else 0]
+        direction = torch.tensor([1.0, -1.0], **like).repeat(self.graph.num_edges // 2).unsqueeze(-1)
+        return Graph(nodes, direction, torch.zeros(0, **like), self.places.incidence.edge_index)
 
     def forward(self, observation: Tensor, action: Tensor | None = None) -> Tensor:
         """Features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if they are read, actions ``[*B, A]``."""

@@ -1,0 +1,94 @@
+"""Whether a network is exactly what a fold computes: linear layers, one activation between them, and nothing more.
+
+Cores are folded at every training step, so a name is only made of what was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import nn
+from torch.nn.modules import module as modules
+from torch_geometric.nn.aggr import SumAggregation
+from torchrl.modules import MLP
+
+from torchrl_gn.networks.gn_block import GNBlock
+from torchrl_gn.networks.linear import ACTIVATIONS
+
+_METHODS = {"forward", "edge_updater", "edge_update", "propagate", "message", "aggregate", "update"}  # of a block
+_CALLED = ("propagate", "message", "aggregate", "message_and_aggregate", "edge_update")  # where PyG has hooks
+_BLOCK_HOOKS = tuple(f"_{name}_forward{when}_hooks" for name in _CALLED for when in ("_pre", ""))
+
+
+def change_of_core(core: nn.Module, kind: type[nn.Module]) -> str | None:
+    """What makes a core compute anything else than its class ``kind``, its parts aside; None: nothing."""
+    if modules._has_any_global_hook():
+        return "there are hooks on all modules"
+    if type(core).forward is not kind.forward or "forward" in core.__dict__:
+        return "it has its own forward()"
+    return "it has a hook" if _hooked(core) else None
+
+
+def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> str | None:
+    """What makes a GN block other than message passing by sums with the MLPs ``parts``; None: nothing."""
+    if type(block) is not GNBlock:
+        return f" is {_named(block)}"
+    own, inside = block.__dict__, block._modules
+    if _hooked(block) or any([own[hooks] for hooks in _BLOCK_HOOKS]):
+        return " has a hook"
+    if not _METHODS.isdisjoint(own):
+        return " has its own method"
+    if own["flow"] != "source_to_target" or own["_explain"] or own["_decomposed_layers"] > 1:
+        return " passes messages in another way"
+    sums = inside["aggr_module"]
+    if type(sums) is not SumAggregation or _hooked(sums) or "forward" in sums.__dict__:
+        return ".aggr_module is changed"
+    for part in parts:
+        if (change := change_of_mlp(inside.get(part), activation)) is not None:
+            return f".{part}{change}"
+    return None
+
+
+def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
+    """What makes an MLP other than linear layers with biases and the activation between them; None: nothing."""
+    kind, usual = type(mlp), ACTIVATIONS[activation]
+    if mlp is None or (kind is not MLP and kind is not nn.Sequential):
+        return f" is {_named(mlp)}"
+    if _hooked(mlp):
+        return " has a hook"
+    layers = list(mlp._modules.values())
+    if len(layers) < 3 or len(layers) % 2 == 0:
+        return f" has {len(layers)} layers"
+    wanted = [nn.Linear, usual] * (len(layers) // 2) + [nn.Linear]
+    if list(map(type, layers)) != wanted:
+        index = next(index for index, layer in enumerate(layers) if type(layer) is not wanted[index])
+        return f"[{index}] is {_named(layers[index])}"
+    hooked = [layer for layer in layers if _hooked(layer)]
+    if hooked:
+        return f"[{layers.index(hooked[0])}] has a hook"
+    for layer in layers[::2]:
+        weights = layer._parameters
+        if type(weights.get("weight")) is nn.Parameter and type(weights.get("bias")) is nn.Parameter:
+            continue
+        # Plain tensors where a loss or torch.func exchanges the weights.
+        if layer.bias is None:
+            return f"[{layers.index(layer)}] has no bias"
+        if hasattr(type(layer.weight), "__tensor_flatten__"):
+            return f"[{layers.index(layer)}] has {_named(layer.weight)} as weight"
+    if activation == "gelu" and any(layer.approximate != "none" for layer in layers[1::2]):
+        return " has another GELU"
+    return None
+
+
+def _hooked(module: nn.Module) -> bool:
+    """Whether a module has hooks, or another ``forward`` than its class."""
+    own = module.__dict__
+    if own["_forward_hooks"] or own["_forward_pre_hooks"] or own["_backward_hooks"] or own["_backward_pre_hooks"]:
+        return True
+    return "forward" in own
+
+
+def _named(thing: object) -> str:
+    """``None``, ``a Dropout``, ``an Adapter``."""
+    name = type(thing).__name__
+    return "None" if thing is None else f"a{'n' if name[0] in 'AEIOU' else ''} {name}"
