@@ -1,4 +1,4 @@
-"""Check that input numbers are finite, where code may branch on numbers."""
+"""Check that inputs are tensors of real, finite numbers, where code may branch on numbers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,15 @@ from torch import Tensor
 def is_traced() -> bool:
     """Whether a compiler or a transform of ``torch.func`` runs the code, which cannot branch on numbers."""
     return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+
+
+def require_real(value: object, what: str) -> None:
+    """TypeError, naming ``what``, unless a value is a tensor of real numbers."""
+    if not isinstance(value, Tensor):
+        kind = f"{type(value).__module__}.{type(value).__name__}".removeprefix("builtins.")
+        raise TypeError(f"{what} must be a tensor, not {kind}: give torch.as_tensor of it.")
+    if value.dtype == torch.bool or value.is_complex():
+        raise TypeError(f"{what} must be real numbers, not {str(value.dtype).removeprefix('torch.')}.")
 
 
 def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> None:

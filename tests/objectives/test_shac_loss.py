@@ -89,6 +89,28 @@ def test_each_loss_reaches_its_own_weights(model, scenes, starts):
     assert all(weight.grad is None for weight in model.parameters())
 
 
+@pytest.mark.parametrize("frozen", ["policy", "value", "log_alpha"])
+def test_a_frozen_part_changes_nothing_for_the_others(model, scenes, starts, frozen):
+    loss, batch = make_loss(model, scenes["pendulum"], starts, steps=3), TensorDict({"state": starts}, [32])
+
+    def learned() -> tuple[TensorDict, dict[str, Tensor]]:
+        loss.zero_grad()
+        torch.manual_seed(1)
+        out = loss(batch)
+        sum(out[name] for name in ("loss_actor", "loss_value", "loss_alpha")).backward()
+        return out.detach(), {name: w.grad.clone() for name, w in loss.named_parameters() if w.grad is not None}
+
+    wanted, gradients = learned()
+    getattr(loss, frozen).requires_grad_(False)
+    got, others = learned()
+    torch.testing.assert_close(dict(got), dict(wanted), rtol=0, atol=0)
+    torch.testing.assert_close(others, {name: g for name, g in gradients.items() if not name.startswith(frozen)})
+    assert others
+    torch.manual_seed(1)
+    with torch.no_grad():
+        torch.testing.assert_close(dict(loss(batch)), dict(wanted), rtol=0, atol=0)
+
+
 class Diverging(nn.Module):
     """A model that overflows for every second sample."""
 

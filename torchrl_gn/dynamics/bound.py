@@ -23,6 +23,7 @@ from torchrl_gn.dynamics.predictor import Predictor, check_shapes
 from torchrl_gn.dynamics.program import InputScaling, OutputScaling, PreparedStep, StepProgram, structure_key
 from torchrl_gn.finite import is_traced, require_finite
 from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import Core, FoldedCore, ReducibleCore, UnfoldedCore, dtype_of
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
@@ -146,6 +147,7 @@ class BoundPredictor(Predictor):
         adding = (each.name for each in self.layout.components if each.kind == "add" and each.name in columns)
         return {name: second_moment[columns[name]].sum() for name in adding}
 
+    @without_autocast
     def program(
         self,
         parameters: TensorDictBase | None = None,
@@ -257,6 +259,7 @@ def static_graph(predictor: BoundPredictor, parameters: PhysicalParameters, dtyp
     return Graph(nodes, edges, globals_, predictor.incidence.edge_index)
 
 
+@without_autocast
 def dynamic_graph(predictor: BoundPredictor, state: Tensor, action: Tensor) -> Graph:
     """Normalised dynamic graph ``[*B, ...]`` of states and actions, in the network's dtype."""
     check_shapes(predictor.scene, state, action)
@@ -264,6 +267,7 @@ def dynamic_graph(predictor: BoundPredictor, state: Tensor, action: Tensor) -> G
     return eager.dynamic_graph(program, eager.canonical_state(program, state, action), action)
 
 
+@without_autocast
 def residual(program: StepProgram, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
     """Target of the network for transitions: change ``[*B, N, 12]`` in the yaw frame, less what is known of it.
 
@@ -293,6 +297,7 @@ def update_parameter_normalizers(predictor: BoundPredictor, parameters: TensorDi
         normalizer.update(getattr(values, part))
 
 
+@without_autocast
 def update_dynamic_normalizers(
     predictor: BoundPredictor,
     state: Tensor,

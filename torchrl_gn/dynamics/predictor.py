@@ -12,6 +12,8 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.program import PreparedStep, StepProgram
+from torchrl_gn.finite import require_real
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
@@ -108,6 +110,7 @@ class Predictor(TensorDictModuleBase):
         """Hidden state that samples bring to a recurrent model; None: the initial one."""
         return tensordict.get("hidden_state", None) if self.recurrent else None
 
+    @without_autocast
     def in_range(self, states: Tensor, limit: float) -> Tensor:
         """Which states ``[*B, N, 13]`` are finite and within ``limit`` times training's range, ``[*B]``.
 
@@ -130,6 +133,7 @@ class Predictor(TensorDictModuleBase):
         tensordict.set(self.out_keys[0], after)
         return tensordict if hidden is None else tensordict.set(self.out_keys[1], hidden)
 
+    @without_autocast
     def step(
         self,
         state: Tensor,
@@ -141,7 +145,7 @@ class Predictor(TensorDictModuleBase):
 
         Args:
             state: ``[*B, N, 13]``.
-            action: ``[*B, A]``; ValueError if a shape does not fit the scene.
+            action: ``[*B, A]``; ValueError if a shape does not fit the scene, TypeError unless tensors.
             parameters: physical parameters of each sample, or without batch; default: the scene's.
             hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
         """
@@ -150,6 +154,7 @@ class Predictor(TensorDictModuleBase):
         after, hidden = step.step(state, action, self._graph(hidden_state))
         return after, None if hidden is None else hidden.tensordict()
 
+    @without_autocast
     def rollout(
         self,
         state: Tensor,
@@ -164,19 +169,17 @@ class Predictor(TensorDictModuleBase):
         ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``; the first state is the start. See :meth:`step`.
         ``prepared`` is what :meth:`prepared` made of these parameters, for many rollouts with the same weights.
         """
-        for action in actions[..., :1, :].unbind(-2):
-            check_shapes(self.scene, state, action, parameters)
+        check_steps(self.scene, state, actions, parameters)
         step = self.prepared(parameters, size=actions.shape[:-1].numel()) if prepared is None else prepared
         states, hidden = step.rollout(state, actions, self._graph(hidden_state))
         return states, None if hidden is None else hidden.tensordict()
 
+    @without_autocast
     def teacher_forced(
         self, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDict | None]:
         """States ``[*B, T, N, 13]`` after each of the true ``states``, and the hidden state that ran through them."""
-        if states.shape[-3] == 0:
-            raise ValueError("There is no state to predict from.")
-        check_shapes(self.scene, states[..., 0, :, :], actions[..., 0, :], parameters)
+        check_steps(self.scene, states, actions, parameters, each=True)
         if not self.recurrent:
             if parameters is not None and parameters.ndim:
                 parameters = parameters.unsqueeze(-1).expand(actions.shape[:-1])
@@ -185,9 +188,9 @@ class Predictor(TensorDictModuleBase):
         for state, action in zip(states.unbind(-3), actions.unbind(-2), strict=True):
             predicted, hidden = step.step(state, action, hidden)
             predictions.append(predicted)
-        assert hidden is not None
-        return torch.stack(predictions, dim=-3), hidden.tensordict()
+        return torch.stack(predictions, dim=-3), None if hidden is None else hidden.tensordict()
 
+    @without_autocast
     def delta(self, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> Tensor:
         """Predicted change ``[*B, N, 12]``, zero in fixed components; from a recurrent model's initial hidden state."""
         check_shapes(self.scene, state, action, parameters)
@@ -215,7 +218,15 @@ def require_bound(model: object) -> None:
 
 
 def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> None:
-    """ValueError unless states are ``[*B, N, C]``, actions ``[*B, A]``, and parameters have that batch or none."""
+    """ValueError unless states are ``[*B, N, C]``, actions ``[*B, A]``, and parameters have that batch or none.
+
+    TypeError unless both are tensors of real numbers, those of states not whole.
+    """
+    require_real(state, "The state")
+    require_real(action, "The action")
+    if not state.is_floating_point():
+        dtype = str(state.dtype).removeprefix("torch.")
+        raise TypeError(f"The state must be floating-point numbers, not {dtype}: give state.double().")
     batch, wanted = state.shape[:-2], [scene.num_nodes, scene.state_size]
     if list(state.shape[-2:]) != wanted:
         raise ValueError(
@@ -230,6 +241,21 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
         raise ValueError(
             f"Physical parameters must have no batch or that of the state, {list(batch)}, got {list(parameters.shape)}."
         )
+
+
+def check_steps(
+    scene: Scene, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None, *, each: bool = False
+) -> None:
+    """As :func:`check_shapes`, of start states and actions ``[*B, T, A]``; for ``each``, states ``[*B, T, N, C]``."""
+    require_real(states, "The state")
+    require_real(actions, "The action")
+    count, first = actions.shape[-2:-1].numel(), states
+    if each:
+        if states.shape[-3:-2].numel() == 0:
+            raise ValueError("There is no state to predict from.")
+        first = states[..., 0, :, :] if states.ndim > 2 else states
+    if count:
+        check_shapes(scene, first, actions[..., 0, :] if actions.ndim > 1 else actions, parameters)
 
 
 def _past_commands(scene: Scene, action: Tensor) -> str:

@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics.bound import BoundPredictor, UnseenParameterWarning, static_graph
 from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor, NativeExecutor
-from torchrl_gn.dynamics.predictor import Predictor, check_shapes, require_bound
+from torchrl_gn.dynamics.predictor import Predictor, check_shapes, check_steps, require_bound
 from torchrl_gn.dynamics.program import Executor, InputScaling, PreparedStep, StepProgram, structure_key
 from torchrl_gn.dynamics.snapshot import Snapshot
 from torchrl_gn.networks.core import dtype_of
@@ -134,9 +134,7 @@ class SpecializedPredictor(Predictor):
         snapshot, executor = self._modules["snapshot"], self.executor
         if snapshot is None or type(executor) is not NativeExecutor or executor.reason is not None:
             return None
-        if many and actions.ndim > 1 and not actions.shape[-2]:
-            return None
-        check_shapes(self.scene, state, actions[..., 0, :] if many else actions)
+        (check_steps if many else check_shapes)(self.scene, state, actions)
         packed = snapshot._buffers
         numbers = packed["core_weights"], packed["core_tables"], None, packed["core_numbers"]
         return executor.call(*numbers, state, actions, many)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel
 from torchrl_gn.dynamics.bound import dynamic_graph, residual
 from torchrl_gn.dynamics.constraints import AnchorEstimator
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.gn_block import GNBlock
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat, graph_split
 from torchrl_gn.scenes import Scene
@@ -81,6 +82,7 @@ class InferenceModel(nn.Module):
         """Initial hidden graph, zeros, for the batch of an observation ``[*B, ...]``."""
         return observed.zeros(self.hidden_size)
 
+    @without_autocast
     def forward(self, observed: Graph, hidden: Graph) -> tuple[Graph, Graph]:
         """Output of one observation, and the hidden graph for the next."""
         size = self.inferred_size
@@ -176,6 +178,7 @@ class BoundInferenceModel(TensorDictModuleBase):
             context = Context(hidden, output, count, None if anchors is None else anchors[..., step, :, :, :])
             yield context
 
+    @without_autocast
     def _anchor_sums(self, state: Tensor, next_state: Tensor, context: Context | None) -> Tensor | None:
         """Normal equations of the anchor offsets after each transition, ``[*B, T, N, 7, 7]``."""
         if self.anchors is None:
@@ -184,6 +187,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         sums = self.anchors.sums(torch.stack((state, next_state), dim=-3)).cumsum(-4)
         return sums if context is None or context.anchors is None else sums + context.anchors.unsqueeze(-4)
 
+    @without_autocast
     def _estimate(self, context: Context) -> Estimate:
         parameters = context.estimate.tensordict()
         if self.anchors is not None and context.anchors is not None:

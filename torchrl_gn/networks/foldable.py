@@ -6,6 +6,7 @@ Cores are folded at every training step, so a name is only made of what was foun
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from torch import nn
 from torch.nn.modules import module as modules
@@ -56,7 +57,7 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
         return f" is {_named(mlp)}"
     if _hooked(mlp):
         return " has a hook"
-    layers = list(mlp._modules.values())
+    layers: list[Any] = list(mlp._modules.values())
     if len(layers) < 3 or len(layers) % 2 == 0:
         return f" has {len(layers)} layers"
     wanted = [nn.Linear, usual] * (len(layers) // 2) + [nn.Linear]

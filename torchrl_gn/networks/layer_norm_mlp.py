@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from torchrl_gn.maths.precision import without_autocast
+
 
 class LayerNormMLP(nn.Module):
     """MLP whose first layer is normalised and bounded, as in D4PG and its successors (Barth-Maron et al. 2018).
@@ -24,6 +26,7 @@ class LayerNormMLP(nn.Module):
         self.first = nn.Sequential(nn.Linear(in_features, first), nn.LayerNorm(first), nn.Tanh())
         self.rest = MLP(first, out_features, num_cells=rest, activation_class=nn.SiLU)
 
+    @without_autocast
     def forward(self, *inputs: Tensor) -> Tensor:
         """Output ``[*B, out_features]`` of inputs ``[*B, F_k]`` side by side."""
         return self.rest(self.first(torch.cat(inputs, dim=-1)))

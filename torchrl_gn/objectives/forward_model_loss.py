@@ -19,6 +19,7 @@ from torchrl_gn.dynamics.predictor import check_shapes, require_bound
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import read_entries, require_fitted
 from torchrl_gn.objectives.episodes_in_rows import Starts, choose, forget, require_constant, starts_of
 
@@ -143,6 +144,7 @@ class ForwardModelLoss(LossModule):
         return ["loss_forward_model", *(f"error_{name}" for name in self.model.layout.names)]
 
     @torch.no_grad()
+    @without_autocast
     def fit_normalizers(self, tensordict: TensorDictBase) -> None:
         """Fit the loss's scales and the model's normalisers to thousands of clean transitions ``[B]``."""
         model = self.model
@@ -153,6 +155,7 @@ class ForwardModelLoss(LossModule):
         update_dynamic_normalizers(model, noisy, action, next_state, parameters)
 
     @torch.no_grad()
+    @without_autocast
     def fit_scales(self, tensordict: TensorDictBase) -> None:
         """Fit only the scales of noise and errors, to thousands of clean transitions ``[B]``."""
         state, _, next_state = self._read(tensordict)
@@ -187,6 +190,7 @@ class ForwardModelLoss(LossModule):
             self.generator.set_state(state["generator"])
 
     @dispatch()
+    @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of transitions or windows; ValueError for a wrong shape, NaN or Inf.
 

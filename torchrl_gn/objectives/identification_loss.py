@@ -8,6 +8,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import BoundPredictor
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import read_entries, require_fitted
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 from torchrl_gn.scenes import Scene
@@ -85,6 +86,7 @@ class IdentificationLoss(LossModule):
         """Fit only the loss's scales; see :meth:`ForwardModelLoss.fit_scales`."""
         self.prediction.fit_scales(tensordict.select(*self.in_keys))
 
+    @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Loss of a batch of sequences; raises what :meth:`ForwardModelLoss.forward` does."""
         require_fitted(self, self.trained, remedy=FIT_NORMALIZERS)

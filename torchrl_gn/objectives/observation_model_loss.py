@@ -10,6 +10,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives import LossModule
 
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import read_entries, require_fitted
 from torchrl_gn.policies import LearnedReward, ObservationModel
 
@@ -59,6 +60,7 @@ class ObservationModelLoss(LossModule):
         return ["loss_model", *([] if self.reward is None else ["loss_reward"])]
 
     @dispatch()
+    @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of transitions; ValueError for NaN, Inf or a wrong shape, RuntimeError if no normaliser is fitted."""
         require_fitted(self, self.model, remedy=UPDATE_NORMALIZERS)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import require_fitted
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 
@@ -74,6 +75,7 @@ class SeveralScenesLoss(LossModule):
         for loss, batch in zip(self.of_scenes, self._sub_batches(batches), strict=True):
             loss.fit_scales(batch)
 
+    @without_autocast
     def forward(self, tensordict: TensorDictBase | Sequence[TensorDictBase]) -> TensorDict:
         """Loss of a sub-batch of every scene; raises what :meth:`ForwardModelLoss.forward` does."""
         batches = self._sub_batches(tensordict)

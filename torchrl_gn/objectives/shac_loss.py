@@ -16,6 +16,7 @@ from torchrl.objectives.value import TDLambdaEstimator
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.envs.episode_ends import alive_of
 from torchrl_gn.envs.starts import for_learning
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.objectives.checks import read_entries
 from torchrl_gn.planners import BoundedPolicy, StateValue
@@ -86,6 +87,7 @@ class SHACLoss(LossModule):
         estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
         object.__setattr__(self, "_estimator", estimator)
 
+    @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         (state,) = read_entries(self, tensordict, ["state"])
         if not (self.policy.fitted and self.value.fitted):
@@ -112,6 +114,7 @@ class SHACLoss(LossModule):
             }
         )
 
+    @without_autocast
     def fit_normalizers(self, state: Tensor, reward: Tensor | None = None) -> None:
         """Add states ``[*B, N, 13]`` to the normalisers; scale a new value by rewards ``[*B, 1]`` that never end."""
         for network in (self.policy, self.value):
@@ -125,10 +128,10 @@ class SHACLoss(LossModule):
         steps, entropies = [], []
         with frozen(self.env.world_model), self.policy.prepared(), set_exploration_type(ExplorationType.RANDOM):
             for _ in range(self.steps):
-                if (state := cast(Tensor, now["state"])).requires_grad:
-                    state.register_hook(_finite_rows)
-                action, log_prob = self.policy.sample(state)
-                action.register_hook(_finite_rows)
+                action, log_prob = self.policy.sample(state := cast(Tensor, now["state"]))
+                for each in (state, action):
+                    if each.requires_grad:  # neither under no_grad, nor of a frozen policy
+                        each.register_hook(_finite_rows)
                 entropies.append(-log_prob)
                 now = self.env.step(now.set("action", action))
                 steps.append(now.select("state", ("next", "state"), ("next", "reward"), ("next", "terminated")))

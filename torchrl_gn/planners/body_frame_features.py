@@ -12,6 +12,7 @@ from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.planners.state_features import FLOOR, LIMIT, check_states
@@ -70,6 +71,7 @@ class BodyFrameFeatures(Float64Buffers):
         self.node_normalizer.update(nodes)
         self.edge_normalizer.update(edges)
 
+    @without_autocast
     def forward(self, state: Tensor, dtype: torch.dtype | None = None) -> Graph:
         """Graphs ``[*B]`` of states ``[*B, N, 13]``; differentiable."""
         nodes, edges = self._features(state)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import FoldedCore
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.graph import GraphSize
@@ -97,10 +98,12 @@ class GraphStatePolicy(BoundedPolicy):
         policy._read_at(nodes, slots)
         return policy
 
+    @without_autocast
     def unbounded(self, state: Tensor) -> Tensor:
         core = self._fold() if self._folded is None else self._folded
         return core.predict(self.features(state, self.log_std.dtype)).flatten(-2)[..., self.take]
 
+    @without_autocast
     def _fold(self) -> FoldedCore:
         return self.network.fold(self.features.incidence, self.features.static_graph(self.log_std))
 

@@ -24,6 +24,7 @@ from torchrl_gn.envs.episode_ends import counted_steps, ended_steps
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.envs.terminal import plan_rewards
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.ilqg_solver import CountedSteps, ILQGSolver
 from torchrl_gn.planners.linearize import RewardExpansion
@@ -149,6 +150,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         actions = self.plan(tensordict)
         return actions[..., 0, :].to(self.action_spec.dtype), {KEY: shift_plan(tensordict.shape, actions)}
 
+    @without_autocast
     def plan(self, tensordict: TensorDictBase) -> Tensor:
         """Planned actions ``[*B, H, A]``, float64, from the states of a TensorDict ``[*B]``."""
         env = self._env

@@ -18,6 +18,7 @@ from torchrl.modules.planners.common import MPCPlannerBase
 
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
+from torchrl_gn.maths.precision import without_autocast
 
 # Environments carry entries unknown to them from step to step; a primer also resets its own when an episode begins.
 KEY = "plan"
@@ -33,6 +34,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
     def planning(self, td: TensorDictBase) -> Tensor:
         return self.decide(td)[0]
 
+    @without_autocast
     def forward(
         self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None, **kwargs: Any
     ) -> TensorDictBase:

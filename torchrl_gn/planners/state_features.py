@@ -13,6 +13,7 @@ from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.rewards.bodies import require_bodies
 from torchrl_gn.scenes import PhysicalParameters, Scene, scene_from_description
@@ -55,10 +56,12 @@ class StateFeatures(Float64Buffers):
             self.update(state)
 
     @torch.no_grad()
+    @without_autocast
     def update(self, state: Tensor) -> None:
         """Add states ``[*B, N, 13]`` to the normaliser; ValueError if one is not finite."""
         self.normalizer.update(self._encoded(state))
 
+    @without_autocast
     def forward(self, state: Tensor, dtype: torch.dtype | None = None) -> Tensor:
         """Features ``[*B, F]`` of states ``[*B, N, 13]``; differentiable."""
         return self.normalizer(self._encoded(state), dtype)

@@ -10,6 +10,7 @@ from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequ
 from torch import Tensor, nn
 from torchrl.modules import MLP, ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
 
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.policies.observation_model import ObservationModel
 from torchrl_gn.policies.observation_network import ObservationNetwork, sharing_weights
@@ -23,6 +24,7 @@ class LearnedReward(nn.Module):
         super().__init__()
         self.mlp = MLP(2 * num_observations + num_actions, 1, num_cells=list(hidden), activation_class=nn.SiLU)
 
+    @without_autocast
     def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
         return self.mlp(torch.cat((observation, action, next_observation), dim=-1))
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.policies.observation_network import ObservationNetwork, sharing_weights
 from torchrl_gn.scenes import ObservationGraph, Scene
 
@@ -92,12 +93,14 @@ class ObservationModel(TensorDictModuleBase):
         observation, action = (tensordict[key] for key in self.in_keys)
         return tensordict.set(self.out_keys[0], self.step(observation, action))
 
+    @without_autocast
     def step(self, observation: Tensor, action: Tensor) -> Tensor:
         """Next observation ``[*B, O]``; ValueError if a shape does not fit the graph."""
         mean = self._flat(self.change_normalizer.mean, self.global_change_normalizer.mean)
         change = self._change(observation, action) * self.change_std.to(observation.dtype)
         return observation + change + mean.to(observation.dtype)
 
+    @without_autocast
     def normalized_change(self, observation: Tensor, action: Tensor) -> Tensor:
         """Predicted change ``[*B, O]`` in standard deviations, 0 where the change never varied."""
         change = self._change(observation, action)
@@ -136,6 +139,7 @@ class SwimmerObservation(TensorDictModuleBase):
         state, target = (tensordict[key] for key in self.in_keys)
         return tensordict.set("observation", self.observe(state, target))
 
+    @without_autocast
     def observe(self, state: Tensor, target: Tensor) -> Tensor:
         """Observation ``[*B, O]`` of states ``[*B, N, 13]`` and targets ``[*B, 3]``."""
         links = state[..., 1:, :]

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import UnfoldedCore, dtype_of
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.graph import Graph, GraphSize
@@ -133,6 +134,7 @@ class ObservationNetwork(nn.Module):
         direction = torch.tensor([1.0, -1.0], **like).repeat(self.graph.num_edges // 2).unsqueeze(-1)
         return Graph(nodes, direction, torch.zeros(0, **like), self.places.incidence.edge_index)
 
+    @without_autocast
     def forward(self, observation: Tensor, action: Tensor | None = None) -> Tensor:
         """Features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if they are read, actions ``[*B, A]``."""
         dynamic, static = self.dynamic_graph(observation, action), self.static_graph()

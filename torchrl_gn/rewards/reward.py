@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
 from torchrl_gn.finite import require_finite
+from torchrl_gn.maths.precision import without_autocast
 
 
 class Reward(nn.Module):
@@ -26,6 +27,10 @@ class Reward(nn.Module):
 
     target_shape: tuple[int, ...] | None = None  # of a target without batch; None if the reward needs none
     shown: Mapping[str, object] = MappingProxyType({})  # arguments in its repr
+
+    @without_autocast
+    def __call__(self, *args, **kwargs):
+        return super().__call__(*args, **kwargs)
 
     @abstractmethod
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:

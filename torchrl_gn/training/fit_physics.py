@@ -12,10 +12,12 @@ from torchrl_gn.data import trajectory_buffer
 from torchrl_gn.dynamics.features.controls import present_actions
 from torchrl_gn.dynamics.model import layout_of
 from torchrl_gn.evaluation.errors import squared_errors
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.scenes import KinematicTree, Scene
 from torchrl_gn.training.optimizers import clip_gradients
 
 
+@without_autocast
 def fit_physics(
     physics: nn.Module,
     scene: Scene | KinematicTree,

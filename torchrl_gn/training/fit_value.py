@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.objectives.value import TDLambdaEstimator
 
 from torchrl_gn.finite import require_finite
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.planners import StatePolicy, StateValue
 from torchrl_gn.training.optimizers import make_optimizer
 
@@ -37,6 +38,7 @@ class ValueHistory:
     explained: float = math.nan  # share of the last targets' variance that the value explains
 
 
+@without_autocast
 def fit_value(
     value: StateValue,
     episodes: Episodes,
@@ -106,6 +108,7 @@ def fit_value(
     return history
 
 
+@without_autocast
 def fit_policy(
     policy: StatePolicy,
     episodes: Episodes,

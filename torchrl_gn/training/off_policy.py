@@ -19,6 +19,7 @@ from torchrl.objectives import HardUpdate, LossModule
 
 from torchrl_gn.dynamics.executors.compiled import check_compiling
 from torchrl_gn.finite import require_finite
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.policies import Agent
 from torchrl_gn.training.experience import buffer_state, load_buffer_state, make_collector
 from torchrl_gn.training.optimizers import clip_gradients
@@ -183,6 +184,7 @@ class OffPolicyTrainer:
         if self.frames > self.random_frames:
             self.owed += self.updates_per_frame * len(steps)
 
+    @without_autocast
     def update(self) -> dict[str, float]:
         """Take one gradient step on transitions from the replay buffer; return the losses by name.
 

@@ -12,6 +12,7 @@ from torch import nn
 from torchrl.data import ReplayBuffer
 
 from torchrl_gn.maths import fast_matmul
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss, SeveralScenesLoss
 from torchrl_gn.processor import threads_for_native
 from torchrl_gn.training.budget import Budget
@@ -104,6 +105,7 @@ class Trainer:
             yield Progress(self.step, self.seconds, fraction, loss, validation)
             self._lap("caller", start)
 
+    @without_autocast
     def _update(self, module: nn.Module, fraction: float) -> float:
         clock = self.budget.now()
         buffer = self.buffer
@@ -124,6 +126,7 @@ class Trainer:
         self.step += 1
         return mean
 
+    @without_autocast
     def _validation(self, fraction: float) -> float | None:
         due = math.floor(fraction * self.validations)
         if self.validate is None or due <= self.validated:
