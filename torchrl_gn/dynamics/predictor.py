@@ -222,11 +222,8 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
 
     TypeError unless both are tensors of real numbers, those of states not whole.
     """
-    require_real(state, "The state")
+    require_real(state, "The state", whole=False)
     require_real(action, "The action")
-    if not state.is_floating_point():
-        dtype = str(state.dtype).removeprefix("torch.")
-        raise TypeError(f"The state must be floating-point numbers, not {dtype}: give state.double().")
     batch, wanted = state.shape[:-2], [scene.num_nodes, scene.state_size]
     if list(state.shape[-2:]) != wanted:
         raise ValueError(
@@ -247,7 +244,7 @@ def check_steps(
     scene: Scene, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None, *, each: bool = False
 ) -> None:
     """As :func:`check_shapes`, of start states and actions ``[*B, T, A]``; for ``each``, states ``[*B, T, N, C]``."""
-    require_real(states, "The state")
+    require_real(states, "The state", whole=False)
     require_real(actions, "The action")
     count, first = actions.shape[-2:-1].numel(), states
     if each:

@@ -34,7 +34,7 @@ from torchrl_gn.envs.specs import (
 )
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
-from torchrl_gn.finite import is_traced, require_finite
+from torchrl_gn.finite import is_traced, require_finite, require_real
 from torchrl_gn.scenes.scene import Scene
 
 _UNIT = 1e-2  # what the squared length of a quaternion may be off 1
@@ -234,6 +234,7 @@ class ModelEnv(ModelBasedEnvBase):
         self, tensordict: TensorDictBase, actions: Tensor, prepared: PreparedStep | None = None
     ) -> Imagined:
         """What :meth:`imagine` returns, and which of the steps count."""
+        require_real(actions, "The actions")
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
         if actions.shape != shape or shape[-2] < 1:
             raise ValueError(

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.finite import require_real
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
@@ -112,7 +113,8 @@ def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicaliz
 
 
 def check_states(scene: Scene, state: Tensor) -> None:
-    """Raise ValueError unless states are ``[*B, N, 13]`` of the scene."""
+    """Raise ValueError unless states are ``[*B, N, 13]`` of the scene, TypeError unless they are a tensor."""
+    require_real(state, "The state", whole=False)
     if state.shape[-2:] != (shape := (scene.num_nodes, BODY_STATE.size)):
         raise ValueError(f"States of {scene.name!r} must be {['*B', *shape]}, got {list(state.shape)}.")
 

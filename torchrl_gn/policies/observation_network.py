@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchrl_gn.finite import require_real
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.precision import without_autocast
@@ -108,6 +109,9 @@ class ObservationNetwork(nn.Module):
     def _arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Features of nodes, edges and globals, of inputs that fit the graph."""
         graph = self.graph
+        require_real(observation, "The observation", whole=False)
+        if self.actions and action is not None:
+            require_real(action, "The action")
         if observation.shape[-1] != graph.num_observations:
             raise ValueError(
                 f"Observations of {graph.name!r} must be [*B, {graph.num_observations}], got {list(observation.shape)}."
