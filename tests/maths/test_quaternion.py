@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch._subclasses import FakeTensorMode
 
 from torchrl_gn.maths import quaternion
 
@@ -224,3 +226,32 @@ def test_rotating_by_a_rotation_vector(scale):
     torch.testing.assert_close(turned, expected, rtol=0, atol=1e-14)
     gradients = [torch.autograd.grad(out.square().sum() + out[..., 0].sum(), vector)[0] for out in (turned, expected)]
     torch.testing.assert_close(*gradients, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("first", ["hessian", "vmap", "fake", "inference"])
+def test_constants_outlive_what_asked_first(first):
+    """They are made once for all: not inside a transform of torch.func or a mode, where they would stay its own."""
+    spec = importlib.util.find_spec(quaternion.__name__)
+    fresh = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(fresh)
+    q, v = rotations(3), axes(3)
+
+    def rotated(q: Tensor) -> Tensor:
+        return fresh.rotate(fresh.product(q, q), v).sum()
+
+    if first == "hessian":
+        torch.func.hessian(rotated)(q)
+    elif first == "vmap":
+        torch.func.vmap(torch.func.jacfwd(lambda q: fresh.rotate(q, v)))(q)
+    elif first == "inference":
+        with torch.inference_mode():
+            rotated(q)
+    else:
+        with FakeTensorMode(allow_non_fake_inputs=True):
+            rotated(q)
+    grown = q.clone().requires_grad_()
+    rotated(grown).backward()
+    expected = q.clone().requires_grad_()
+    quaternion.rotate(quaternion.product(expected, expected), v).sum().backward()
+    torch.testing.assert_close(grown.grad, expected.grad)
+    torch.testing.assert_close(torch.func.hessian(rotated)(q), torch.func.hessian(rotated)(q))

@@ -6,9 +6,11 @@ Every function has finite gradients on unit quaternions, at the zero rotation an
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 # A product and a rotation matrix are sums of the 16 products of two quaternions' entries: one multiplication and one
 # matrix product, where entry by entry they would take dozens of operations. For many at once those are faster, for
@@ -21,21 +23,36 @@ _MATRIX = (
 )
 
 
-@functools.cache
+def _kept(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Keep the tensors that a function makes, but those of ``torch.func`` or of a mode, which must not outlive it."""
+    made: dict[tuple, Tensor] = {}
+
+    @functools.wraps(make)
+    def get(*key) -> Tensor:
+        tensor = made.get(key)
+        if tensor is None:
+            with torch.inference_mode(False):  # whoever asks first, it serves all
+                tensor = make(*key)
+            if type(tensor) is Tensor and not is_functorch_wrapped_tensor(tensor):
+                made[key] = tensor
+        return tensor
+
+    return get
+
+
+@_kept
 def _table(columns: tuple[str, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """``[16, len(columns)]`` signs of the products of entries that each column sums."""
-    with torch.inference_mode(False):  # whoever asks first, it serves all
-        table = torch.zeros(16, len(columns), dtype=dtype, device="cpu")
-        for column, terms in enumerate(columns):
-            for sign, first, second in terms.split():
-                table[4 * int(first) + int(second), column] = 1 if sign == "+" else -1
-        return table.to(device)
+    rows = [[0.0] * len(columns) for _ in range(16)]
+    for column, terms in enumerate(columns):
+        for sign, first, second in terms.split():
+            rows[4 * int(first) + int(second)][column] = 1.0 if sign == "+" else -1.0
+    return torch.tensor(rows, dtype=dtype, device=device)
 
 
-@functools.cache
+@_kept
 def _identity(dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False):
-        return torch.eye(3, dtype=dtype, device="cpu").flatten().to(device)
+    return torch.eye(3, dtype=dtype, device=device).flatten()
 
 
 def _few(q: Tensor) -> bool:
