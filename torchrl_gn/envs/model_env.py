@@ -110,7 +110,8 @@ class ModelEnv(ModelBasedEnvBase):
                 spec["hidden_state"] = spec_of(cast(Any, model).initial_hidden_state(), self.device)
         if self.history:
             for spec in (self.observation_spec, self.state_spec):
-                spec["past_actions"] = Unbounded(torch.Size((self.history, self.scene.num_actions)), device=self.device)
+                shape = torch.Size((self.history, self.scene.num_actions))
+                spec["past_actions"] = Unbounded(shape, dtype=torch.float32, device=self.device)
 
     @property
     def predictor(self) -> Predictor | ModulePredictor:
@@ -148,7 +149,7 @@ class ModelEnv(ModelBasedEnvBase):
             known = tensordict if set_state else TensorDict(batch_size=shape)
             reset.set("past_actions", self._past_actions(known).clone())
         if self.terminal is not None:
-            reset.set("discount", torch.ones(*shape, 1))
+            reset.set("discount", torch.ones(*shape, 1, dtype=torch.float32))
         return reset.to(self.device)
 
     def _past_actions(self, tensordict: TensorDictBase) -> Tensor:
@@ -156,7 +157,7 @@ class ModelEnv(ModelBasedEnvBase):
         if "past_actions" in tensordict.keys():
             return read(tensordict, "past_actions", (self.history, self.scene.num_actions), self)
         low, high = (torch.as_tensor(bound).float() for bound in (self.scene.action_low, self.scene.action_high))
-        return torch.zeros(*tensordict.shape, self.history, len(low)).clamp(low, high).to(self.device)
+        return low.new_zeros(*tensordict.shape, self.history, len(low)).clamp(low, high).to(self.device)
 
     def _with_past(self, tensordict: TensorDictBase, actions: Tensor) -> Tensor:
         """What the model reads ``[*B, H, (history + 1) A]`` at each of the actions ``[*B, H, A]``."""

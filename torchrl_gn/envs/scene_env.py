@@ -113,7 +113,7 @@ class SceneEnv(EnvBase):
         if variant is not None:
             entries["variant"] = variant
         if self.terminal is not None:
-            entries["discount"] = torch.ones(*shape, 1)
+            entries["discount"] = torch.ones(*shape, 1, dtype=torch.float32)
         return TensorDict(entries, batch_size=shape).to(self.device)
 
     def variant_of(self, tensordict: TensorDictBase) -> Tensor | None:

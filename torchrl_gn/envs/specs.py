@@ -42,7 +42,7 @@ def set_specs(env: Any, scene: Scene, *, physics: bool, variants: int = 1) -> No
     if variants > 1:
         observation["variant"] = Bounded(0, variants - 1, shape=torch.Size((1,)), dtype=torch.int64, device=device)
     if env.terminal is not None:
-        observation["discount"] = Unbounded(shape=torch.Size((1,)), device=device)
+        observation["discount"] = Unbounded(shape=torch.Size((1,)), dtype=torch.float32, device=device)
     env.observation_spec = Composite(observation, device=device)
     inputs = {
         "physics" if physics else "state",

@@ -37,7 +37,7 @@ class Incidence(Float64Buffers):
         predicted = torch.arange(num_nodes, device=edge_index.device) if predicted is None else predicted
         kept = torch.isin(edge_index[1], predicted).nonzero().flatten()
         sender, receiver = (F.one_hot(index, num_nodes).float() for index in edge_index)
-        ones = torch.ones(self.num_edges, 1, device=edge_index.device)
+        ones = receiver.new_ones(self.num_edges, 1)
         reduce = torch.cat((receiver, ones), 1).T.contiguous()
         self._slices = _slice(predicted), _slice(kept)
         self.constants(

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torchrl_gn.maths.precision import without_autocast
+from torchrl_gn.networks.core import dtype_of
 
 
 class LayerNormMLP(nn.Module):
@@ -28,5 +29,6 @@ class LayerNormMLP(nn.Module):
 
     @without_autocast
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Output ``[*B, out_features]`` of inputs ``[*B, F_k]`` side by side."""
-        return self.rest(self.first(torch.cat(inputs, dim=-1)))
+        """Output ``[*B, out_features]`` of inputs ``[*B, F_k]`` side by side, in their dtype."""
+        together = torch.cat(inputs, dim=-1)
+        return self.rest(self.first(together.to(dtype_of(self.first)))).to(together.dtype)

@@ -24,7 +24,7 @@ _LOG_STD, _LOG_STD_BOUNDS = -1.0, (-5.0, 1.0)  # at first, and where it may get
 
 
 class BoundedPolicy(TensorDictModuleBase):
-    """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]``.
+    """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to float32 ``action`` ``[*B, A]``.
 
     Explores, with TorchRL's exploration type RANDOM, by Gaussian noise before the tanh that bounds its actions.
 
@@ -96,7 +96,7 @@ class BoundedPolicy(TensorDictModuleBase):
 
     def act(self, state: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in states ``[*B, N, 13]``; ValueError for another shape."""
-        return self.middle + self.half_range * self.unbounded(state).tanh()
+        return self._bounded(self.unbounded(state))
 
     def sample(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Random actions ``[*B, A]``, reparameterised, and the log densities ``[*B]`` of their scaled ones."""
@@ -106,4 +106,8 @@ class BoundedPolicy(TensorDictModuleBase):
         # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)), which does not cancel.
         slope = 2 * (math.log(2) - before - softplus(-2 * before))
         density = -0.5 * (noise.square() + math.log(2 * math.pi)) - std.log() - slope
-        return self.middle + self.half_range * before.tanh(), density.sum(-1)
+        return self._bounded(before), density.sum(-1)
+
+    def _bounded(self, before: Tensor) -> Tensor:
+        """Actions in the dtype of their bounds, of an environment's, whatever the network's is."""
+        return self.middle + self.half_range * before.tanh().to(self.half_range.dtype)

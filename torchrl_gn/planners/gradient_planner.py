@@ -149,7 +149,7 @@ class GradientPlanner(RecedingHorizonPlanner):
                 f"The model carries {lost[0]!r} from step to step, and the environment drops it: append the planner's"
                 " make_tensordict_primer() to the real environment."
             )
-        size = cast(Tensor, flat.get((KEY, "step_size"), torch.ones(len(flat), 1)))
+        size = cast(Tensor, flat.get((KEY, "step_size"), torch.ones(len(flat), 1, dtype=torch.float32)))
         step_size = size.where(size > 0, 1.0).to(device)  # a primer writes 0
         best = plan.clone()
         with frozen(self.imagined):

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP, ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
 
 from torchrl_gn.maths.precision import without_autocast
+from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.policies.observation_model import ObservationModel
 from torchrl_gn.policies.observation_network import ObservationNetwork, sharing_weights
@@ -26,7 +27,8 @@ class LearnedReward(nn.Module):
 
     @without_autocast
     def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-        return self.mlp(torch.cat((observation, action, next_observation), dim=-1))
+        together = torch.cat((observation, action, next_observation), dim=-1)
+        return self.mlp(together.to(dtype_of(self.mlp))).to(together.dtype)
 
 
 class OutputNormalization(nn.Module):
@@ -71,7 +73,7 @@ class GraphPolicy(nn.Module):
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Location and scale ``[*B, A]`` of the actions, before they are squashed, for observations ``[*B, O]``."""
-        loc, scale = self.network(observation).chunk(2, dim=-1)
+        loc, scale = self.network(observation).to(observation.dtype).chunk(2, dim=-1)
         return self.extract(torch.cat([part.flatten(-2)[..., self.take] for part in (loc, scale)], dim=-1))
 
 
