@@ -11,7 +11,8 @@ import torch
 
 from torchrl_gn.processor import onednn_precision, product_speeds
 
-P, T = ParamSpec("P"), TypeVar("T")
+P = ParamSpec("P")
+T = TypeVar("T")
 _DEVICES = ("cpu", "cuda", "mps", "xpu")
 
 
