@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn.utils import prune
 
 from torchrl_gn.dynamics import specialize
-from torchrl_gn.networks.snapshot import copy_of
+from torchrl_gn.networks.tensor_tree import copy_of
 from torchrl_gn.objectives import ForwardModelLoss
 
 from ..compiling import compiles
@@ -48,7 +48,7 @@ def test_changes_take_effect(scenes, make_model, random_states, random_actions, 
         reference.step(state, action)
         fast = specialize(bound)
         torch.testing.assert_close(fast.step(state, action)[0], expected, rtol=1e-6, atol=1e-9)
-    assert fast.executor().reason is not None
+    assert fast.reason is not None
 
 
 def test_dropout_follows_the_mode(scenes, make_model, random_states, random_actions):

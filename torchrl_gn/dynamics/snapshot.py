@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -14,7 +13,7 @@ from torchrl_gn.dynamics.physics import Physics
 from torchrl_gn.dynamics.program import StepProgram, numbers_of, with_numbers
 from torchrl_gn.networks.core import Core, dtype_of
 from torchrl_gn.networks.packed_layers import PackedLayers, pack_pairs
-from torchrl_gn.networks.tensor_tree import leaves, rebuild, skeleton
+from torchrl_gn.networks.tensor_tree import copy_of, leaves, rebuild, skeleton
 
 # What training changes: the rest of a program is the scene's, and no part of a state_dict.
 _NETWORK = ("core", "recurrent", "static")  # in the network's dtype
@@ -41,7 +40,7 @@ class Snapshot(nn.Module):
             elif isinstance(leaf, Physics) and not leaf.trained:
                 self.add_module(name, leaf)
             else:
-                self.add_module(name, copy.deepcopy(leaf).requires_grad_(False))
+                self.add_module(name, copy_of(leaf).requires_grad_(False))
 
     def program(self) -> StepProgram:
         """The program of the buffers as they are now."""

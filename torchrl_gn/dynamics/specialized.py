@@ -19,7 +19,7 @@ from torchrl_gn.dynamics.snapshot import Snapshot
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
-from torchrl_gn.networks.tensor_tree import in_dtype
+from torchrl_gn.networks.tensor_tree import copy_of, in_dtype
 from torchrl_gn.processor import SlowDtypeWarning, product_speeds
 from torchrl_gn.scenes.scene import Scene
 
@@ -266,7 +266,7 @@ def specialize(
 def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype: torch.dtype) -> StepProgram:
     """Snapshot of the step in a dtype, without features and components that never vary."""
     # In float64, so that folding loses nothing.
-    core = copy.deepcopy(predictor.model.core).double().requires_grad_(False)
+    core = copy_of(predictor.model.core).double().requires_grad_(False)
     rows = (predictor.movable.any(0) & ~predictor.model.residual_normalizer.constant).nonzero().flatten()
     program = predictor.program(parameters, reference=False, reduced=True, rows=rows, core=core)
     changed = {name: in_dtype(getattr(program, name), dtype) for name in ("core", "recurrent", "static")}
@@ -275,7 +275,7 @@ def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype:
 
 def _frozen_copy(predictor: BoundPredictor) -> BoundPredictor:
     """The predictor with a copy of the weights, in float64, so that folding loses nothing."""
-    model = copy.deepcopy(predictor.model).requires_grad_(False)
+    model = copy_of(predictor.model).requires_grad_(False)
     model.core.double()
     state_key, action_key = predictor.in_keys[:2]
     with warnings.catch_warnings():  # the predictor has warned

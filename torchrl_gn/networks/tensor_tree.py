@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 Leaf = Tensor | nn.Module
+M = TypeVar("M", bound=nn.Module)
 
 
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Leaf]]:
@@ -42,13 +44,21 @@ def rebuild(of: Any, given: Iterator[Any]) -> Any:
     return tuple(children.values()) if of.kind is tuple else of.kind(**children)
 
 
+def copy_of(module: M) -> M:
+    """Deep copy of a module as it is now: its mode, hooks and all that was changed in it."""
+    # A pruned weight is computed from parameters, and PyTorch copies no tensor in an autograd graph.
+    attributes = itertools.chain.from_iterable(vars(each).values() for each in module.modules())
+    computed = [each for each in attributes if isinstance(each, Tensor) and not each.is_leaf]
+    return copy.deepcopy(module, {id(each): each.detach().clone() for each in computed})
+
+
 def in_dtype(value: Any, dtype: torch.dtype) -> Any:
     """Nested tuples and dataclasses with their floating-point numbers in another dtype, detached."""
 
     def cast(part: Any) -> Any:
         if isinstance(part, Tensor):
             return part.detach().to(dtype) if part.is_floating_point() else part
-        return copy.deepcopy(part).to(dtype).requires_grad_(False)
+        return copy_of(part).to(dtype).requires_grad_(False)
 
     return rebuild(skeleton(value), (cast(part) for _, part in leaves(value)))
 

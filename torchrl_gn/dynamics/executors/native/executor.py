@@ -17,7 +17,7 @@ from torchrl_gn.dynamics.executors.native.state_maths import StateMaths, may_be_
 from torchrl_gn.dynamics.executors.native.structure import structure
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
 from torchrl_gn.dynamics.program import StepProgram, numbers_of
-from torchrl_gn.networks.core import ListedCore
+from torchrl_gn.networks.core import ListedCore, UnfoldedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.layers import LayerList
 from torchrl_gn.networks.linear import needs_plain_operations
@@ -247,7 +247,8 @@ def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     if program.dtype not in (*_NUMBERS, torch.bfloat16):
         return None, f"{str(program.dtype).removeprefix('torch.')} products run by torch operations"
     if not isinstance(core, ListedCore):
-        return None, "a core without fold() and layers() runs by torch operations"
+        why = core.reason if isinstance(core, UnfoldedCore) else None
+        return None, f"a core without fold() and layers() runs by torch operations{'' if why is None else ': ' + why}"
     if not batch_of(program.parameters).numel():
         return None, "there is no sample"
     if (layers := core.layers()) is None:
