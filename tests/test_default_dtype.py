@@ -103,6 +103,7 @@ def test_policies_of_states(trajectories, kind):
     sum(out[name] for name in ("loss_actor", "loss_value", "loss_alpha")).backward()
     assert all(weight.dtype == weight.grad.dtype == torch.float64 for weight in loss.parameters())
     check_rollout(gn.SceneEnv(scene, seed=0).rollout(2, policy))
+    check_rollout(gn.SceneEnv(scene, seed=0).rollout(2, policy.double()))  # as loading does, bounds and all
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")

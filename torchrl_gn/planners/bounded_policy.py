@@ -109,5 +109,5 @@ class BoundedPolicy(TensorDictModuleBase):
         return self._bounded(before), density.sum(-1)
 
     def _bounded(self, before: Tensor) -> Tensor:
-        """Actions in the dtype of their bounds, of an environment's, whatever the network's is."""
-        return self.middle + self.half_range * before.tanh().to(self.half_range.dtype)
+        """Actions of the environments' dtype, whatever the network's is."""
+        return self.middle.float() + self.half_range.float() * before.tanh().float()
