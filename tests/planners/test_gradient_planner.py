@@ -484,9 +484,9 @@ def test_a_compiled_model_sees_one_number_of_rows(monkeypatch):
     monkeypatch.setattr(ModulePredictor, "fixed_batch", True)
     rows, imagine = [], env.imagine_steps
 
-    def watched(entries, actions):
+    def watched(entries, actions, prepared):
         rows.append(len(actions))
-        return imagine(entries, actions)
+        return imagine(entries, actions, prepared)
 
     monkeypatch.setattr(env, "imagine_steps", watched)
     start = at(1.0, -0.5)
