@@ -41,7 +41,7 @@ def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os
     rest = torch.eye(model.layout.size, dtype=torch.float64, device=device)[min(3, model.layout.size - 1)]
     # Two samples: of one alone the program would be for one alone.
     state = rest.expand(2, scene.num_nodes, -1).clone()
-    action = torch.zeros(2, scene.num_actions, device=device)
+    action = torch.zeros(2, scene.num_actions, dtype=torch.float32, device=device)
     batch = torch.export.Dim("batch")
     with torch.no_grad():
         exported = torch.export.export(_Step(program), (state, action), dynamic_shapes=({0: batch}, {0: batch}))

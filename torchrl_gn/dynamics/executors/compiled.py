@@ -37,8 +37,8 @@ class CompiledExecutor:
     def __init__(self, program: StepProgram) -> None:
         check_compiling(program.movable.device)
         if isinstance(program.core, UnfoldedCore):
-            kind = type(program.core.core).__name__
-            raise TypeError(f"{kind} has no fold() and is evaluated by message passing: use executor='eager'.")
+            why = program.core.reason or f"{type(program.core.core).__name__} has no fold()"
+            raise TypeError(f"{why}, and is evaluated by message passing: use executor='eager'.")
         if program.physics is not None and program.physics.outside:
             raise TypeError("The physics run outside torch, which cannot compile them: use executor='eager'.")
         self._compiled: _Compiled | None = None

@@ -247,8 +247,9 @@ def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
     if program.dtype not in (*_NUMBERS, torch.bfloat16):
         return None, f"{str(program.dtype).removeprefix('torch.')} products run by torch operations"
     if not isinstance(core, ListedCore):
-        why = core.reason if isinstance(core, UnfoldedCore) else None
-        return None, f"a core without fold() and layers() runs by torch operations{'' if why is None else ': ' + why}"
+        if isinstance(core, UnfoldedCore) and core.reason is not None:
+            return None, f"its core runs by message passing: {core.reason}"
+        return None, "a core without fold() and layers() runs by torch operations"
     if not batch_of(program.parameters).numel():
         return None, "there is no sample"
     if (layers := core.layers()) is None:
