@@ -106,7 +106,8 @@ class PackedLayers:
             buffers.append(out if layer.activation is None else ACTIVATIONS[layer.activation]()(out))
         out, count = buffers[-1], self.shapes.num_nodes
         nodes = torch.arange(count, device=out.device)[self.predicted]
-        out = out.transpose(0, 1).reshape(out.shape[1], len(nodes), -1)  # an MLP's one item holds all nodes
+        width = out.shape[0] * out.shape[2] // max(len(nodes), 1)  # an MLP's one item holds all nodes
+        out = out.transpose(0, 1).reshape(out.shape[1], len(nodes), width)
         full = out.new_zeros(out.shape[0], count, out.shape[-1]).index_copy(1, nodes, out)
         return full.reshape(*batch, *full.shape[1:])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from dataclasses import replace
 from typing import Any
@@ -72,9 +71,9 @@ class StateMaths:
         # Phase 0: network inputs from the varying channels and the action; phase 1: the result from the network's
         # output.
         self.forward = assemble(graph, self._groups, [self._inputs, self._after])
+        self.adjoint = self._pull_back()
 
-    @functools.cached_property
-    def adjoint(self) -> Tape:
+    def _pull_back(self) -> Tape:
         """The pull-back of ``forward``.
 
         Phase 0: gradient of the network's output from that of the result. Phase 1: gradients of state and action
