@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from torchrl_gn.dynamics import specialize
-from torchrl_gn.dynamics.executors.native import NoCompilerError, build, operators
+from torchrl_gn.dynamics.executors.native import build, operators
 
 from .native import ROOT, equal, pull, run, with_compiler
 
@@ -74,7 +74,9 @@ def test_without_a_compiler_it_runs_by_torch(fresh, wide, inputs, monkeypatch, v
     monkeypatch.setattr(operators, "load", lambda *_: pytest.fail("tried again"))
     predictor.refresh(bound)
     many = actions[:1, :1].expand(600, 3, -1)  # so many that C++ would pay
-    torch.testing.assert_close(bound.rollout(state[:1].expand(600, -1, -1), many)[0][0], bound.rollout(state[0], many[0])[0])
+    torch.testing.assert_close(
+        bound.rollout(state[:1].expand(600, -1, -1), many)[0][0], bound.rollout(state[0], many[0])[0]
+    )
 
 
 def test_a_library_is_built_once(fresh, builds):

@@ -10,37 +10,38 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.dynamics import BodyState, Controls, ForwardModel, JointAxes, SpecializedPredictor, specialize
+from torchrl_gn.dynamics import BodyState, BoundPredictor, Controls, ForwardModel, JointAxes, specialize
 from torchrl_gn.dynamics.bound import update_parameter_normalizers
-from torchrl_gn.dynamics.executors import NativeExecutor
 from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, batch_of
 from torchrl_gn.dynamics.features import Feature
+from torchrl_gn.networks.packed_layers import PackedLayers
 from torchrl_gn.scenes import sample_variants
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 from ..sizes import SMALL
-from .test_native import equal, pytestmark  # noqa: F401  which skips without a compiler
+from .native import equal, pull, with_compiler
+
+pytestmark = with_compiler
 
 
 class OfVariants:
-    """A predictor bound to the parameters of its samples, with states, actions and parameters of variants."""
+    """A bound predictor of its samples' parameters and the specialised one, with states and actions of variants."""
 
-    def __init__(self, predictor: SpecializedPredictor, state, actions, parameters: TensorDict) -> None:
-        self.predictor, self.inputs, self.parameters = predictor, (state, actions), parameters
+    def __init__(self, bound: BoundPredictor, state, actions, parameters: TensorDict, predictor=None) -> None:
+        self.bound, self.inputs, self.parameters = bound, (state, actions), parameters
+        self.predictor = specialize(bound) if predictor is None else predictor
 
     @property
-    def native(self):
-        executor = self.predictor.executor(self.parameters)
-        assert isinstance(executor, NativeExecutor) and executor.reason is None and executor.native is not None
-        return executor.native
+    def core(self) -> PackedLayers:
+        """Packed layers of all samples, which run natively."""
+        prepared = self.predictor.prepared(self.parameters)
+        assert prepared.executor.reason is None and isinstance(prepared.program.core, PackedLayers)
+        return prepared.program.core
 
     def pull(self, at=slice(None), parameters=None, predictor=None):
         """States of samples' rollout, and gradients of a function of them."""
-        leaves = [each[at].clone().requires_grad_() for each in self.inputs]
         parameters = self.parameters[at] if parameters is None else parameters
-        states = (predictor or self.predictor).rollout(*leaves, parameters)[0]
-        weights = torch.linspace(-1, 1, states[0].numel(), dtype=states.dtype).view(states.shape[1:])
-        return [states.detach(), *torch.autograd.grad((states * weights).sum(), leaves)]
+        return pull(predictor or self.predictor, *(each[at] for each in self.inputs), parameters)
 
 
 def same(found, expected) -> None:
@@ -50,7 +51,7 @@ def same(found, expected) -> None:
 
 
 @pytest.fixture
-def of_variants(scenes, fit, random_states, random_actions):
+def of_variants(scenes, fit, moved, random_actions):
     def make(name="swimmer6", count=30, dtype=torch.float64, **options) -> OfVariants:
         sizes = {} if "core" in options else {"latent": 20, "edge_hidden": (36,), "node_hidden": (36,)}
         scene = scenes[name]
@@ -61,8 +62,7 @@ def of_variants(scenes, fit, random_states, random_actions):
         varied = torch.stack([PhysicalParameters.of(each).tensordict() for each in sample_variants(name, count, rng=0)])
         update_parameter_normalizers(bound, varied)
         parameters = torch.stack([bound.parameters_of(each) for each in sample_variants(name, count, rng=0)])
-        state = random_states(scene, count, seed=3, scale=0.3)
-        return OfVariants(specialize(bound), state, random_actions(scene, count, 3, seed=3), parameters)
+        return OfVariants(bound, moved(bound, count), random_actions(scene, count, 3, seed=3), parameters)
 
     return make
 
@@ -73,21 +73,20 @@ def test_batches_and_threads(of_variants, core, dtype, bound):
     options = {"core": "mlp", "hidden": (36, 20)} if core == "mlp" else {}
     variants = of_variants(count=61, dtype=dtype, **options)
     whole = variants.pull()
-    samples = variants.native.samples
-    assert samples.count == 61
-    own = [table for table in samples.tables if table is not None]
-    assert any(((table[:, 0] - table[:, 1]).abs() > 1e-2).any() for table in own)
-    eager = specialize(variants.predictor, executor="eager")
+    tables = [each for each in variants.core._plain_tables() if each is not None and each.shape[1] == 61]
+    assert any(((table[:, 0] - table[:, 1]).abs() > 1e-2).any() for table in tables)
+    eager = specialize(variants.bound, executor="eager")
     for at in (slice(0, 2), slice(1, 4), slice(30, 54), slice(7, 32), slice(1, 61)):
         wanted = variants.pull(at, predictor=eager)
         for got in (variants.pull(at), [each[at] for each in whole]):
             # A specialised model takes channels that cannot move for constants: of the gradients, that in actions.
             assert (got[0] - wanted[0]).norm() <= bound * (wanted[0] - wanted[0][:, :1]).norm()
             assert (got[2] - wanted[2]).norm() <= bound * wanted[2].norm()
-    variants.pull()
+    prepared = variants.predictor.prepared(variants.parameters)  # torch's own sums may depend on threads
+    whole = pull(prepared, *variants.inputs)
     for threads in (2, 3, 8):
         torch.set_num_threads(threads)
-        assert equal(variants.pull(), whole)
+        assert equal(pull(prepared, *variants.inputs), whole)
 
 
 def test_one_sample_and_parameters_without_batch(of_variants):
@@ -98,35 +97,39 @@ def test_one_sample_and_parameters_without_batch(of_variants):
         same(one, [each[2:3] for each in whole])
     shared = variants.pull(slice(None), variants.parameters[2])
     torch.testing.assert_close(shared[0][2], whole[0][2], rtol=0, atol=1e-12)
-    assert variants.predictor.executor(variants.parameters[2]).native.samples.count is None
+    core = variants.predictor.prepared(variants.parameters[2]).program.core
+    assert core.sample_tables is None and variants.core.sample_tables is not None
 
 
 def test_only_what_differs_is_an_input(of_variants):
-    parameters = of_variants().predictor.parameter_reader.own
+    parameters = of_variants(count=2).bound.scene_parameters
     assert batch_of(parameters) == ()
-    inputs = ParameterInputs.of(parameters, None)
+    inputs = ParameterInputs.of(parameters, parameters)
     assert len(inputs) == 0 and inputs.read(parameters).shape == (1, 0)
     anchors = parameters.child_anchor.expand(2, 3, -1, -1).clone()
     anchors[1, 2, 4, 0] += 0.1
     varied = parameters._replace(child_anchor=anchors)
     assert batch_of(varied) == (2, 3)
-    more = ParameterInputs.of(varied, inputs)
+    more = ParameterInputs.of(parameters, varied)
     assert len(more) == 1 and more.read(varied).flatten().tolist() == anchors[..., 4, 0].flatten().tolist()
-    assert ParameterInputs.of(varied, more) is more and ParameterInputs.of(parameters, more) is more
     anchors[0, 0, 1, 2] += 0.1
-    most = ParameterInputs.of(varied, more)
+    most = ParameterInputs.of(parameters, varied)
     assert len(most) == 2 and most.read(varied).shape == (6, 2)
+    (array,) = most.arrays(["first", "second"])
+    assert (array[1, 2], array[4, 0], array[0, 0]) == ("first", "second", parameters.child_anchor[0, 0])
 
 
 def test_state_maths_are_traced_once_for_all_values(of_variants, monkeypatch):
     variants = of_variants(count=6)
     whole = variants.pull()
+    one = variants.pull(slice(1, 2))
     monkeypatch.setattr(
-        "torchrl_gn.dynamics.executors.native.traced_program.StateMaths", lambda *_: pytest.fail("traced")
+        "torchrl_gn.dynamics.executors.native.executor.StateMaths", lambda *_: pytest.fail("traced again")
     )
     order = [5, 0, 3, 1, 4, 2]
     same(variants.pull(order), [each[order] for each in whole])
-    same(variants.pull(slice(1, 2)), [each[1:2] for each in whole])
+    same(variants.pull(slice(2, 3)), [each[2:3] for each in whole])
+    same(one, [each[1:2] for each in whole])
 
 
 def test_samples_that_need_other_state_maths(of_variants):
@@ -134,20 +137,26 @@ def test_samples_that_need_other_state_maths(of_variants):
     state, actions = variants.inputs
     lifted = state.clone()
     lifted[::2, :, 2] += 1.0  # a height that cannot change
-    found = OfVariants(variants.predictor, lifted, actions, variants.parameters).pull()
+    mixed = OfVariants(variants.bound, lifted, actions, variants.parameters, variants.predictor)
+    found = mixed.pull()
+    eager = mixed.pull(predictor=specialize(variants.bound, executor="eager"))
+    torch.testing.assert_close(found[0], eager[0], rtol=0, atol=1e-10)
+    torch.testing.assert_close(found[2], eager[2], rtol=1e-8, atol=1e-10)
     for index in range(6):
-        alone = OfVariants(specialize(variants.predictor), lifted, actions, variants.parameters)
-        same([each[index : index + 1] for each in found], alone.pull(slice(index, index + 1)))
-    assert variants.native.traced.reason is None
+        same([each[index : index + 1] for each in found], mixed.pull(slice(index, index + 1)))
+    # Of samples whose state maths differ, step and gradient as of those whose do not.
+    same([each[::2] for each in found], mixed.pull(slice(None, None, 2)))
+    same([each[1::2] for each in found], mixed.pull(slice(1, None, 2)))
 
 
 def test_gradients_after_other_parameters(of_variants):
     variants = of_variants(count=4)
-    expected = [variants.pull(slice(0, 2)), variants.pull(slice(2, 4))]
+    halves = [slice(0, 2), slice(2, 4)]
+    expected = [variants.pull(at) for at in halves]
     (state, actions), predictor = variants.inputs, variants.predictor
     leaf = actions.clone().requires_grad_()
-    halves = [slice(0, 2), slice(2, 4)]
     states = [predictor.rollout(state[at], leaf[at], variants.parameters[at])[0] for at in halves]
+    predictor.rollout(state[:0], leaf[:0], variants.parameters[:0])
     weights = torch.linspace(-1, 1, states[0][0].numel(), dtype=torch.float64).view(states[0].shape[1:])
     sum((each * weights).sum() for each in states).backward()
     assert leaf.grad is not None and torch.equal(leaf.grad, torch.cat([each[2] for each in expected]))
@@ -157,31 +166,20 @@ def test_no_samples(of_variants):
     variants = of_variants(count=4)
     state, actions = variants.inputs
     assert variants.predictor.rollout(state[:0], actions[:0], variants.parameters[:0])[0].shape[0] == 0
-    assert variants.native.traced.reason is None
+    assert variants.core
 
 
-def test_an_empty_batch_between_changes_no_weights(of_variants):
+def test_the_scenes_own_parameters(of_variants):
     variants = of_variants(count=4)
-    (state, actions), predictor = variants.inputs, variants.predictor
-    leaf, traced = actions.clone().requires_grad_(), variants.native.traced
-    first = predictor.rollout(state[:2], leaf[:2], variants.parameters[:2])[0]
-    predictor.rollout(state[:0], leaf[:0], variants.parameters[:0])
-    second = predictor.rollout(state[2:], leaf[2:], variants.parameters[2:])[0]
-    (first.sum() + second.sum()).backward()
-    assert variants.native.traced is traced
-
-
-def test_the_scenes_own_parameters_after_those_of_samples(of_variants):
-    variants = of_variants(count=4)
-    (state, actions), predictor = variants.inputs, variants.predictor
-    expected = specialize(predictor, executor="eager").step(state, actions[:, 0])[0]
-    predictor.step(state, actions[:, 0], variants.parameters)
-    for _ in range(4):  # single steps are called without ctypes once they can be
-        torch.testing.assert_close(predictor.step(state, actions[:, 0])[0], expected, rtol=0, atol=1e-10)
-    fresh = specialize(predictor)
-    for _ in range(3):
-        torch.testing.assert_close(fresh.step(state, actions[:, 0])[0], expected, rtol=0, atol=1e-10)
-    variants.native  # noqa: B018  runs natively
+    state, actions = variants.inputs
+    predictor, eager = variants.predictor, specialize(variants.bound, executor="eager")
+    expected = eager.step(state, actions[:, 0])[0]
+    for _ in range(2):  # before and after those of samples
+        for parameters in (None, predictor.own_parameters(), predictor.own_parameters().expand(4)):
+            torch.testing.assert_close(
+                predictor.step(state, actions[:, 0], parameters)[0], expected, rtol=0, atol=1e-10
+            )
+        predictor.step(state, actions[:, 0], variants.parameters)
 
 
 def test_parameters_that_change_in_place(of_variants):
@@ -190,30 +188,54 @@ def test_parameters_that_change_in_place(of_variants):
     own = variants.parameters[0].clone()
     predictor.rollout(state, actions, own)
     own["child_anchor"].mul_(1.1)
-    expected = specialize(predictor, executor="eager").rollout(state, actions, own)[0]
+    expected = specialize(variants.bound, executor="eager").rollout(state, actions, own)[0]
     torch.testing.assert_close(predictor.rollout(state, actions, own)[0], expected, rtol=0, atol=1e-10)
+
+
+def test_a_refresh_takes_new_weights(of_variants):
+    variants = of_variants(count=4)
+    before = variants.pull()
+    with torch.no_grad():
+        for weight in variants.bound.model.parameters():
+            weight.mul_(1.1)
+    assert equal(variants.pull(), before)
+    variants.predictor.refresh(variants.bound)
+    after = variants.pull()
+    assert not torch.equal(after[0], before[0])
+    same(after, variants.pull(predictor=specialize(variants.bound)))
+
+
+def test_prepared_parameters_are_folded_once(of_variants, folds):
+    variants = of_variants(count=4)
+    state, actions = variants.inputs
+    expected = variants.pull()[0]
+    prepared = variants.predictor.prepared(variants.parameters)
+    folds.clear()
+    for step in range(3):
+        state = prepared.step(state, actions[:, step])[0]
+        torch.testing.assert_close(state, expected[:, step + 1], rtol=0, atol=1e-12)
+    assert not folds
 
 
 def test_samples_may_bring_some_parameters(of_variants):
     variants = of_variants(count=4)
     state, actions = variants.inputs
     some = variants.parameters.select("child_anchor")
-    expected = specialize(variants.predictor, executor="eager").rollout(state, actions, some)[0]
-    found = specialize(variants.predictor).rollout(state, actions, some)[0]
+    expected = specialize(variants.bound, executor="eager").rollout(state, actions, some)[0]
+    found = variants.predictor.rollout(state, actions, some)[0]
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
 
 
 def test_threads_with_parameters_of_their_own(of_variants):
     variants = of_variants(count=8)
     (state, actions), predictor = variants.inputs, variants.predictor
-    variants.pull()  # so that all that differs is an input
     halves = [slice(0, 4), slice(4, 8)]
     expected = [predictor.rollout(state[at], actions[at], variants.parameters[at])[0] for at in halves]
     wrong = []
 
     def work(index: int) -> None:
         at, parameters = halves[index], variants.parameters[halves[index]]
-        for _ in range(150):
+        for _ in range(20):
             states = predictor.rollout(state[at], actions[at], parameters)[0]
             if not torch.equal(states, expected[index]):
                 wrong.append(index)
@@ -252,12 +274,14 @@ def test_constants_may_be_read_by_any_operation(fit, scenes, random_states, rand
     state, action = random_states(scene, 3), random_actions(scene, 3)
     fast, eager = (specialize(model.bind(scene), executor=name) for name in ("native", "eager"))
     torch.testing.assert_close(fast.step(state, action)[0], eager.step(state, action)[0], rtol=1e-5, atol=1e-6)
-    assert fast.executor().reason is None
+    assert fast.reason is None
     varied = specialize(model.bind(scene, parameters_key="parameters"))
     parameters = varied.own_parameters().expand(3).clone()
     parameters["child_anchor"][1] *= 1.1
-    varied.step(state, action, parameters)
-    assert "no scalar form" in varied.executor(parameters).reason
+    expected = specialize(model.bind(scene, parameters_key="parameters"), executor="eager")
+    wanted = expected.step(state, action, parameters)[0]
+    torch.testing.assert_close(varied.step(state, action, parameters)[0], wanted)
+    assert "no scalar form" in varied.prepared(parameters).executor.reason
 
 
 def test_another_number_of_samples_is_refused(of_variants):
@@ -265,5 +289,6 @@ def test_another_number_of_samples_is_refused(of_variants):
     state, actions = variants.inputs
     with pytest.raises(ValueError, match="parameters"):
         variants.predictor.rollout(state[:3], actions[:3], variants.parameters)
-    executor = variants.predictor.executor(variants.parameters)
-    assert executor.running(state, actions) is not None and executor.running(state[:3], actions[:3]) is None
+    prepared = variants.predictor.prepared(variants.parameters)
+    with pytest.raises(ValueError, match="tables of each sample"):
+        prepared.rollout(state[:3], actions[:3])

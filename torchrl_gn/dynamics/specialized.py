@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import warnings
 from dataclasses import replace
 
@@ -55,8 +56,8 @@ class SpecializedPredictor(Predictor):
         with torch.inference_mode(False), torch.no_grad():
             self._products = dtype or predictor.dtype
             program = _folded(predictor, None, self._products)
-            self._key = structure_key(program)
-            self.executor = self._executors[self._key] = EXECUTORS[executor](program)
+            self._form = _form(predictor, program)
+            self.executor = self._executors[structure_key(program)] = EXECUTORS[executor](program)
             if predictor.parameters_key is None:
                 self.snapshot = Snapshot(self.executor.pack(program))
                 self.reader = copy.deepcopy(predictor.parameter_reader)
@@ -85,15 +86,15 @@ class SpecializedPredictor(Predictor):
         """Take the weights of a model bound to the same scene, in place: whoever shares its memory sees them.
 
         Raises:
-            ValueError: if the model has another form: other layers or, after :func:`fit_normalizers`, other features
-                that vary.
+            ValueError: if the model has another form: another scene, other options or, after :func:`fit_normalizers`,
+                other features that vary.
         """
         with torch.inference_mode(False):
-            program = _folded(predictor, None, self._products)
-            if structure_key(program) != self._key or predictor.scene is not self.scene:
+            program = _folded(predictor, None, self.dtype)
+            if _form(predictor, program) != self._form:
                 raise ValueError(
-                    f"{type(self).__name__} of {self.scene.name!r} cannot take these weights: the model is bound to"
-                    " another scene object, or other features vary in its training. Specialise it anew."
+                    f"{type(self).__name__} of {self.scene.name!r} cannot take these weights: the model has other"
+                    " options, is bound to another scene, or other features vary in its training. Specialise it anew."
                 )
             if self.snapshot is not None:
                 self.snapshot.load(self.executor.pack(program))
@@ -132,7 +133,7 @@ class SpecializedPredictor(Predictor):
 
     def _native(self, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
         """Result of the operator, without the program around it, which takes longer than a step of one state."""
-        snapshot, executor = self._modules["snapshot"], self.executor
+        snapshot, executor = self._modules.get("snapshot"), self.executor
         if snapshot is None or type(executor) is not NativeExecutor or executor.reason is not None:
             return None
         (check_steps if many else check_shapes)(self.scene, state, actions)
@@ -208,6 +209,8 @@ class SpecializedPredictor(Predictor):
         super()._apply(fn, recurse)
         if self.squares.dtype != squares.dtype:
             self.squares = squares.to(self.squares.device)
+        if self.source is not None:
+            self._products = fn(torch.empty(0, dtype=self._products)).dtype
         return self
 
     def __str__(self) -> str:
@@ -272,6 +275,16 @@ def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype:
     program = predictor.program(parameters, reference=False, reduced=True, rows=rows, core=core)
     changed = {name: in_dtype(getattr(program, name), dtype) for name in ("core", "recurrent", "static")}
     return replace(program, dtype=dtype, **changed)
+
+
+def _form(predictor: BoundPredictor, program: StepProgram) -> tuple:
+    """What predictors have in common whose numbers can take each other's place, in any dtype."""
+    model = predictor.model
+    try:
+        options = json.dumps(model.description(), sort_keys=True, default=str)
+    except ValueError:  # of a feature without a name
+        options = repr((model.features, model.core_name, sorted(model.core_options.items())))
+    return structure_key(replace(program, dtype=torch.float64)), options, predictor.scene.fingerprint()
 
 
 def _frozen_copy(predictor: BoundPredictor) -> BoundPredictor:

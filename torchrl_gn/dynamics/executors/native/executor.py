@@ -26,7 +26,6 @@ from torchrl_gn.networks.tensor_tree import in_dtype
 from torchrl_gn.processor import native_threads
 
 _NUMBERS = (torch.float32, torch.float64)  # of states, actions, weights
-_PACKED = (*_NUMBERS, torch.bfloat16)
 _TENSORS = (Tensor, torch.nn.Parameter)
 
 
@@ -57,9 +56,9 @@ class NativeExecutor:
         self.parameters = ParameterInputs.of(program.standard, program.parameters)
         self.channels = program.layout.delta_size if change else program.layout.size
         try:
-            if program.dtype == torch.bfloat16 and not load_operators().has_bfloat16():
+            self._load()
+            if program.dtype not in self._products:
                 raise NoCompilerError("This processor multiplies no bfloat16.")
-            load_operators()
             self.structure = self._trace(program, layers)
         except (NoCompilerError, UntraceableError) as error:
             self.reason = str(error)
@@ -68,9 +67,13 @@ class NativeExecutor:
         self.__dict__.update(state)
         if self.reason is None:
             try:
-                load_operators()
+                self._load()
             except NoCompilerError as error:
-                self.reason = str(error)
+                self.reason, self._products = str(error), ()
+
+    def _load(self) -> None:
+        """Load the operators, and ask which products they know here."""
+        self._products = (*_NUMBERS, torch.bfloat16) if load_operators().has_bfloat16() else _NUMBERS
 
     def pack(self, program: StepProgram) -> StepProgram:
         """The program with its core as :class:`PackedLayers`; itself if torch must run it."""
@@ -80,13 +83,13 @@ class NativeExecutor:
         assert isinstance(core, ListedCore)
         layers, operators = core.layers(), load_operators()
         assert layers is not None
-        sums = torch.float32 if program.dtype == torch.bfloat16 else program.dtype  # dtype of sums and tables
+        sums = torch.float64 if program.dtype == torch.float64 else torch.float32
         weights = [layer.weight for layer in layers.layers]
         if program.dtype == torch.bfloat16:
             packed = pack_pairs(weights)
-        else:
+        else:  # products of others than float32 and float64, which a module was cast to, are torch's
             plain = torch.cat([weight.reshape(-1) for weight in weights]).to(sums)
-            packed = operators.pack(plain, self.shapes.weights, True)
+            packed = operators.pack(plain, self.shapes.weights, True).to(program.dtype)
         tables = [
             layer.table.reshape(-1) for layer in layers.layers if layer.table is not None and layer.table.ndim == 2
         ]
@@ -149,11 +152,13 @@ class NativeExecutor:
 
         The first four are those of :class:`PackedLayers`.
         """
-        if weights.dtype not in _PACKED or not weights.is_cpu or not runs_natively(state, actions):
+        if weights.dtype not in self._products or not weights.is_cpu or not runs_natively(state, actions):
             return None
         packed = self.structure, weights, tables, sample_tables, numbers
+        # A compiler takes no number of threads into its graph: 0 are torch's.
+        threads = 0 if torch.compiler.is_compiling() else native_threads()
         with contextlib.suppress(NotImplementedError):  # states that no state maths could be traced for
-            return torch.ops.torchrl_gn.rollout(state, actions, *packed, self.channels, many, native_threads())
+            return torch.ops.torchrl_gn.rollout(state, actions, *packed, self.channels, many, threads)
         return None
 
     def _trace(self, program: StepProgram, layers: LayerList) -> Tensor:

@@ -12,6 +12,7 @@
 #include <ATen/ops/index_select.h>
 #include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
+#include <c10/core/impl/TorchDispatchModeTLS.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
@@ -255,6 +256,7 @@ std::tuple<Tensor, Tensor> rollout_keeping(const Tensor& state_, const Tensor& a
                          : at::empty_like(state);
   call.out = array(out);
   Tensor stored;
+  TORCH_CHECK_VALUE(keep != kAll || !many, "Activations are kept of one step alone.");
   if (keep == kAll) call.keeps_all = true, call.tile = std::min(gn::kTile, call.batch);  // so the sums, whatever the threads
   if (keep != kNothing) {
     const int64_t count = gn::stored_count(maths, weights_of(model), call);
@@ -283,12 +285,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
   const Tensor gradient = gradient_.contiguous(), states = states_.contiguous(), actions = actions_.contiguous();
   const Model model{structure, weights, tables, sample_tables, numbers};
   Prepared prepared(states, actions, model, false, many, threads);
-  TORCH_CHECK_VALUE(is_number(gradient), "A native step takes no gradient of such numbers.");
+  const int64_t rows = many ? actions.size(-2) + 1 : 1;
+  TORCH_CHECK_VALUE(is_number(gradient) &&
+                        gradient.numel() == prepared.call.batch * rows * prepared.words.maths(0)->result_size,
+                    "The gradient does not fit the native step: ", gradient.sizes(), ".");
   const Tensor nothing = at::empty({0}, tables.options());
   std::vector<int64_t> shape = states.sizes().vec();
   if (many) shape.erase(shape.end() - 3);
   if (prepared.which == 2) {
-    Tensor of_packed = nothing, of_tables = nothing;
+    Tensor of_packed = nothing, of_tables = at::empty_like(nothing);
     auto alone = [&](const std::vector<Tensor>& parts, const Model& of) {
       auto [of_state, of_actions, first, second] =
           rollout_adjoint(parts[0], parts[1], parts[2], of.structure, of.weights, of.tables, of.sample_tables, of.numbers,
@@ -304,7 +309,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
   const gn::Maths maths = prepared.maths();
   const Tensor of_state = Pool::empty(shape, states.scalar_type()), of_actions = at::empty_like(actions);
   const Tensor of_packed = of_weights ? at::zeros_like(weights) : nothing;
-  const Tensor of_tables = of_weights ? at::zeros_like(tables) : nothing;
+  const Tensor of_tables = of_weights ? at::zeros_like(tables) : at::empty_like(nothing);  // results share no memory
   call.out = array(gradient);
   call.grad_state = array(of_state), call.grad_actions = array(of_actions);
   if (of_weights) {
@@ -313,7 +318,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
     call.keeps_all = stored.numel() > 0;
     call.tile = std::min(gn::kTile, call.batch);
   }
-  TORCH_CHECK_VALUE(stored.numel() == 0 || stored.numel() == gn::stored_count(maths, weights_of(model), call),
+  TORCH_CHECK_VALUE(stored.numel() == 0 || (stored.numel() == gn::stored_count(maths, weights_of(model), call) &&
+                                            stored.scalar_type() == tables.scalar_type() && stored.is_contiguous()),
                     "What the native step kept for its gradient is of another call.");
   if (stored.numel()) call.stored = stored.data_ptr();
   gn::run(maths, weights_of(model), call, true);
@@ -322,19 +328,24 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
 
 int64_t panels(int64_t width) { return (width + gn::kPanel - 1) / gn::kPanel; }
 
+int64_t packed_count(at::IntArrayRef shapes, bool weights) {
+  int64_t count = 0;
+  for (size_t i = 0; i + 1 < shapes.size(); i += 2) {
+    const int64_t rows = shapes[i], columns = shapes[i + 1];
+    count += gn::kPanel * (weights ? panels(rows) * columns + panels(columns) * rows : rows * panels(columns));
+  }
+  return count;
+}
+
 // Matrices [rows, columns] of `shapes`, whose numbers come one after the other, as the engine reads them. Weights as
 // panels of 16 rows, [rows / 16][columns][16], then the same of their transpose; other tables row by row. Both padded
 // with zeros to whole panels.
 Tensor pack(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
   constexpr int64_t P = gn::kPanel;
-  int64_t given = 0, count = 0;
-  for (size_t i = 0; i + 1 < shapes.size(); i += 2) {
-    const int64_t rows = shapes[i], columns = shapes[i + 1];
-    given += rows * columns;
-    count += P * (weights ? panels(rows) * columns + panels(columns) * rows : rows * panels(columns));
-  }
+  int64_t given = 0;
+  for (size_t i = 0; i + 1 < shapes.size(); i += 2) given += shapes[i] * shapes[i + 1];
   TORCH_CHECK_VALUE(is_number(numbers) && numbers.numel() == given, "Numbers to pack do not have the shapes given.");
-  const Tensor plain = numbers.contiguous(), packed = at::zeros({count}, numbers.options());
+  const Tensor plain = numbers.contiguous(), packed = at::zeros({packed_count(shapes, weights)}, numbers.options());
   auto fill = [&](auto zero) {
     using T = decltype(zero);
     const T* from = plain.const_data_ptr<T>();
@@ -415,7 +426,6 @@ std::tuple<Tensor, Tensor> rollout_keeping_shape(const Tensor& state, const Tens
                                                  const Tensor& weights, const Tensor& tables,
                                                  const OptionalTensor& sample_tables, const Tensor& numbers,
                                                  int64_t channels, bool many, int64_t threads, int64_t) {
-  // Compiled code keeps nothing, as how much that is depends on the states: its gradients compute the steps again.
   return {rollout_shape(state, actions, structure, weights, tables, sample_tables, numbers, channels, many, threads),
           at::empty({0}, tables.options())};
 }
@@ -427,9 +437,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint_shape(const Tensor&, 
                                                                  bool many, int64_t, bool of_weights) {
   std::vector<c10::SymInt> shape = states.sym_sizes().vec();
   if (many) shape.erase(shape.end() - 3);
-  const Tensor nothing = at::empty({0}, tables.options());
+  auto like = [&](const Tensor& tensor) {
+    return of_weights ? at::empty_like(tensor) : at::empty({0}, tables.options());
+  };
   return {at::empty_symint(shape, states.options()), at::empty_symint(actions.sym_sizes(), actions.options()),
-          of_weights ? at::empty_like(weights) : nothing, of_weights ? at::empty_like(tables) : nothing};
+          like(weights), like(tables)};
+}
+
+Tensor pack_shape(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
+  return at::empty({packed_count(shapes, weights)}, numbers.options());
 }
 
 // Gradients.
@@ -447,7 +463,8 @@ struct FirstOrder : torch::autograd::Function<FirstOrder> {
     return {a.view_as(a), b.view_as(b), c.view_as(c), d.view_as(d)};
   }
   static variable_list backward(AutogradContext*, variable_list) {
-    TORCH_CHECK(false, "Native gradients are of first order; specialise with executor='eager' for those of second.");
+    TORCH_CHECK(false, "Native gradients are of first order. For those of second, specialise with executor='eager', or",
+                " bind the model with reference=True.");
   }
 };
 
@@ -478,9 +495,12 @@ struct Rollout : torch::autograd::Function<Rollout> {
                         const Tensor& numbers, int64_t channels, bool many, int64_t threads) {
     static const auto op = typed<decltype(rollout_keeping)>("torchrl_gn::rollout_keeping");
     const bool of_weights = needs(weights) || needs(tables);
+    threads = thread_count(threads);  // what is kept lies as they share it
     TORCH_CHECK(!needs(numbers) && !(sample_tables.has_value() && needs(*sample_tables)),
                 "There is no native gradient in physical parameters: use executor='eager'.");
-    const int64_t keep = !of_weights ? kSlopes : many ? kNothing : kAll;
+    // Compiled code keeps nothing, as how much that is depends on the states: its gradients compute the steps again.
+    const bool traced = c10::impl::TorchDispatchModeTLS::any_modes_set();
+    const int64_t keep = traced || (of_weights && many) ? kNothing : of_weights ? kAll : kSlopes;
     at::AutoDispatchBelowADInplaceOrView guard;
     auto [out, stored] = op.call(state, actions, structure, weights, tables, sample_tables, numbers, channels, many,
                                  threads, keep);
@@ -568,6 +588,7 @@ TORCH_LIBRARY_IMPL(torchrl_gn, Meta, library) {
   library.impl("rollout", rollout_shape);
   library.impl("rollout_keeping", rollout_keeping_shape);
   library.impl("rollout_adjoint", rollout_adjoint_shape);
+  library.impl("pack", pack_shape);
 }
 
 TORCH_LIBRARY_IMPL(torchrl_gn, Autograd, library) {
