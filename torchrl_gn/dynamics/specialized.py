@@ -31,8 +31,8 @@ class SpecializedPredictor(Predictor):
     A value: it predicts what the given predictor predicted when it was made, and never changes by itself. Its folded
     weights are its buffers and its only copy, so what is done to a module (``to``, ``load_state_dict``, copies,
     pickles, shared memory, a collector's weight update, ``functional_call``) is done to the model. After training,
-    :meth:`refresh` takes the new weights, in place. A core that was changed (dropout, hooks, adapters) is copied as it is,
-    in its mode: call ``eval()`` first.
+    :meth:`refresh` takes the new weights, in place. A core that was changed (dropout, hooks, adapters) is copied as
+    it is, in its mode: call ``eval()`` first.
 
     Differentiable in states and actions, never in weights. Native gradients are of first order; that in a component of
     the state that cannot move is that of copying it. Reads and writes the keys of the given predictor. ``print`` shows
