@@ -143,15 +143,28 @@ def structure_key(program: StepProgram) -> tuple:
     if program.physics is not None:
         tensors += [*program.physics.parameters(), *program.physics.buffers()]
     numbers = tuple(None if each is None else each.detach().cpu().numpy().tobytes() for each in tensors)
-    varies, count = [], 1
+    masks = tuple(each.cpu().numpy().tobytes() for each in parameter_inputs(program))
+    pairs = zip(program.parameters, program.standard, strict=True)
+    many = any(given.shape[: given.ndim - own.ndim].numel() > 1 for given, own in pairs)
+    return repr(program.output.runs), program.dtype, numbers, masks, many
+
+
+def parameter_inputs(program: StepProgram) -> list[Tensor]:
+    """Which numbers of each physical parameter samples may have of their own, bool; the others are the scene's.
+
+    Of a parameter that samples bring these are all but zeros and ones that all of them share, as a planar scene's axes:
+    such make short state maths, and the same ones for all variants.
+    """
+    found = []
     for given, own in zip(program.parameters, program.standard, strict=True):
         if given is own:
+            found.append(torch.zeros_like(own, dtype=torch.bool))
             continue
-        batch = given.shape[: given.ndim - own.ndim]
-        varies.append((given != own).flatten(0, len(batch) - 1).any(0) if batch else given != own)
-        count = max(count, batch.numel())
-    masks = tuple(each.cpu().numpy().tobytes() for each in varies)
-    return repr(program.output.runs), program.dtype, numbers, masks, count > 1
+        differs = given != own
+        batch = given.ndim - own.ndim
+        differs = differs.flatten(0, batch - 1).any(0) if batch else differs
+        found.append(differs | ((own != 0) & (own.abs() != 1)))
+    return found
 
 
 class Executor(Protocol):

@@ -53,7 +53,7 @@ class NativeExecutor:
             return
         self.change = change
         self.shapes = LayerShapes(layers)
-        self.parameters = ParameterInputs.of(program.standard, program.parameters)
+        self.parameters = ParameterInputs.of(program)
         self.channels = program.layout.delta_size if change else program.layout.size
         try:
             self._load()

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics.executors.native.trace import Array
+from torchrl_gn.dynamics.program import StepProgram, parameter_inputs
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 _DIMS = (2, 2, 1, 2, 1, 1, 2, 2, 3, 2)  # of each physical parameter without batch
@@ -28,16 +29,10 @@ class ParameterInputs:
     varies: tuple[np.ndarray, ...]  # bool, alike
 
     @classmethod
-    def of(cls, own: PhysicalParameters, given: PhysicalParameters) -> ParameterInputs:
-        """Inputs for samples of parameters ``given`` of a scene with its ``own``."""
-        values = tuple(part[0] for part in _flat(own))
-        varies = ((part != value).any(0) for part, value in zip(_flat(given), values, strict=True))
-        return cls(values, tuple(varies))
-
-    @property
-    def key(self) -> bytes:
-        """What tells inputs of one scene apart."""
-        return np.packbits(np.concatenate([part.ravel() for part in self.varies])).tobytes()
+    def of(cls, program: StepProgram) -> ParameterInputs:
+        """Inputs of a program with the parameters of samples."""
+        values = tuple(part[0] for part in _flat(program.standard))
+        return cls(values, tuple(mask.numpy() for mask in parameter_inputs(program)))
 
     def __len__(self) -> int:
         """Numbers P that differ."""
