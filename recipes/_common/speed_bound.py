@@ -11,6 +11,7 @@ from torch import Tensor
 
 from _common.speed_measure import timed
 from torchrl_gn.dynamics import SpecializedPredictor
+from torchrl_gn.networks.packed_layers import PackedLayers
 
 _SIZE = 512  # of a square product whose matrices fit the cache
 _READS = 20
@@ -63,6 +64,10 @@ def read_rate(size: float, repeats: int) -> float:
 
 def _weight_bytes(core: Any) -> int:
     """Bytes of a folded core's weights and tables. Its own tensors are incidence matrices, which lists can replace."""
+    if isinstance(core, PackedLayers):  # which pads, and has every weight's transpose too
+        shapes, tables = core.shapes.tables, core.tables.element_size()
+        sizes = [rows * columns * tables for rows, columns in zip(shapes[::2], shapes[1::2], strict=True)]
+        return sum(sizes) + sum(map(_bytes, core.plain_weights()))
     parts = [getattr(core, field.name) for field in fields(core)]
     return sum(_bytes(part) for part in parts if not isinstance(part, Tensor))
 

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from torchrl_gn.dynamics import Predictor, as_predictor, specialize
+from torchrl_gn.dynamics import BoundPredictor, as_predictor, specialize
 
 
 def counting(state, action, count):
@@ -50,7 +50,7 @@ def test_a_modules_other_inputs_are_its_hidden_state():
 def test_a_predictor_of_nested_keys_is_itself(scenes, make_model, random_states, random_actions):
     scene = scenes["swimmer6"]
     model = make_model(scene)
-    nested = Predictor(model, scene, state_key=("robot", "state"), action_key=("robot", "action"))
+    nested = BoundPredictor(model, scene, state_key=("robot", "state"), action_key=("robot", "action"))
     quick = specialize(nested)
     state, actions = random_states(scene, 4, scale=0.1), random_actions(scene, 4, 3)
     expected = model.bind(scene).rollout(state, actions)[0]

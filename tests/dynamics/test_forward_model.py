@@ -19,7 +19,6 @@ from torchrl_gn.dynamics import (
     JointAxes,
     Predictor,
     UnseenParameterWarning,
-    specialize,
 )
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths import Component, StateLayout
@@ -154,9 +153,8 @@ def test_what_binding_makes_lies_where_the_model_is(scenes, make_model, monkeypa
     def look(bound: Predictor, *_, **__) -> None:
         places.update(tensor.device.type for tensor in bound.buffers())
 
-    monkeypatch.setattr("torchrl_gn.dynamics.predictor.warn_of_unseen", look)
+    monkeypatch.setattr("torchrl_gn.dynamics.bound._warn_of_unseen", look)
     bound = model.bind(scenes["cheetah"])
-    specialize(bound)
     for module in (ForwardModelLoss(bound), IdentifyingModel(model).bind(bound.scene)[1]):
         places.update(tensor.device.type for tensor in module.buffers())
     assert places == {"meta"}

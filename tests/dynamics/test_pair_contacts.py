@@ -205,9 +205,9 @@ def compare(fitted, sampled, executor, dtype, **options):
 @pytest.mark.parametrize("executor", ["eager", "native"])
 @pytest.mark.parametrize("core", ["gn", "mlp"])
 def test_every_executor_is_the_reference(fitted, sampled, executor, dtype, core):
-    fast = compare(fitted, sampled, executor, dtype, core=core, hidden=(16, 12)).executor()
+    fast = compare(fitted, sampled, executor, dtype, core=core, hidden=(16, 12))
     if executor == "native":
-        assert isinstance(fast, NativeExecutor) and fast.reason is None
+        assert isinstance(fast.executor, NativeExecutor) and fast.reason is None
 
 
 @compiles

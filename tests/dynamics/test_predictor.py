@@ -9,11 +9,11 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from torchrl_gn.dynamics import (
     BodyState,
+    BoundPredictor,
     Canonicalizer,
     Contacts,
     Controls,
     JointAxes,
-    Predictor,
     specialize,
 )
 from torchrl_gn.maths import BODY_STATE
@@ -142,7 +142,7 @@ def test_tensordict_contract(scenes, make_model, random_states, random_actions, 
 def test_nested_keys(scenes, make_model, random_states, random_actions):
     scene = scenes["swimmer6"]
     model = make_model(scene)
-    bound = Predictor(model, scene, state_key=("robot", "state"), action_key=("robot", "action"))
+    bound = BoundPredictor(model, scene, state_key=("robot", "state"), action_key=("robot", "action"))
     assert bound.out_keys == [("next", "robot", "state")]
     tensordict = bound(transitions(scene, random_states, random_actions, 4, robot=True))
     robot = tensordict["robot"]

@@ -8,7 +8,7 @@ import torch
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics.constraints.generalized_coordinates import GeneralizedProjection
-from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection
+from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection, position_weight
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.scenes.physical_parameters import joint_axes
@@ -20,8 +20,8 @@ CONSTRAINED = [*SYSTEMS, "creature", "crawler"]
 
 
 def project(bound, state, delta):
-    std, matrices = bound.model.delta_normalizer.std, bound.canonicalizer.matrices(state)
-    return bound.projection(state, matrices, delta, std, bound.scene_parameters)
+    weight, matrices = position_weight(bound.model.delta_normalizer.std), bound.canonicalizer.matrices(state)
+    return bound.projection(state, matrices, delta, weight, bound.scene_parameters)
 
 
 def gaps(scene, state):
@@ -83,7 +83,8 @@ def test_a_body_that_turns_about_one_place_needs_no_linking(make_model):
     state = trajectories["state"][:, :-1]
     delta, matrices = bound.delta(state, trajectories["action"]).detach(), bound.canonicalizer.matrices(state)
     assert torch.equal(
-        projection(state, matrices, delta, bound.model.delta_normalizer.std, bound.scene_parameters), delta
+        projection(state, matrices, delta, position_weight(bound.model.delta_normalizer.std), bound.scene_parameters),
+        delta,
     )
 
 
@@ -132,7 +133,9 @@ def test_linking_by_joints_takes_noise_away(make_model, name):
     seen = std > 1e-9
     seen_from = states[:, :-1], bound.canonicalizer.matrices(states[:, :-1])
     left = [
-        ((by(*seen_from, noisy, std, bound.scene_parameters) - delta)[..., seen] / std[seen]).square().mean()
+        ((by(*seen_from, noisy, position_weight(std), bound.scene_parameters) - delta)[..., seen] / std[seen])
+        .square()
+        .mean()
         for by in (GeneralizedProjection(scene), MaximalProjection(scene), lambda _, __, change, *___: change)
     ]
     assert left[0] < 0.9 * left[1] < 0.8 * left[2]
@@ -150,7 +153,7 @@ def test_in_the_plane_both_ways_are_the_same(make_model, name):
     std = torch.ones(12, dtype=torch.float64)
     matrices = bound.canonicalizer.matrices(state)
     ours, theirs = (
-        by(state, matrices, raw, std, bound.scene_parameters)
+        by(state, matrices, raw, position_weight(std), bound.scene_parameters)
         for by in (GeneralizedProjection(scene), MaximalProjection(scene))
     )
     assert (ours - theirs).norm() < 1e-3 * raw.norm()
@@ -165,7 +168,11 @@ def test_gradients_of_linking_by_joints(make_model):
     std = torch.ones(12, dtype=torch.float64)
     assert torch.autograd.gradcheck(
         lambda delta: bound.projection(
-            state, bound.canonicalizer.matrices(state), delta * bound.movable, std, bound.scene_parameters
+            state,
+            bound.canonicalizer.matrices(state),
+            delta * bound.movable,
+            position_weight(std),
+            bound.scene_parameters,
         ),
         (raw.requires_grad_(),),
     )

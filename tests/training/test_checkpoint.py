@@ -274,5 +274,5 @@ def test_a_predictor_is_saved_with_its_scene(tmp_path, trained, scene):
 
 
 def test_what_a_checkpoint_cannot_hold_is_refused(tmp_path, trained):
-    with pytest.raises(TypeError, match="cannot hold a GNCore; give one of Predictor, ForwardModel"):
+    with pytest.raises(TypeError, match="cannot hold a GNCore; give one of BoundPredictor, ForwardModel"):
         save_checkpoint(tmp_path / "core.safetensors", trained.model.core)

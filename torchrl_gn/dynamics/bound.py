@@ -118,7 +118,14 @@ class BoundPredictor(Predictor):
     def own_parameters(self) -> TensorDict:
         return self.parameter_reader.entries()
 
-    def parameters_of(self, scene: Scene) -> TensorDict:
+    def _apply(self, fn, recurse: bool = True):
+        reference = self.reference_state
+        super()._apply(fn, recurse)
+        if self.reference_state.dtype != reference.dtype:  # the scene's numbers keep theirs
+            self.reference_state = reference.to(self.reference_state.device)
+        return self
+
+    def parameters_of(self, scene: Scene, *, stacklevel: int = 1) -> TensorDict:
         here, there = topology(self.scene), topology(scene)
         differs = [what for what in here if here[what] != there[what]]
         if differs:
@@ -127,7 +134,7 @@ class BoundPredictor(Predictor):
                 " Bind the model to it instead."
             )
         values = self.model.parameters_of(scene)
-        _warn_of_unseen(self, values, scene.name, stacklevel=3)
+        _warn_of_unseen(self, values, scene.name, stacklevel=2 + stacklevel)
         return self.parameter_reader.of(scene, values)
 
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:

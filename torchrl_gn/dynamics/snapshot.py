@@ -37,8 +37,6 @@ class Snapshot(nn.Module):
         for name, leaf in leaves(program):
             if isinstance(leaf, Tensor):
                 self.register_buffer(name, leaf.detach().clone(), persistent=_is_trained(name))
-            elif isinstance(leaf, Physics) and not leaf.trained:
-                self.add_module(name, leaf)
             else:
                 self.add_module(name, copy_of(leaf).requires_grad_(False))
 

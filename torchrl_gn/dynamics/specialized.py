@@ -86,15 +86,15 @@ class SpecializedPredictor(Predictor):
         """Take the weights of a model bound to the same scene, in place: whoever shares its memory sees them.
 
         Raises:
-            ValueError: if the model has another form: another scene, other options or, after :func:`fit_normalizers`,
-                other features that vary.
+            ValueError: if the model has another form: another scene, other options or physics, or, after its normalisers
+                saw data, other features that vary.
         """
         with torch.inference_mode(False):
             program = _folded(predictor, None, self.dtype)
             if _form(predictor, program) != self._form:
                 raise ValueError(
                     f"{type(self).__name__} of {self.scene.name!r} cannot take these weights: the model has other"
-                    " options, is bound to another scene, or other features vary in its training. Specialise it anew."
+                    " options, scene or physics, or other features vary in its training. Specialise it anew."
                 )
             if self.snapshot is not None:
                 self.snapshot.load(self.executor.pack(program))
@@ -179,7 +179,7 @@ class SpecializedPredictor(Predictor):
     def parameters_of(self, scene: Scene) -> TensorDict:
         if self.source is None:
             raise ValueError("The model is of one scene: bind with parameters_key, then specialise.")
-        return self.source.parameters_of(scene)
+        return self.source.parameters_of(scene, stacklevel=2)
 
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         return self._reader.find(tensordict)
@@ -294,7 +294,7 @@ def _frozen_copy(predictor: BoundPredictor) -> BoundPredictor:
     state_key, action_key = predictor.in_keys[:2]
     with warnings.catch_warnings():  # the predictor has warned
         warnings.simplefilter("ignore", UnseenParameterWarning)
-        return BoundPredictor(
+        copied = BoundPredictor(
             model,
             predictor.scene,
             state_key=state_key,
@@ -302,6 +302,8 @@ def _frozen_copy(predictor: BoundPredictor) -> BoundPredictor:
             parameters_key=predictor.parameters_key,
             parameter_names=predictor.parameter_reader.brought,
         )
+    copied.strict = predictor.strict  # of other variants
+    return copied
 
 
 def _skipped(predictor: BoundPredictor, program: StepProgram) -> dict[str, tuple[float, float]]:
