@@ -14,7 +14,6 @@ import torch
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import export_c, export_step, specialize
 from torchrl_gn.dynamics.executors.native.build import instruction_flags
-from torchrl_gn.dynamics.executors.native.executor import NativeExecutor
 from torchrl_gn.scenes import load_scene
 
 COMPILER = shutil.which("g++")
@@ -99,13 +98,14 @@ def test_c_functions_are_the_native_executor_bit_for_bit(fit, make_model, random
 
     rest = torch.tensor((ctypes.c_double * (13 * scene.num_nodes)).in_dll(library, "twin_rest")[:], dtype=torch.float64)
     rest = rest.reshape(1, -1, 13)
-    executor = specialize(bound).executor()
-    assert isinstance(executor, NativeExecutor)
-    executor.step(rest, torch.zeros(1, scene.num_actions))  # of the same constant channels
-    for count, steps, threads in ((1, 1, 1), (7, 3, 1), (30, 2, 2)):
-        state = Simulator(scene).observe(sample_start_states(scene, count, 0)).requires_grad_()
+    native = specialize(bound)
+    assert native.reason is None
+    for count, steps, threads, lifted in ((1, 1, 1, 0), (7, 3, 1, 0), (30, 2, 2, 0), (1, 2, 1, 1), (30, 2, 2, 3)):
+        state = Simulator(scene).observe(sample_start_states(scene, count, 0))
+        if lifted:
+            state[::lifted, 0, 2] = 1.0  # the world cannot move: other state maths, of all samples or some
         actions = random_actions(scene, count, steps).requires_grad_()
-        expected, _ = executor.rollout(state, actions)
+        expected, _ = native.rollout(state.requires_grad_(), actions)
         status, states = steps_of(library, state, actions, threads)
         assert status == 0 and torch.equal(states, expected)
         weights = torch.randn(expected.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -118,14 +118,41 @@ def test_c_functions_are_the_native_executor_bit_for_bit(fit, make_model, random
         assert library.twin_step(*map(pointer, (state[0], actions[0, 0].contiguous(), after))) == 0
         assert torch.equal(after, expected[0, 1])
 
-    elsewhere = rest.clone()
-    elsewhere[:, 0, 2] = 1.0  # the world cannot move
-    status, states = steps_of(library, elsewhere, torch.zeros(1, 1, scene.num_actions, dtype=torch.float64))
-    assert status == 1 and states.isnan().all()
-    moved = export_c(bound, tmp_path / "moved", torch.stack((rest[0], elsewhere[0])))
-    texts = [next(each.glob("*.cpp")).read_text() for each in (folder, moved)]
-    counts = [int(text.split(" MATHS = {")[1].split(", ")[1]) for text in texts]
-    assert counts[1] == counts[0] + 1  # one more channel varies
+    broken = rest.clone()
+    broken[:, 1, 0] = torch.nan
+    status, states = steps_of(library, broken, torch.zeros(1, 1, scene.num_actions, dtype=torch.float64))
+    assert status == 0 and states[:, 1].isnan().any()
+
+
+@with_compiler
+def test_a_specialised_model_is_exported_as_it_is(scenes, make_model, tmp_path):
+    scene = scenes["pendulum"]
+    model = make_model(scene)
+    native = specialize(model.bind(scene))
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.mul_(1.5)
+    texts = [
+        (export_c(each, tmp_path / name / "step") / "step.cpp").read_text()
+        for name, each in (
+            ("kept", native),
+            ("new", model.bind(scene)),
+            ("wide", specialize(model.bind(scene)).double()),
+        )
+    ]
+    assert texts[0] != texts[1] and "const float WEIGHTS" in texts[0] and "const double WEIGHTS" in texts[2]
+    native.refresh(model.bind(scene))
+    assert (export_c(native, tmp_path / "again" / "step") / "step.cpp").read_text() == texts[1]
+
+
+def test_c_says_where_it_knows_no_state_maths(scenes, make_model, random_actions, tmp_path, monkeypatch):
+    """A model whose maths for other states has no scalar form or too many registers."""
+    scene = scenes["swimmer6"]
+    bound = make_model(scene).bind(scene)
+    monkeypatch.setattr("torchrl_gn.dynamics.executors.native.tape._MOST_REGISTERS", 800)
+    assert (folder := export_c(bound, tmp_path / "twin")).exists()
+    words = (folder / "twin.cpp").read_text().split("STRUCTURE[] = {")[1].split("}")[0].replace("\n", " ").split(",")
+    assert int(words[6]) == -1 and int(words[5]) > 0
 
 
 @with_compiler
@@ -152,6 +179,6 @@ def test_c_refuses_what_the_native_executor_cannot_run(scenes, make_model, tmp_p
         export_c(make_model(scene).bind(scene, parameters_key="parameters"), tmp_path / "step")
     with pytest.raises(ValueError, match="'my-model' is no C identifier"):
         export_c(bound, tmp_path / "my-model")
-    with pytest.raises(ValueError, match=r"states must be \[\*B, 2, 13\], got \[3\]"):
-        export_c(bound, tmp_path / "step", torch.zeros(3))
+    with pytest.raises(TypeError, match="specialised for another executor"):
+        export_c(specialize(bound, executor="eager"), tmp_path / "step")
     assert not list(tmp_path.iterdir())

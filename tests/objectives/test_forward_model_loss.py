@@ -6,13 +6,14 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.data import create_dataset, trajectory_buffer
-from torchrl_gn.dynamics import Canonicalizer, ForwardModel, Predictor
+from torchrl_gn.dynamics import BoundPredictor, Canonicalizer, ForwardModel
 from torchrl_gn.dynamics.bound import dynamic_graph
 from torchrl_gn.dynamics.executors import EagerExecutor
+from torchrl_gn.dynamics.program import PreparedStep, StepProgram
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
@@ -31,11 +32,15 @@ def predict(monkeypatch) -> Callable[[Callable], list[Tensor]]:
         fed: list[Tensor] = []
 
         class Stub(EagerExecutor):
-            def delta(self, state: Tensor, action: Tensor, hidden: None) -> tuple[Tensor, None]:
+            def delta(self, program: StepProgram, state: Tensor, action: Tensor, hidden: None) -> tuple[Tensor, None]:
                 fed.append(state)
-                return delta(state, action) * self.program.movable, hidden
+                return delta(state, action) * program.movable, hidden
 
-        monkeypatch.setattr(Predictor, "training_executor", lambda self, parameters: Stub(self.program(parameters)))
+        def prepared(self: BoundPredictor, parameters: TensorDictBase | None) -> PreparedStep:
+            program = self.program(parameters)
+            return PreparedStep(Stub(program), program)
+
+        monkeypatch.setattr(BoundPredictor, "prepared_for_training", prepared)
         return fed
 
     return predict

@@ -126,7 +126,7 @@ class PackedLayers:
         """Every layer's table ``[I, 1 or B, out]``."""
         shared, own = 0, 0
         every = sum(_panels(each.weight[0]) * PANEL * (each.table or 0) for each in self.shapes.layers if each.sampled)
-        batch = 0 if self.sample_tables is None else self.sample_tables.numel() // max(every, 1)
+        batch = self.sample_tables.numel() // every if self.sample_tables is not None and every else 1
         for layer in self.shapes.layers:
             if layer.table is None:
                 yield None
@@ -139,7 +139,7 @@ class PackedLayers:
             else:
                 assert self.sample_tables is not None
                 size = layer.table * batch * width
-                yield self.sample_tables[own : own + size].view(layer.table, -1, width)[..., :columns]
+                yield self.sample_tables[own : own + size].view(layer.table, batch, width)[..., :columns]
                 own += size
 
 
