@@ -80,7 +80,7 @@ def steps_of(library, state, actions, threads=1):
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
-        ("pendulum", torch.float32),
+        pytest.param("pendulum", torch.float32, marks=pytest.mark.slow),
         pytest.param("swimmer6", torch.float64, marks=pytest.mark.slow),
         pytest.param("jaco", torch.float32, marks=pytest.mark.slow),
     ],

@@ -62,15 +62,12 @@ def test_predicts_as_the_folded_core(random_graph, kind, edges, predicted, depth
     others = [node for node in range(num_nodes) if node not in predicted]
     assert found.shape == expected.shape and not found[:, others].any()
     if not own:
-        one, two, empty = (dynamic.nodes[0], dynamic.edges[0]), dynamic.nodes.unflatten(0, (2, 3)), dynamic.nodes[:0]
         graph = type(dynamic)
-        single = layers.predict(graph(*one, dynamic.globals_[0], edges))
+        single = layers.predict(graph(*(part[0] for part in dynamic.features), edges))
         torch.testing.assert_close(single, found[0])
-        both = layers.predict(
-            graph(two, dynamic.edges.unflatten(0, (2, 3)), dynamic.globals_.unflatten(0, (2, 3)), edges)
-        )
+        both = layers.predict(graph(*(part.unflatten(0, (2, 3)) for part in dynamic.features), edges))
         torch.testing.assert_close(both.flatten(0, 1), found)
-        nothing = layers.predict(graph(empty, dynamic.edges[:0], dynamic.globals_[:0], edges))
+        nothing = layers.predict(graph(*(part[:0] for part in dynamic.features), edges))
         assert nothing.shape == expected[:0].shape
 
 
