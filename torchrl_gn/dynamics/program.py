@@ -138,8 +138,8 @@ def with_numbers(program: StepProgram, numbers: Iterable[Tensor]) -> StepProgram
 def structure_key(program: StepProgram) -> tuple:
     """What tells the structures of one scene's programs apart: programs of equal keys differ in numbers alone."""
     tensors = [program.nodes.columns, program.edges.columns]
-    if program.output.runs is not None:  # components that never varied keep their mean
-        tensors.append(program.output.mean)
+    # Components that never varied keep their mean.
+    tensors += [program.output.mean[where] for varies, where in program.output.runs or () if not varies]
     if program.physics is not None:
         tensors += [*program.physics.parameters(), *program.physics.buffers()]
     numbers = tuple(None if each is None else each.detach().cpu().numpy().tobytes() for each in tensors)
