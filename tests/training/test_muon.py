@@ -6,6 +6,8 @@ import pytest
 import torch
 from torch import nn
 
+from torchrl_gn.dynamics.executors.native import NoCompilerError, build
+from torchrl_gn.training import muon
 from torchrl_gn.training.muon import Muon, orthogonalize
 
 SHAPES = [(8, 8), (8, 20), (20, 8), (8, 11), (1, 5), (12, 128), (128, 782)]
@@ -85,6 +87,38 @@ def updated(shapes: list, dtype: torch.dtype, steps: int = 3, *, transposed: boo
     return [parameter.detach() for parameter in parameters]
 
 
+NATIVE_SHAPES = [*SHAPES, (5, 1), (1, 1), (33, 17), (17, 33), (128, 128), (300, 70), (600, 530)]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_cpp_updates_as_torch_operations_do(monkeypatch, dtype):
+    compiled = updated(NATIVE_SHAPES, dtype)
+
+    def refuse(*_, **__):
+        raise NoCompilerError("no compiler")
+
+    monkeypatch.setattr(muon, "load_operators", refuse)
+    expected = updated(NATIVE_SHAPES, dtype if dtype == torch.float64 else torch.float32)
+    digits = 1e-8 if dtype == torch.float64 else 2e-3  # of the update: the polynomials are steep
+    monkeypatch.undo()
+    start = updated(NATIVE_SHAPES, dtype, steps=0)
+    for ours, torchs, before in zip(compiled, expected, start, strict=True):
+        assert (ours - torchs).norm() < digits * (torchs - before).norm(), list(ours.shape)
+
+
+@pytest.mark.skipif(build.find_compiler() is None, reason="needs a C++ compiler")
+def test_cpp_gives_the_same_bits_on_any_number_of_threads():
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            results.append(updated(NATIVE_SHAPES, torch.float32))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(map(torch.equal, *results))
+
+
 def test_matrices_that_do_not_lie_in_rows_are_updated_too():
     for ours, expected in zip(
         updated(SHAPES, torch.float64, transposed=True), updated(SHAPES, torch.float64), strict=True
@@ -92,7 +126,7 @@ def test_matrices_that_do_not_lie_in_rows_are_updated_too():
         torch.testing.assert_close(ours, expected, rtol=1e-8, atol=1e-10)
 
 
-def test_an_update_counts_as_a_change_for_autograd():
+def test_an_update_in_cpp_counts_as_a_change_for_autograd():
     weight = nn.Parameter(torch.ones(3, 3))
     loss = (weight * weight).sum()
     weight.grad = torch.eye(3)
