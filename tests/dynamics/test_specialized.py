@@ -102,7 +102,7 @@ def trees(draw) -> str:
 
 
 @settings(
-    max_examples=12,
+    max_examples=20,
     deadline=None,
     derandomize=True,
     database=None,
