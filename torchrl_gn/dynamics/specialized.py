@@ -86,8 +86,8 @@ class SpecializedPredictor(Predictor):
         """Take the weights of a model bound to the same scene, in place: whoever shares its memory sees them.
 
         Raises:
-            ValueError: if the model has another form: another scene, other options or physics, or, after its normalisers
-                saw data, other features that vary.
+            ValueError: if the model has another form: another scene, other options or physics, or, after its
+                normalisers saw data, other features that vary.
         """
         with torch.inference_mode(False):
             program = _folded(predictor, None, self.dtype)
