@@ -21,12 +21,13 @@ from torchrl_gn.dynamics.features.feature import graph_edges
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.predictor import Predictor, check_shapes
 from torchrl_gn.dynamics.program import InputScaling, OutputScaling, PreparedStep, StepProgram, structure_key
-from torchrl_gn.finite import is_traced, require_finite
+from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import Core, FoldedCore, ReducibleCore, UnfoldedCore, dtype_of
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
+from torchrl_gn.networks.linear import needs_plain_operations
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
 from torchrl_gn.scenes.scene import Scene
 
@@ -224,7 +225,7 @@ class BoundPredictor(Predictor):
 
     def _may_run_natively(self, parameters: TensorDictBase | None) -> bool:
         # What is traced cannot ask which features vary; C++ has no gradient in parameters of physics or samples.
-        if is_traced() or self.reference or (self.model.physics is not None and self.model.physics.trained):
+        if needs_plain_operations() or self.reference or (self.model.physics is not None and self.model.physics.trained):
             return False
         return self.movable.is_cpu and (parameters is None or not torch.is_grad_enabled())
 

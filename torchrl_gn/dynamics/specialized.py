@@ -42,6 +42,7 @@ class SpecializedPredictor(Predictor):
     call; :meth:`prepared` folds once for many. No gradient flows to the parameters.
     """
 
+    @without_autocast
     def __init__(
         self, predictor: BoundPredictor, *, executor: str = "native", dtype: torch.dtype | None = None
     ) -> None:
@@ -81,6 +82,7 @@ class SpecializedPredictor(Predictor):
         """Why torch operations run it although it is native; None if they do not."""
         return self.executor.reason
 
+    @without_autocast
     @torch.no_grad()
     def refresh(self, predictor: BoundPredictor) -> None:
         """Take the weights of a model bound to the same scene, in place: whoever shares its memory sees them.
@@ -145,6 +147,7 @@ class SpecializedPredictor(Predictor):
         """The step as data, packed for its executor."""
         return self.prepared(parameters).program
 
+    @without_autocast
     def prepared(self, parameters: TensorDictBase | None = None, *, size: int = 1) -> PreparedStep:
         if self.snapshot is not None:
             if parameters is not None:

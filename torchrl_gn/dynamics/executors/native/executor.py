@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native.build import NoCompilerError
@@ -164,7 +165,7 @@ class NativeExecutor:
     def _trace(self, program: StepProgram, layers: LayerList) -> Tensor:
         """The structure, compared with torch's own numbers; UntraceableError if they differ or have no scalar form."""
         reference = program.reference.detach().double().numpy()
-        with torch.device("cpu"), torch.no_grad():
+        with _disable_current_modes(), torch.device("cpu"), torch.no_grad():
             # What a step changes is not constant: found by numbers, it need not be traced to be found.
             constant = may_be_constant(program, reference)
             batch, moved = batch_of(program.parameters), _example(program, torch.from_numpy(constant), False)
@@ -199,15 +200,14 @@ class NativeExecutor:
         core = program.core
         assert isinstance(core, ListedCore)
         program = replace(program, core=in_dtype(core, torch.float64), dtype=torch.float64)
-        other = object.__new__(NativeExecutor)
-        other.__dict__.update(self.__dict__, structure=words)
-        packed, batch = other.pack(program), batch_of(program.parameters)
+        layers, batch = self.pack(program).core, batch_of(program.parameters)
+        assert isinstance(layers, PackedLayers)
         for everywhere in (False, True)[: 1 + general]:
             state = _example(program, torch.from_numpy(constant), everywhere).expand(*batch, -1, -1)
             action = _action(program).expand(*batch, -1)
             wanted = eager.delta(program, state, action)[0]
-            found = other._run(packed, state, action, False)
-            assert found is not None
+            inputs = words, layers.weights, layers.tables, layers.sample_tables, layers.numbers
+            found = torch.ops.torchrl_gn.rollout(state, action, *inputs, self.channels, False, 1)
             if not self.change:
                 wanted, found = program.layout.apply(state, wanted) - state, found - state
             sizes, errors = (each.flatten(-2).norm(dim=-1).flatten() for each in (wanted, found - wanted))
