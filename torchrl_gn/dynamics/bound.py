@@ -225,10 +225,15 @@ class BoundPredictor(Predictor):
 
     def _may_run_natively(self, parameters: TensorDictBase | None) -> bool:
         # What is traced cannot ask which features vary; C++ has no gradient in parameters of physics or samples.
-        if needs_plain_operations() or self.reference or (self.model.physics is not None and self.model.physics.trained):
+        if (
+            needs_plain_operations()
+            or self.reference
+            or (self.model.physics is not None and self.model.physics.trained)
+        ):
             return False
         return self.movable.is_cpu and (parameters is None or not torch.is_grad_enabled())
 
+    @without_autocast
     def _prepared_natively(self, parameters: TensorDictBase | None, *, change: bool) -> PreparedStep:
         program = self.program(parameters, reduced=True)
         key = (change, *structure_key(program))

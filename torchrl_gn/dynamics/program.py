@@ -14,6 +14,7 @@ from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.physics import Physics
 from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.networks.core import Core, FoldedCore
 from torchrl_gn.networks.graph import Graph
@@ -201,14 +202,17 @@ class PreparedStep:
     executor: Executor
     program: StepProgram
 
+    @without_autocast
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         """As :meth:`Executor.step`."""
         return self.executor.step(self.program, state, action, hidden)
 
+    @without_autocast
     def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         """As :meth:`Executor.rollout`."""
         return self.executor.rollout(self.program, state, actions, hidden)
 
+    @without_autocast
     def delta(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
         """Predicted change ``[*B, N, 12]``, differentiable in the weights too, and hidden state."""
         return cast(Any, self.executor).delta(self.program, state, action, hidden)

@@ -17,6 +17,7 @@ from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor, NativeExecut
 from torchrl_gn.dynamics.predictor import Predictor, check_shapes, check_steps, require_bound
 from torchrl_gn.dynamics.program import Executor, InputScaling, PreparedStep, StepProgram, structure_key
 from torchrl_gn.dynamics.snapshot import Snapshot
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
@@ -270,6 +271,7 @@ def specialize(
     return SpecializedPredictor(predictor, executor=executor, dtype=dtype)
 
 
+@without_autocast
 def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype: torch.dtype) -> StepProgram:
     """Snapshot of the step in a dtype, without features and components that never vary."""
     # In float64, so that folding loses nothing.
