@@ -15,7 +15,7 @@ import torch
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.dynamics.executors.native import build, operators
 
-from .native import ROOT, equal, pull, run, with_compiler
+from .native import ROOT, equal, pull, with_compiler
 
 pytestmark = with_compiler
 
@@ -188,77 +188,3 @@ def test_two_processes_build_at_once(tmp_path, compiler):
     (file,) = (folder / "torchrl_gn").glob("*.so")
     content = file.read_bytes()
     assert hashlib.sha256(content[:-32]).digest() == content[-32:]
-
-
-SANITIZED = """
-import torch
-from tests import zoo
-from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.executors.native.operators import load_operators
-operators = load_operators()
-for name in ("swimmer3", "joints"):
-    scene = zoo.load(name)
-    for sizes in ({"latent": 6, "hidden": (8,)}, {"latent": 20, "hidden": (36,), "activation": "gelu"}):
-        for dtype in (torch.float32, torch.float64, torch.bfloat16):
-            if dtype == torch.bfloat16 and not operators.has_bfloat16():
-                continue
-            products, dtype = dtype, torch.float32 if dtype == torch.bfloat16 else dtype
-            model = ForwardModel.for_scene(scene, **sizes).to(dtype)
-            for normalizer in model.modules():
-                if hasattr(normalizer, "m2"):
-                    ones = {key: torch.ones_like(value) for key, value in normalizer.state_dict().items()}
-                    normalizer.load_state_dict(ones)
-            bound = model.bind(scene)
-            predictor = specialize(bound, dtype=products)
-            assert predictor.reason is None, predictor.reason
-            for count in (1, 3, 7, 13, 24, 50):
-                for threads in (1, 3):
-                    torch.set_num_threads(threads)
-                    rest = bound.reference_state.expand(count, -1, -1).clone()
-                    rest[count // 2 :, :, 2] += 0.1 * (threads > 1)  # other state maths, or both
-                    actions = torch.zeros(count, 3, scene.num_actions, dtype=torch.float64)
-                    predictor.step(rest, actions[:, 0])
-                    rest.requires_grad_(), actions.requires_grad_()
-                    predictor.rollout(rest, actions)[0].sum().backward()
-                    predictor.step(rest, actions[:, 0])[0].sum().backward()
-            of_samples = specialize(model.bind(scene, parameters_key="parameters"), dtype=products)
-            torch.set_num_threads(3)
-            for count in (2, 25, 50):
-                parameters = of_samples.own_parameters().expand(count).clone()
-                parameters["child_anchor"] *= 1 + 0.1 * torch.rand(count, 1, 1, dtype=torch.float64)
-                state = torch.eye(13, dtype=torch.float64)[3].repeat(count, scene.num_nodes, 1).requires_grad_()
-                actions = torch.zeros(count, 3, scene.num_actions, dtype=torch.float64, requires_grad=True)
-                of_samples.rollout(state, actions, parameters)[0].sum().backward()
-                of_samples.step(state, actions[:, 0], parameters)[0].sum().backward()
-                assert of_samples.prepared(parameters).executor.reason is None
-            for count in (1, 5, 130):
-                trained = bound.prepared_for_training()
-                assert trained.executor.reason is None
-                start, action = state[:1].expand(count, -1, -1), actions[:1, 0].expand(count, -1)
-                trained.delta(start, action)[0].sum().backward()
-                if count > 1:
-                    bound.rollout(start, action.unsqueeze(1).expand(-1, 300, -1))[0].sum().backward()
-            torch.set_num_threads(1)
-print("fine")
-"""
-
-
-@pytest.mark.slow
-def test_sanitizers_find_nothing(tmp_path):
-    def where(name: str) -> str:
-        return subprocess.run(["g++", f"-print-file-name={name}"], capture_output=True, text=True).stdout.strip()
-
-    libraries = [where("libasan.so"), where("libubsan.so"), where("libstdc++.so.6")]
-    if not all(map(os.path.isabs, libraries)):
-        pytest.skip("there are no sanitizers")
-    flags = "-fsanitize=address,undefined -fno-sanitize-recover=undefined -O1"
-    done = run(
-        SANITIZED,
-        check=False,
-        XDG_CACHE_HOME=str(tmp_path),
-        CXX="g++",
-        TORCHRL_GN_CXXFLAGS=flags,
-        LD_PRELOAD=" ".join(map(os.path.realpath, libraries)),
-        ASAN_OPTIONS="detect_leaks=0",
-    )
-    assert done.returncode == 0 and "fine" in done.stdout, done.stderr[-4000:]

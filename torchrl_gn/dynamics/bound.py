@@ -211,7 +211,7 @@ class BoundPredictor(Predictor):
         )
 
     def prepared(self, parameters: TensorDictBase | None = None, *, size: int = 1) -> PreparedStep:
-        if size < _PAYS or not self._may_run_natively(parameters):
+        if not self._may_run_natively(parameters) or size < _PAYS:
             program = self.program(parameters)
             return PreparedStep(EagerExecutor(program), program)
         return self._prepared_natively(parameters, change=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 
 import torch
@@ -150,7 +151,7 @@ class Predictor(TensorDictModuleBase):
             hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
         """
         check_shapes(self.scene, state, action, parameters)
-        step = self.prepared(parameters, size=state.shape[:-2].numel())
+        step = self.prepared(parameters, size=math.prod(state.shape[:-2]))
         after, hidden = step.step(state, action, self._graph(hidden_state))
         return after, None if hidden is None else hidden.tensordict()
 
@@ -170,7 +171,7 @@ class Predictor(TensorDictModuleBase):
         ``prepared`` is what :meth:`prepared` made of these parameters, for many rollouts with the same weights.
         """
         check_steps(self.scene, state, actions, parameters)
-        step = self.prepared(parameters, size=actions.shape[:-1].numel()) if prepared is None else prepared
+        step = self.prepared(parameters, size=math.prod(actions.shape[:-1])) if prepared is None else prepared
         states, hidden = step.rollout(state, actions, self._graph(hidden_state))
         return states, None if hidden is None else hidden.tensordict()
 
@@ -184,7 +185,7 @@ class Predictor(TensorDictModuleBase):
             if parameters is not None and parameters.ndim:
                 parameters = parameters.unsqueeze(-1).expand(actions.shape[:-1])
             return self.step(states, actions, parameters)
-        hidden, predictions, step = None, [], self.prepared(parameters, size=actions.shape[:-1].numel())
+        hidden, predictions, step = None, [], self.prepared(parameters, size=math.prod(actions.shape[:-1]))
         for state, action in zip(states.unbind(-3), actions.unbind(-2), strict=True):
             predicted, hidden = step.step(state, action, hidden)
             predictions.append(predicted)
