@@ -24,6 +24,8 @@ struct Array {
 // What a rollout, or its adjoint, reads and writes.
 struct Call {
   int64_t batch, steps, tile, threads;
+  int64_t count;           // samples of the batch to compute; run() says which
+  const int64_t* samples;  // [count] of them; null: the first
   Array states;            // forward: start states [B, size]; adjoint: all states, sample stride below
   int64_t state_stride;    // from sample to sample, in numbers
   Array actions;           // [B, T, A]
@@ -34,7 +36,7 @@ struct Call {
   const void* sample_tables;  // every layer's [I, B, out padded to kPanel], one after the other; null: none has any
   Array grad_state;        // adjoint: [B, size]
   Array grad_actions;      // adjoint: [B, T, A]
-  void* stored;            // what the adjoint needs, as stored_count() says; null: it computes the steps again
+  void* stored;            // what the adjoint needs, of stored_count() numbers; null: it computes the steps again
   int64_t keeps_all;       // of one step also the activations, for gradients of the weights
   void* grad_weights;      // adjoint: as the packed weights, zeros to begin with; null: no gradient of the weights
   void* grad_tables;       // adjoint: as the shared tables, zeros to begin with

@@ -25,12 +25,13 @@ bool has_bfloat16() {
 #endif
 }
 
-void run(const Maths& maths, const Weights& weights, const Call& call, bool adjoint) {
-  with_network(maths.structure, weights, [&](const auto& network) { run(maths, network, call, adjoint); });
+bool run(const Structure& structure, const Weights& weights, const Call& call, bool adjoint) {
+  return with_network(structure, weights, [&](const auto& network) { return run(structure, network, call, adjoint); });
 }
 
-int64_t stored_count(const Maths& maths, const Weights& weights, const Call& call) {
-  return with_network(maths.structure, weights, [&](const auto& network) { return stored_count(network, maths, call); });
+int64_t stored_count(const Structure& structure, const Weights& weights, const Call& call) {
+  return with_network(structure, weights,
+                      [&](const auto& network) { return stored_count(network, *structure.maths(0), call); });
 }
 
 void muon(Type type, const std::vector<MuonMatrix>& matrices, const MuonOptions& options, int64_t threads) {

@@ -31,8 +31,8 @@ struct MuonOptions {
 
 // Errors are C++ exceptions: std::bad_alloc if there is no memory.
 bool has_bfloat16();
-void run(const Maths& maths, const Weights& weights, const Call& call, bool adjoint);
-int64_t stored_count(const Maths& maths, const Weights& weights, const Call& call);
+bool run(const Structure& structure, const Weights& weights, const Call& call, bool adjoint);
+int64_t stored_count(const Structure& structure, const Weights& weights, const Call& call);
 void muon(Type type, const std::vector<MuonMatrix>& matrices, const MuonOptions& options, int64_t threads);
 
 }  // namespace gn

@@ -178,8 +178,8 @@ class Muon {
 
 template <class T>
 void muon(const MuonMatrix* matrices, int64_t count, const MuonOptions& options, int64_t threads) {
-  on_threads(threads, count, [&](std::atomic<int64_t>& next) {
-    static thread_local Muon<T> worker;
+  auto reserve = [](Muon<T>&) {};  // matrices have sizes of their own
+  on_threads<Muon<T>>(threads, count, reserve, [&](Muon<T>& worker, std::atomic<int64_t>& next) {
     for (int64_t i; (i = next++) < count;) worker.update(matrices[i], options);
   });
 }

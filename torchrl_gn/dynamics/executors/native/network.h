@@ -54,7 +54,9 @@ class Network {
   // Tables that each sample has, beside the shared ones: [I, batch, width padded to kPanel] of every such layer.
   struct SampleTables {
     const void* tables;
-    int64_t batch, first;  // first: the tile's first sample
+    int64_t batch;
+    const int64_t* samples;  // of the call; null: all
+    int64_t first;           // the tile's first among them
   };
 
   // Reads nodes and edges, writes output and, if it is given, the block of S * stored() numbers.
@@ -96,15 +98,15 @@ class Network {
       });
   }
 
-  // Writes gradients of all weights, row by row, where the packed weights have them.
-  void pack_gradients(const T* plain, T* packed) const {
+  // Adds gradients of all weights, row by row, where the packed weights have them.
+  void add_packed(const T* plain, T* packed) const {
     for (int64_t i = 0; i < words_.layer_count; i++) {
       const LayerWords& layer = layers_[i];
       const T* from = plain + layer.plain;
       T* to = packed + layer.forward;
       for (int64_t c = 0; c < layer.width; c++)
         for (int64_t k = 0; k < layer.depth; k++)
-          to[(c / kPanel * layer.depth + k) * kPanel + c % kPanel] = from[c * layer.depth + k];
+          to[(c / kPanel * layer.depth + k) * kPanel + c % kPanel] += from[c * layer.depth + k];
     }
   }
 
@@ -213,15 +215,23 @@ class Network {
     int64_t width = padded(layer.width), table_width = panels(layer.width);
     const T* own = layer.sampled ? static_cast<const T*>(samples.tables) + layer.table * samples.batch : nullptr;
     const T* init[kChunk];
-    runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
+    auto begin = [&](int64_t item, int sample, int row, int now) {
       const T* base = layer.has_table ? tables_ + layer.table + item * table_width : zeros_.data();
       T* sum = sums(ws) + row * width;
       int64_t step = 0;
-      if (own) base = own + (item * samples.batch + samples.first + sample) * table_width, step = table_width;
+      if (own) {
+        const int64_t at = samples.first + sample;
+        base = own + (item * samples.batch + (samples.samples ? samples.samples[at] : at)) * table_width;
+        step = table_width;
+      }
       for (const GatherWords& g : added(layer))
         for (int64_t j = offsets(g)[item]; j < offsets(g)[item + 1]; j++, base = sum, step = width)
           add_rows(sum, width, base, step, rows_of(g, j, ws, S, sample), g.width, now, width);
       for (int r = 0; r < now; r++, base += step) init[row + r] = base;
+    };
+    runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
+      const int part = own && samples.samples ? 1 : now;  // rows of listed samples do not follow each other
+      for (int r = 0; r < now; r += part) begin(item, sample + r, row + r, part);
     });
     bool direct = width == layer.width;
     T* to = direct ? out : results(ws);

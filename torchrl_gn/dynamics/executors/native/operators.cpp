@@ -6,10 +6,8 @@
 #include <ATen/Parallel.h>
 #include <ATen/core/dispatch/Dispatcher.h>
 #include <ATen/core/grad_mode.h>
-#include <ATen/ops/arange.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>
-#include <ATen/ops/index_select.h>
 #include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
 #include <c10/core/impl/TorchDispatchModeTLS.h>
@@ -138,15 +136,15 @@ gn::Weights weights_of(const Model& model) {
 
 int64_t thread_count(int64_t threads) { return threads > 0 ? threads : at::get_num_threads(); }
 
-// A call for contiguous states and actions, and which state maths its samples need: 0, 1, or 2 for both.
+// A call for contiguous states and actions: a start state each, or all states of a rollout.
 struct Prepared {
   gn::Structure words;
+  const gn::MathsWords& maths;  // of all state maths alike
+  gn::Weights weights;
   gn::Call call{};
-  int which;
 
   Prepared(const Tensor& states, const Tensor& actions, const Model& model, bool starts_alone, bool many, int64_t threads)
-      : words(words_of(model.structure)) {
-    const gn::MathsWords& maths = *words.maths(0);
+      : words(words_of(model.structure)), maths(*words.maths(0)), weights(weights_of(model)) {
     const int64_t rows = many && !starts_alone ? actions.size(-2) + 1 : 1;
     call.batch = states.numel() / (maths.size * rows);
     call.steps = many ? actions.size(-2) : 1;
@@ -164,63 +162,12 @@ struct Prepared {
     call.numbers = model.numbers.const_data_ptr<double>();
     call.number_stride = model.numbers.size(0) > 1 ? model.numbers.size(1) : 0;
     if (words.network().sample_tables) call.sample_tables = model.sample_tables->const_data_ptr();
-    which = find_maths(gn::Maths(words, maths));
   }
-  gn::Maths maths() const { return gn::Maths(words, *words.maths(which)); }
-
-  bool fits(const gn::Maths& special, int64_t sample) const {
-    return gn::fits(special, call.states, sample * call.state_stride);
-  }
-  int find_maths(const gn::Maths& special) const {
-    const bool first = fits(special, 0);
-    for (int64_t s = 1; s < call.batch; ++s)
-      if (fits(special, s) != first) return 2;
-    TORCH_CHECK_NOT_IMPLEMENTED(first || words.maths(1), "The native step has no state maths for such states.");
-    return first ? 0 : 1;
+  int64_t stored_count() const { return gn::stored_count(words, weights, call); }
+  void run(bool adjoint) const {
+    TORCH_CHECK_NOT_IMPLEMENTED(gn::run(words, weights, call, adjoint), "The native step has no maths for such states.");
   }
 };
-
-// Runs a function for the samples of each state maths alone, and puts the results in their places.
-template <class F>
-std::vector<Tensor> apart(const Prepared& prepared, int64_t batch_dims, const std::vector<Tensor>& given,
-                          const Model& model, F function) {
-  std::vector<int64_t> places[2];
-  const gn::Maths special(prepared.words, *prepared.words.maths(0));
-  for (int64_t s = 0; s < prepared.call.batch; ++s) places[prepared.fits(special, s) ? 0 : 1].push_back(s);
-  std::vector<Tensor> results;
-  for (const auto& group : places) {
-    const Tensor at = at::empty({int64_t(group.size())}, at::kLong);
-    std::copy(group.begin(), group.end(), at.data_ptr<int64_t>());
-    std::vector<Tensor> parts;
-    for (const Tensor& each : given) parts.push_back(each.flatten(0, batch_dims - 1).index_select(0, at));
-    OptionalTensor own = model.sample_tables;
-    if (prepared.call.sample_tables) {
-      // Every layer's [I, B, width]: rows of kPanel numbers, of which a table has as many for each item and sample.
-      std::vector<Tensor> layers;
-      const gn::NetworkWords& network = prepared.words.network();
-      const auto* words = prepared.words.at<gn::LayerWords>(network.layers);
-      for (int64_t i = 0; i < network.layer_count; ++i) {
-        if (!words[i].sampled) continue;
-        const int64_t width = (words[i].width + gn::kPanel - 1) / gn::kPanel * gn::kPanel, batch = prepared.call.batch;
-        const int64_t count = words[i].items * width;
-        layers.push_back(own->narrow(0, words[i].table * batch, count * batch)
-                             .view({words[i].items, batch, width}).index_select(1, at).flatten());
-      }
-      own = at::cat(layers);
-    }
-    const Tensor numbers = model.numbers.size(0) > 1 ? model.numbers.index_select(0, at) : model.numbers;
-    const std::vector<Tensor> found = function(parts, Model{model.structure, model.weights, model.tables, own, numbers});
-    for (size_t i = 0; i < found.size(); ++i) {
-      if (results.size() <= i) {
-        auto shape = found[i].sizes().vec();
-        shape[0] = prepared.call.batch;
-        results.push_back(at::empty(shape, found[i].options()));
-      }
-      results[i].index_copy_(0, at, found[i]);
-    }
-  }
-  return results;
-}
 
 std::vector<int64_t> result_shape(const Tensor& state, const Tensor& actions, int64_t channels, bool many) {
   std::vector<int64_t> shape = state.sizes().vec();
@@ -239,18 +186,8 @@ std::tuple<Tensor, Tensor> rollout_keeping(const Tensor& state_, const Tensor& a
   const Tensor state = state_.contiguous(), actions = actions_.contiguous();
   const Model model{structure, weights, tables, sample_tables, numbers};
   Prepared prepared(state, actions, model, true, many, threads);
-  if (prepared.which == 2) {  // a gradient computes the steps again
-    auto alone = [&](const std::vector<Tensor>& parts, const Model& of) {
-      return std::vector<Tensor>{std::get<0>(rollout_keeping(parts[0], parts[1], of.structure, of.weights, of.tables,
-                                                             of.sample_tables, of.numbers, channels, many, threads,
-                                                             kNothing))};
-    };
-    const Tensor out = apart(prepared, state.dim() - 2, {state, actions}, model, alone)[0];
-    return {out.view(result_shape(state, actions, channels, many)), at::empty({0}, tables.options())};
-  }
   gn::Call& call = prepared.call;
-  const gn::Maths maths = prepared.maths();
-  TORCH_CHECK_VALUE(maths.result_size == state.size(-2) * channels, "The native step gives no ", channels, " channels.");
+  TORCH_CHECK_VALUE(prepared.maths.result_size == state.size(-2) * channels, "The native step gives no ", channels, " channels.");
   const Tensor out = many || channels != state.size(-1)
                          ? Pool::empty(result_shape(state, actions, channels, many), state.scalar_type())
                          : at::empty_like(state);
@@ -259,11 +196,11 @@ std::tuple<Tensor, Tensor> rollout_keeping(const Tensor& state_, const Tensor& a
   TORCH_CHECK_VALUE(keep != kAll || !many, "Activations are kept of one step alone.");
   if (keep == kAll) call.keeps_all = true, call.tile = std::min(gn::kTile, call.batch);  // so the sums, whatever the threads
   if (keep != kNothing) {
-    const int64_t count = gn::stored_count(maths, weights_of(model), call);
+    const int64_t count = prepared.stored_count();
     if (keep == kAll || count * tables.element_size() <= kMostStored) stored = Pool::take(count, tables.scalar_type());
   }
   if (stored.defined()) call.stored = stored.data_ptr();
-  gn::run(maths, weights_of(model), call, false);
+  prepared.run(false);
   return {out, stored.defined() ? stored : at::empty({0}, tables.options())};
 }
 
@@ -287,26 +224,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
   Prepared prepared(states, actions, model, false, many, threads);
   const int64_t rows = many ? actions.size(-2) + 1 : 1;
   TORCH_CHECK_VALUE(is_number(gradient) &&
-                        gradient.numel() == prepared.call.batch * rows * prepared.words.maths(0)->result_size,
+                        gradient.numel() == prepared.call.batch * rows * prepared.maths.result_size,
                     "The gradient does not fit the native step: ", gradient.sizes(), ".");
   const Tensor nothing = at::empty({0}, tables.options());
   std::vector<int64_t> shape = states.sizes().vec();
   if (many) shape.erase(shape.end() - 3);
-  if (prepared.which == 2) {
-    Tensor of_packed = nothing, of_tables = at::empty_like(nothing);
-    auto alone = [&](const std::vector<Tensor>& parts, const Model& of) {
-      auto [of_state, of_actions, first, second] =
-          rollout_adjoint(parts[0], parts[1], parts[2], of.structure, of.weights, of.tables, of.sample_tables, of.numbers,
-                          nothing, many, threads, of_weights);
-      of_packed = of_packed.numel() ? of_packed.add_(first) : first;
-      of_tables = of_tables.numel() ? of_tables.add_(second) : second;
-      return std::vector<Tensor>{of_state, of_actions};
-    };
-    const auto found = apart(prepared, shape.size() - 2, {gradient, states, actions}, model, alone);
-    return {found[0].view(shape), found[1].view(actions.sizes()), of_packed, of_tables};
-  }
   gn::Call& call = prepared.call;
-  const gn::Maths maths = prepared.maths();
   const Tensor of_state = Pool::empty(shape, states.scalar_type()), of_actions = at::empty_like(actions);
   const Tensor of_packed = of_weights ? at::zeros_like(weights) : nothing;
   const Tensor of_tables = of_weights ? at::zeros_like(tables) : at::empty_like(nothing);  // results share no memory
@@ -318,11 +241,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
     call.keeps_all = stored.numel() > 0;
     call.tile = std::min(gn::kTile, call.batch);
   }
-  TORCH_CHECK_VALUE(stored.numel() == 0 || (stored.numel() == gn::stored_count(maths, weights_of(model), call) &&
+  TORCH_CHECK_VALUE(stored.numel() == 0 || (stored.numel() == prepared.stored_count() &&
                                             stored.scalar_type() == tables.scalar_type() && stored.is_contiguous()),
                     "What the native step kept for its gradient is of another call.");
   if (stored.numel()) call.stored = stored.data_ptr();
-  gn::run(maths, weights_of(model), call, true);
+  prepared.run(true);
   return {of_state, of_actions, of_packed, of_tables};
 }
 
@@ -517,11 +440,15 @@ struct Rollout : torch::autograd::Function<Rollout> {
     const variable_list saved = context->get_saved_variables();
     const OptionalTensor own = saved[5].defined() ? OptionalTensor(saved[5]) : std::nullopt;
     const bool many = context->saved_data["many"].toBool();
-    auto [of_state, of_actions, of_weights, of_tables] =
-        op.call(gradients[0], saved[0], saved[1], saved[2], saved[3], saved[4], own, saved[6],
-                context->saved_data["stored"].toTensor(), many, context->saved_data["threads"].toInt(),
-                context->saved_data["of_weights"].toBool());
     const bool trained = context->saved_data["of_weights"].toBool();
+    auto [of_state, of_actions, of_weights, of_tables] = [&] {
+      try {
+        return op.call(gradients[0], saved[0], saved[1], saved[2], saved[3], saved[4], own, saved[6],
+                       context->saved_data["stored"].toTensor(), many, context->saved_data["threads"].toInt(), trained);
+      } catch (const std::bad_alloc&) {  // of which autograd would make a RuntimeError
+        TORCH_CHECK_WITH(OutOfMemoryError, false, "There is not enough memory for the gradient of a native step.");
+      }
+    }();
     return {of_state, of_actions, Tensor(), trained ? of_weights : Tensor(), trained ? of_tables : Tensor(),
             Tensor(), Tensor(), Tensor(), Tensor(), Tensor()};
   }

@@ -21,18 +21,20 @@ namespace gn __attribute__((visibility("hidden"))) {
 class Arena {
  public:
   ~Arena() { std::free(data_); }
-  // Room for all blocks, which take() then hands out.
+  // Makes room for all blocks.
   void reserve(size_t bytes) {
-    if (bytes > size_) {
-      std::free(data_);
-      size_ = 0;
-      bytes = padded(bytes) / 64 * 64;
-      data_ = static_cast<char*>(std::aligned_alloc(64, bytes));
-      if (!data_) throw std::bad_alloc();
-      size_ = bytes;
-      std::memset(data_, 0, bytes);
-    }
-    used_ = 0;
+    if (bytes <= size_) return;
+    std::free(data_);
+    size_ = 0;
+    bytes = padded(bytes) / 64 * 64;
+    data_ = static_cast<char*>(std::aligned_alloc(64, bytes));
+    if (!data_) throw std::bad_alloc();
+    size_ = bytes, fresh_ = true;
+  }
+  // By the thread that uses it, before take() hands the blocks out.
+  void begin() {
+    if (fresh_) std::memset(data_, 0, size_);
+    fresh_ = false, used_ = 0;
   }
   template <class N>
   N* take(size_t count) {
@@ -45,6 +47,7 @@ class Arena {
  private:
   char* data_ = nullptr;
   size_t size_ = 0, used_ = 0;
+  bool fresh_ = false;
 };
 
 template <class Net, int W, int C>
@@ -54,13 +57,16 @@ struct Runner {
   const Maths& m;
   const Net& network;
   const Call& call;
-  int64_t first;
-  int count;  // samples of this tile
+  int64_t first;  // of the call's samples
+  int count;      // samples of this tile
   double* r;
   T* ws;
   T* whole;  // where the only step keeps its slopes and activations; null: as kept() says
 
-  int64_t sample(int lane) const { return first + (lane < count ? lane : count - 1); }
+  int64_t sample(int lane) const {
+    const int64_t at = first + (lane < count ? lane : count - 1);
+    return call.samples ? call.samples[at] : at;
+  }
 
   // Numbers at[index] of every sample into a group of a tape's registers.
   template <class F>
@@ -105,7 +111,7 @@ struct Runner {
     run_tape<W, C>(tape, 0, r);
     to_network(tape, 0, 0, m.node_inputs, m.node_width, network.nodes(ws, count));
     to_network(tape, 0, m.node_inputs, m.edge_inputs, m.edge_width, network.edges(ws, count));
-    network.forward(ws, count, derivatives, {call.sample_tables, call.batch, first});
+    network.forward(ws, count, derivatives, {call.sample_tables, call.batch, call.samples, first});
   }
 
   void forward() const {
@@ -113,7 +119,7 @@ struct Runner {
     if (call.with_start)
       for (int lane = 0; lane < count; ++lane)
         for (int64_t i = 0; i < m.size; ++i)
-          call.out.set((first + lane) * rows * m.size + i, call.states.get((first + lane) * call.state_stride + i));
+          call.out.set(sample(lane) * rows * m.size + i, call.states.get(sample(lane) * call.state_stride + i));
     load_numbers(m.forward);
     load(m.forward, 0, m.varying_count,
          [&](int64_t s, int, int64_t i) { return call.states.get(s * call.state_stride + m.varying[i]); });
@@ -129,8 +135,8 @@ struct Runner {
       from_network(m.forward, 2, 0, m.outputs, m.output_width, output);
       run_tape<W, C>(m.forward, 1, r);
       for (int lane = 0; lane < count; ++lane) {
-        const int64_t to = ((first + lane) * rows + t + call.with_start) * m.result_size;
-        const int64_t start = (first + lane) * call.state_stride;
+        const int64_t to = (sample(lane) * rows + t + call.with_start) * m.result_size;
+        const int64_t start = sample(lane) * call.state_stride;
         if (m.is_state)
           for (int64_t i = 0; i < m.size - m.varying_count; ++i)
             call.out.set(to + m.constant[i], call.states.get(start + m.constant[i]));
@@ -192,10 +198,10 @@ struct Runner {
       for (int64_t i = 0; i < n; ++i) std::memcpy(&gradient[i * L], result(m.adjoint, 1, i), sizeof(double) * L);
       for (int64_t i = 0; i < A; ++i)
         for (int lane = 0; lane < count; ++lane)
-          call.grad_actions.set(((first + lane) * call.steps + t) * A + i, result(m.adjoint, 1, n + i)[lane]);
+          call.grad_actions.set((sample(lane) * call.steps + t) * A + i, result(m.adjoint, 1, n + i)[lane]);
     }
     for (int lane = 0; lane < count; ++lane) {
-      const int64_t s = first + lane;
+      const int64_t s = sample(lane);
       for (int64_t i = 0; i < n; ++i)
         call.grad_state.set(s * m.size + m.varying[i],
                             gradient[i * L + lane] + (call.with_start ? incoming(s, 0, m.varying[i]) : 0.0));
@@ -216,8 +222,8 @@ int64_t tile_store(const Net& network, const Call& call) {
 
 // T's that a call keeps for its adjoint.
 template <class Net>
-int64_t stored_count(const Net& network, const Maths& m, const Call& call) {
-  if (call.keeps_all) return tile_store(network, call) * ((call.batch + call.tile - 1) / call.tile);
+int64_t stored_count(const Net& network, const MathsWords& m, const Call& call) {
+  if (call.keeps_all) return tile_store(network, call) * (call.batch / call.tile + 2);  // of both groups of run()
   return (network.stored() + m.outputs) * call.batch * call.steps;
 }
 
@@ -235,8 +241,8 @@ struct WeightGradients {
     if (!parts) return;
     for (int64_t part = 1; part < parts; ++part)
       for (int64_t j = 0; j < weights + tables; ++j) numbers[j] += numbers[part * (weights + tables) + j];
-    network.pack_gradients(of_weights(0), static_cast<T*>(call.grad_weights));
-    std::copy_n(of_tables(0), tables, static_cast<T*>(call.grad_tables));
+    network.add_packed(of_weights(0), static_cast<T*>(call.grad_weights));
+    for (int64_t j = 0; j < tables; ++j) static_cast<T*>(call.grad_tables)[j] += of_tables(0)[j];
   }
 
   int64_t parts, weights, tables;
@@ -246,19 +252,21 @@ struct WeightGradients {
 template <class Net, int W, int C>
 void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoint) {
   using T = typename Net::Number;
-  const int64_t tiles = (call.batch + call.tile - 1) / call.tile;
+  const int64_t tiles = (call.count + call.tile - 1) / call.tile;
   WeightGradients<T> gradients(call, m.structure.network(), adjoint ? tiles : 0);
   // Each part's tiles are handled in order by one thread; without parts, a tile is a part.
   const int64_t parts = gradients.parts ? gradients.parts : tiles;
-  on_threads(call.threads, parts, [&](std::atomic<int64_t>& next) {
-    constexpr int L = W * C;
-    const int64_t most = std::max(m.forward.registers(), adjoint ? m.adjoint.registers() : 0) + m.varying_count;
-    const bool again = adjoint && !call.stored;
-    const size_t registers = L * most, ws = network.workspace(call.tile, adjoint);
-    const size_t derivatives = again ? network.stored() * call.tile : 0, gradient = adjoint ? L * m.varying_count : 0;
-    static thread_local Arena arena;
+  constexpr int L = W * C;
+  const int64_t most = std::max(m.forward.registers(), adjoint ? m.adjoint.registers() : 0) + m.varying_count;
+  const bool again = adjoint && !call.stored;
+  const size_t registers = L * most, ws = network.workspace(call.tile, adjoint);
+  const size_t derivatives = again ? network.stored() * call.tile : 0, gradient = adjoint ? L * m.varying_count : 0;
+  auto reserve = [&](Arena& arena) {
     arena.reserve((again ? 2 : 1) * Arena::padded(sizeof(double) * registers) + Arena::padded(sizeof(T) * ws) +
                   Arena::padded(sizeof(T) * derivatives) + Arena::padded(sizeof(double) * gradient));
+  };
+  on_threads<Arena>(call.threads, parts, reserve, [&](Arena& arena, std::atomic<int64_t>& next) {
+    arena.begin();
     double* const r = arena.take<double>(registers);
     double* const more = again ? arena.take<double>(registers) : nullptr;
     T* const scratch = arena.take<T>(ws);
@@ -266,7 +274,7 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
     double* const sums = arena.take<double>(gradient);
     for (int64_t part; (part = next++) < parts;)
       for (int64_t tile = part; tile < tiles; tile += parts) {
-        const int64_t first = tile * call.tile, count = std::min(call.tile, call.batch - first);
+        const int64_t first = tile * call.tile, count = std::min(call.tile, call.count - first);
         T* const whole =
             call.keeps_all && call.stored ? static_cast<T*>(call.stored) + tile * tile_store(network, call) : nullptr;
         Runner<Net, W, C> runner{m, network, call, first, static_cast<int>(count), r, scratch, whole};
@@ -278,12 +286,43 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
 }
 
 template <class Net>
-void run(const Maths& m, const Net& network, const Call& call, bool adjoint) {
+void run_group(const Maths& m, const Net& network, const Call& call, bool adjoint) {
   if (call.tile <= 1) run_tiles<Net, 1, 1>(m, network, call, adjoint);
   else if (call.tile <= 4) run_tiles<Net, 4, 1>(m, network, call, adjoint);
   else if (call.tile <= 8) run_tiles<Net, 8, 1>(m, network, call, adjoint);
   else if (call.tile <= 16) run_tiles<Net, 8, 2>(m, network, call, adjoint);
   else run_tiles<Net, 8, 3>(m, network, call, adjoint);
+}
+
+// Computes the samples that the usual state maths fits, then the others with the general one. False, and nothing is
+// computed, if the structure lacks that.
+template <class Net>
+bool run(const Structure& structure, const Net& network, Call call, bool adjoint) {
+  const Maths usual(structure, *structure.maths(0));
+  const int64_t batch = call.batch;
+  std::vector<int64_t> others, samples;
+  for (int64_t s = 0; s < batch; ++s)
+    if (!fits(usual, call.states, s * call.state_stride)) others.push_back(s);
+  call.count = batch - static_cast<int64_t>(others.size());
+  if (!others.empty() && !structure.maths(1)) return false;
+  if (!others.empty() && call.count) {
+    auto other = others.begin();
+    for (int64_t s = 0; s < batch; ++s)
+      if (other != others.end() && *other == s) ++other;
+      else samples.push_back(s);
+    call.samples = samples.data();
+  }
+  if (call.count) run_group(usual, network, call, adjoint);
+  if (others.empty()) return true;
+  if (call.stored) {
+    const int64_t tiles = (call.count + call.tile - 1) / call.tile;
+    const int64_t used =
+        call.keeps_all ? tile_store(network, call) * tiles : (network.stored() + usual.outputs) * call.count * call.steps;
+    call.stored = static_cast<typename Net::Number*>(call.stored) + used;
+  }
+  call.count = others.size(), call.samples = others.data();
+  run_group(Maths(structure, *structure.maths(1)), network, call, adjoint);
+  return true;
 }
 
 }  // namespace gn

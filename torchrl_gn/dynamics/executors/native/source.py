@@ -207,36 +207,13 @@ namespace {
 
 gn::Array array(const double* data) { return {const_cast<double*>(data), 1}; }
 
-gn::Array from(gn::Array array, int64_t count) {
-  if (array.data) array.data = static_cast<double*>(array.data) + count;
-  return array;
-}
-
-// Runs neighbours that need the same state maths together.
-int run(const gn::Call& whole, bool adjoint) try {
+int run(gn::Call call, bool adjoint) try {
   const gn::Structure structure{STRUCTURE};
   const gn::Network<@TYPE@> network(structure, WEIGHTS, TABLES);
-  const gn::Maths special(structure, *structure.maths(0));
-  const int64_t rows = whole.steps + whole.with_start, size = special.size;
-  for (int64_t first = 0, end = 0; first < whole.batch; first = end) {
-    const bool fits = gn::fits(special, whole.states, first * whole.state_stride);
-    for (end = first + 1; end < whole.batch; ++end)
-      if (gn::fits(special, whole.states, end * whole.state_stride) != fits) break;
-    const gn::MathsWords* words = structure.maths(fits ? 0 : 1);
-    if (!words) return 1;
-    gn::Call call = whole;
-    call.batch = end - first;
-    call.threads = std::max<int64_t>(call.threads, 1);
-    call.tile = std::min(gn::kTile, (call.batch + call.threads - 1) / call.threads);
-    call.states = from(call.states, first * call.state_stride);
-    call.actions = from(call.actions, first * call.steps * special.actions);
-    call.out = from(call.out, first * rows * size);
-    call.grad_state = from(call.grad_state, first * size);
-    call.grad_actions = from(call.grad_actions, first * call.steps * special.actions);
-    call.numbers = NUMBERS;
-    gn::run(gn::Maths(structure, *words), network, call, adjoint);
-  }
-  return 0;
+  call.threads = std::max<int64_t>(call.threads, 1);
+  call.tile = std::min(gn::kTile, (call.batch + call.threads - 1) / call.threads);
+  call.numbers = NUMBERS;
+  return !gn::run(structure, network, call, adjoint);
 } catch (const std::exception&) {
   return 1;
 }
