@@ -25,12 +25,16 @@ _ROUNDS = 7
 _LIMITS = ("ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA", "MKL_ENABLE_INSTRUCTIONS")
 
 
-_native = threading.local()
+class _Native(threading.local):
+    threads = 0
+
+
+_native = _Native()
 
 
 def native_threads() -> int:
-    """Threads of C++ code: as many as torch's, also inside of :func:`threads_for_native`."""
-    return getattr(_native, "count", None) or torch.get_num_threads()
+    """Threads of C++ code, those of torch before :func:`threads_for_native`; 0 outside of it: as many as torch's."""
+    return _native.threads
 
 
 @contextlib.contextmanager
@@ -40,14 +44,14 @@ def threads_for_native() -> Iterator[None]:
     For small operations between calls of C++ code: torch's other threads, waiting for the next one, would take the
     processor from it.
     """
-    before, count = getattr(_native, "count", None), torch.get_num_threads()
-    _native.count = native_threads()
+    before, count = native_threads(), torch.get_num_threads()
+    _native.threads = before or count
     if count > 1:
         torch.set_num_threads(1)
     try:
         yield
     finally:
-        _native.count = before
+        _native.threads = before
         if count > 1:
             torch.set_num_threads(count)
 

@@ -191,6 +191,7 @@ def test_weights_of_another_form_are_refused(made, make_model, inputs, kind):
     assert torch.equal(quick.rollout(state, actions)[0], before)
 
 
+@pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenParameterWarning")
 def test_another_scene_or_other_features_that_vary_are_refused(made, inputs):
     quick, bound = made()
     state, actions = inputs(quick, 3)

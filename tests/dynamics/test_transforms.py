@@ -14,6 +14,7 @@ from torch.func import functional_call, grad, hessian, jacfwd, jacrev, vmap
 from torchrl_gn.dynamics import ForwardModel
 
 STEPS = 2
+pytestmark = pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")  # vmap of a GRU
 
 
 def differences(function: Callable[[Tensor], Tensor], at: Tensor, size: float = 1e-5) -> Tensor:

@@ -135,6 +135,8 @@ CONTAINERS: dict[str, Callable[[str], TensorDictBase]] = {
 }
 SLOW = ("ParallelEnv", "MultiSyncCollector", "MultiAsyncCollector")  # start processes
 
+pytestmark = pytest.mark.usefixtures("quick_processes")
+
 
 def by_hand(kind: str, data: TensorDictBase, action: Tensor) -> TensorDict:
     """What each of the steps ``[*B, T]`` should have written."""

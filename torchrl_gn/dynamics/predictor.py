@@ -225,11 +225,9 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
     """
     require_real(state, "The state", whole=False)
     require_real(action, "The action")
-    batch, wanted = state.shape[:-2], [scene.num_nodes, scene.state_size]
-    if list(state.shape[-2:]) != wanted:
-        raise ValueError(
-            f"State of scene {scene.name!r} must be [*B, {', '.join(map(str, wanted))}], got {list(state.shape)}."
-        )
+    batch, nodes, size = state.shape[:-2], scene.num_nodes, scene.state_size
+    if state.shape[-2:] != (nodes, size):
+        raise ValueError(f"State of scene {scene.name!r} must be [*B, {nodes}, {size}], got {list(state.shape)}.")
     if action.shape != (*batch, scene.num_actions):
         raise ValueError(
             f"Action of scene {scene.name!r} must be {[*batch, scene.num_actions]} to go with a state"

@@ -113,10 +113,9 @@ class SpecializedPredictor(Predictor):
         parameters: TensorDictBase | None = None,
         hidden_state: TensorDictBase | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
-        after = None
-        if parameters is None and hidden_state is None:
-            after = self._native(state, action, False)
-        return super().step(state, action, parameters, hidden_state) if after is None else (after, None)
+        if parameters is None and hidden_state is None and (after := self._native(state, action, False)) is not None:
+            return after, None
+        return super().step(state, action, parameters, hidden_state)
 
     def rollout(
         self,
@@ -127,10 +126,7 @@ class SpecializedPredictor(Predictor):
         *,
         prepared: PreparedStep | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
-        states = None
-        if parameters is None and hidden_state is None:
-            states = self._native(state, actions, True)
-        if states is not None:
+        if parameters is None and hidden_state is None and (states := self._native(state, actions, True)) is not None:
             return states, None
         return super().rollout(state, actions, parameters, hidden_state, prepared=prepared)
 
@@ -139,10 +135,13 @@ class SpecializedPredictor(Predictor):
         snapshot, executor = self._modules.get("snapshot"), self.executor
         if snapshot is None or type(executor) is not NativeExecutor or executor.reason is not None:
             return None
-        (check_steps if many else check_shapes)(self.scene, state, actions)
         packed = snapshot._buffers
         numbers = packed["core_weights"], packed["core_tables"], None, packed["core_numbers"]
-        return executor.call(*numbers, state, actions, many)
+        try:
+            return executor.call(*numbers, state, actions, many)
+        except ValueError:
+            (check_steps if many else check_shapes)(self.scene, state, actions)  # which names what does not fit
+            raise
 
     def program(self, parameters: TensorDictBase | None = None) -> StepProgram:
         """The step as data, packed for its executor."""

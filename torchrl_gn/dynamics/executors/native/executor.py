@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.utils._python_dispatch import _disable_current_modes
 
 from torchrl_gn.dynamics.executors import eager
@@ -21,7 +22,6 @@ from torchrl_gn.dynamics.program import StepProgram, numbers_of
 from torchrl_gn.networks.core import ListedCore, UnfoldedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.layers import LayerList
-from torchrl_gn.networks.linear import needs_plain_operations
 from torchrl_gn.networks.packed_layers import LayerShapes, PackedLayers, pack_pairs, pack_sample_tables
 from torchrl_gn.networks.tensor_tree import in_dtype
 from torchrl_gn.processor import native_threads
@@ -58,11 +58,14 @@ class NativeExecutor:
         self.channels = program.layout.delta_size if change else program.layout.size
         try:
             self._load()
-            if program.dtype not in self._products:
+            if program.dtype == torch.bfloat16 and not load_operators().has_bfloat16():
                 raise NoCompilerError("This processor multiplies no bfloat16.")
             self.structure = self._trace(program, layers)
         except (NoCompilerError, UntraceableError) as error:
             self.reason = str(error)
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_operator": None}
 
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
@@ -70,11 +73,10 @@ class NativeExecutor:
             try:
                 self._load()
             except NoCompilerError as error:
-                self.reason, self._products = str(error), ()
+                self.reason = str(error)
 
     def _load(self) -> None:
-        """Load the operators, and ask which products they know here."""
-        self._products = (*_NUMBERS, torch.bfloat16) if load_operators().has_bfloat16() else _NUMBERS
+        self._operator = load_operators().rollout.default
 
     def pack(self, program: StepProgram) -> StepProgram:
         """The program with its core as :class:`PackedLayers`; itself if torch must run it."""
@@ -135,7 +137,7 @@ class NativeExecutor:
 
     def _run(self, program: StepProgram, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
         core = program.core
-        if not isinstance(core, PackedLayers):
+        if self.reason is not None or not isinstance(core, PackedLayers):
             return None
         return self.call(core.weights, core.tables, core.sample_tables, core.numbers, state, actions, many)
 
@@ -151,21 +153,34 @@ class NativeExecutor:
     ) -> Tensor | None:
         """Result of the operator for an action ``[*B, A]`` or ``many`` ``[*B, T, A]``; None if torch must compute it.
 
-        The first four are those of :class:`PackedLayers`.
+        The first four are those of :class:`PackedLayers`. ValueError if shapes do not fit.
         """
-        if weights.dtype not in self._products or not weights.is_cpu or not runs_natively(state, actions):
+        # The operator asks for the rest: Python that runs before a step of one state is a tenth of it.
+        if type(state) not in _TENSORS or type(actions) not in _TENSORS:
             return None
-        packed = self.structure, weights, tables, sample_tables, numbers
+        compiling = torch.compiler.is_compiling()
+        if not compiling and (
+            torch._C._are_functorch_transforms_active()
+            or forward_ad._current_level >= 0
+            or torch._C._len_torch_dispatch_stack()  # a mode that must see every operation
+            or torch._C._get_tracing_state() is not None  # of torch.jit.trace
+        ):
+            return None
         # A compiler takes no number of threads into its graph: 0 are torch's.
-        threads = 0 if torch.compiler.is_compiling() else native_threads()
-        with contextlib.suppress(NotImplementedError):  # states that no state maths could be traced for
-            return torch.ops.torchrl_gn.rollout(state, actions, *packed, self.channels, many, threads)
-        return None
+        packed = self.structure, weights, tables, sample_tables, numbers, self.channels
+        try:
+            return self._operator(state, actions, *packed, many, 0 if compiling else native_threads())
+        except NotImplementedError:  # other dtypes and devices, no sample, states without traced state maths
+            return None
 
     def _trace(self, program: StepProgram, layers: LayerList) -> Tensor:
         """The structure, compared with torch's own numbers; UntraceableError if they differ or have no scalar form."""
         reference = program.reference.detach().double().numpy()
-        with _disable_current_modes(), torch.device("cpu"), torch.no_grad():
+        with (
+            _disable_current_modes(),
+            contextlib.nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"),
+            torch.no_grad(),
+        ):
             # What a step changes is not constant: found by numbers, it need not be traced to be found.
             constant = may_be_constant(program, reference)
             batch, moved = batch_of(program.parameters), _example(program, torch.from_numpy(constant), False)
@@ -215,29 +230,6 @@ class NativeExecutor:
             if wrong.any():
                 worst = float((errors / sizes.clamp(min=1e-300))[wrong].max())
                 raise UntraceableError(f"The native step differs from torch's by {worst:.1e} of the change.")
-
-
-def runs_natively(state: Tensor, actions: Tensor) -> bool:
-    """Whether C++ can compute with such tensors, here."""
-    if torch.compiler.is_compiling():
-        observed = False
-    else:
-        observed = (
-            needs_plain_operations()
-            or torch._C._len_torch_dispatch_stack()  # a mode that must see every operation
-            or torch._C._get_tracing_state() is not None  # of torch.jit.trace
-        )
-    return (
-        not observed
-        and type(state) in _TENSORS
-        and type(actions) in _TENSORS
-        and state.dtype in _NUMBERS
-        and actions.dtype in _NUMBERS
-        and state.is_cpu
-        and actions.is_cpu
-        and state.numel() > 0
-        and 0 not in actions.shape[state.ndim - 2 : -1]
-    )
 
 
 def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:

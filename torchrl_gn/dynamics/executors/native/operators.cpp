@@ -106,7 +106,9 @@ void check_model(const gn::Structure& words, const Model& model, int64_t batch) 
   const gn::NetworkWords& network = words.network();
   const bool paired = model.weights.scalar_type() == at::kBFloat16;
   const int64_t count = paired ? 2 * network.paired_weights : network.weights;
-  TORCH_CHECK_VALUE((is_number(model.weights) || paired) && model.weights.numel() == count &&
+  TORCH_CHECK_NOT_IMPLEMENTED((is_number(model.weights) || paired) && model.weights.is_cpu(),
+                              "Native weights are of float32, float64 or bfloat16 on the processor.");
+  TORCH_CHECK_VALUE(model.weights.numel() == count &&
                         model.tables.numel() == network.tables && model.weights.is_contiguous() &&
                         model.tables.is_contiguous() && model.weights.is_cpu() && model.tables.is_cpu() &&
                         model.tables.scalar_type() == (paired ? at::kFloat : model.weights.scalar_type()),
@@ -121,7 +123,7 @@ void check_model(const gn::Structure& words, const Model& model, int64_t batch) 
   TORCH_CHECK_VALUE(numbers.scalar_type() == at::kDouble && numbers.is_contiguous() && numbers.dim() == 2 &&
                         (numbers.size(0) == 1 || numbers.size(0) == batch) && numbers.size(1) == words.maths(0)->numbers,
                     "The numbers of the native step have another shape than its structure.");
-  TORCH_CHECK(!paired || gn::has_bfloat16(), "This processor multiplies no bfloat16.");
+  TORCH_CHECK_NOT_IMPLEMENTED(!paired || gn::has_bfloat16(), "This processor multiplies no bfloat16.");
 }
 
 gn::Array array(const Tensor& tensor) {
@@ -145,13 +147,19 @@ struct Prepared {
 
   Prepared(const Tensor& states, const Tensor& actions, const Model& model, bool starts_alone, bool many, int64_t threads)
       : words(words_of(model.structure)), maths(*words.maths(0)), weights(weights_of(model)) {
-    const int64_t rows = many && !starts_alone ? actions.size(-2) + 1 : 1;
-    call.batch = states.numel() / (maths.size * rows);
-    call.steps = many ? actions.size(-2) : 1;
-    TORCH_CHECK_VALUE(states.dim() >= 2 && states.numel() == call.batch * rows * maths.size && call.batch > 0 &&
-                          call.steps > 0 && actions.numel() == call.batch * call.steps * maths.actions &&
-                          is_number(states) && is_number(actions),
+    TORCH_CHECK_NOT_IMPLEMENTED(is_number(states) && is_number(actions) && states.numel() && states.is_cpu() &&
+                                    actions.is_cpu(),
+                                "A native step is of float32 or float64 on the processor.");
+    const int64_t alone = many && !starts_alone ? 3 : 2, batch_dims = states.dim() - alone;  // dimensions of one sample
+    TORCH_CHECK_VALUE(batch_dims >= 0 && states.size(-1) == maths.channels && actions.dim() == batch_dims + 1 + many &&
+                          states.size(-2) * maths.channels == maths.size && actions.size(-1) == maths.actions &&
+                          states.sizes().slice(0, batch_dims) == actions.sizes().slice(0, batch_dims),
                       "States or actions do not fit the native step: ", states.sizes(), " and ", actions.sizes(), ".");
+    call.steps = many ? actions.size(-2) : 1;
+    TORCH_CHECK_NOT_IMPLEMENTED(call.steps, "A native rollout has a step.");
+    const int64_t rows = alone == 3 ? states.size(-3) : 1;
+    TORCH_CHECK_VALUE(rows == 1 || rows == call.steps + 1, "A gradient needs all states of a rollout.");
+    call.batch = states.numel() / (maths.size * rows);
     check_model(words, model, call.batch);
     call.threads = thread_count(threads);
     call.tile = std::min(gn::kTile, (call.batch + call.threads - 1) / call.threads);  // such that all threads have some
@@ -178,37 +186,45 @@ std::vector<int64_t> result_shape(const Tensor& state, const Tensor& actions, in
 
 enum Keep : int64_t { kNothing, kSlopes, kAll };
 
-// What a gradient needs: `keep` says whether slopes, for that in states, or the only step's activations too.
-std::tuple<Tensor, Tensor> rollout_keeping(const Tensor& state_, const Tensor& actions_, const Tensor& structure,
-                                           const Tensor& weights, const Tensor& tables,
-                                           const OptionalTensor& sample_tables, const Tensor& numbers, int64_t channels,
-                                           bool many, int64_t threads, int64_t keep) {
+// The result, and with `keep` what a gradient needs: slopes, for that in states, or the only step's activations too.
+Tensor run(const Tensor& state_, const Tensor& actions_, const Model& model, int64_t channels, bool many, int64_t threads,
+           Keep keep, Tensor* stored) {
   const Tensor state = state_.contiguous(), actions = actions_.contiguous();
-  const Model model{structure, weights, tables, sample_tables, numbers};
   Prepared prepared(state, actions, model, true, many, threads);
   gn::Call& call = prepared.call;
-  TORCH_CHECK_VALUE(prepared.maths.result_size == state.size(-2) * channels, "The native step gives no ", channels, " channels.");
+  TORCH_CHECK_VALUE(prepared.maths.result_size == state.size(-2) * channels, "The native step gives no ", channels,
+                    " channels.");
   const Tensor out = many || channels != state.size(-1)
                          ? Pool::empty(result_shape(state, actions, channels, many), state.scalar_type())
                          : at::empty_like(state);
   call.out = array(out);
-  Tensor stored;
   TORCH_CHECK_VALUE(keep != kAll || !many, "Activations are kept of one step alone.");
   if (keep == kAll) call.keeps_all = true, call.tile = std::min(gn::kTile, call.batch);  // so the sums, whatever the threads
   if (keep != kNothing) {
     const int64_t count = prepared.stored_count();
-    if (keep == kAll || count * tables.element_size() <= kMostStored) stored = Pool::take(count, tables.scalar_type());
+    if (keep == kAll || count * model.tables.element_size() <= kMostStored)
+      *stored = Pool::take(count, model.tables.scalar_type());
+    call.stored = stored->numel() ? stored->data_ptr() : nullptr;
   }
-  if (stored.defined()) call.stored = stored.data_ptr();
   prepared.run(false);
-  return {out, stored.defined() ? stored : at::empty({0}, tables.options())};
+  return out;
+}
+
+std::tuple<Tensor, Tensor> rollout_keeping(const Tensor& state, const Tensor& actions, const Tensor& structure,
+                                           const Tensor& weights, const Tensor& tables,
+                                           const OptionalTensor& sample_tables, const Tensor& numbers, int64_t channels,
+                                           bool many, int64_t threads, int64_t keep) {
+  Tensor stored = at::empty({0}, tables.options());
+  const Model model{structure, weights, tables, sample_tables, numbers};
+  const Tensor out = run(state, actions, model, channels, many, threads, Keep(keep), &stored);
+  return {out, stored};
 }
 
 Tensor rollout(const Tensor& state, const Tensor& actions, const Tensor& structure, const Tensor& weights,
                const Tensor& tables, const OptionalTensor& sample_tables, const Tensor& numbers, int64_t channels,
                bool many, int64_t threads) {
-  return std::get<0>(rollout_keeping(state, actions, structure, weights, tables, sample_tables, numbers, channels, many,
-                                     threads, kNothing));
+  const Model model{structure, weights, tables, sample_tables, numbers};
+  return run(state, actions, model, channels, many, threads, kNothing, nullptr);
 }
 
 // Gradients in state, actions, packed weights and tables; the last two empty without `of_weights`. `states` is the start
@@ -222,7 +238,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
   const Tensor gradient = gradient_.contiguous(), states = states_.contiguous(), actions = actions_.contiguous();
   const Model model{structure, weights, tables, sample_tables, numbers};
   Prepared prepared(states, actions, model, false, many, threads);
-  const int64_t rows = many ? actions.size(-2) + 1 : 1;
+  const int64_t rows = prepared.call.steps + many;
   TORCH_CHECK_VALUE(is_number(gradient) &&
                         gradient.numel() == prepared.call.batch * rows * prepared.maths.result_size,
                     "The gradient does not fit the native step: ", gradient.sizes(), ".");

@@ -58,6 +58,7 @@ struct TapeWords {
 
 struct MathsWords {
   int64_t size;            // channels of a state, N * C
+  int64_t channels;        // C
   int64_t varying_count;   // of them change
   int64_t result_size;     // numbers of a result: a state, or a change N * 12
   int64_t result_count;    // of them are computed

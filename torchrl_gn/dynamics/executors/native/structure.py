@@ -84,7 +84,14 @@ class _Words:
 
     def maths(self, maths: StateMaths, layers: LayerList) -> int:
         last = layers.layers[-1]
-        sizes = [maths.is_constant.size, len(maths.varying), maths.result_size, len(maths.results), not maths.change]
+        sizes = [
+            maths.is_constant.size,
+            maths.is_constant.shape[1],
+            len(maths.varying),
+            maths.result_size,
+            len(maths.results),
+            not maths.change,
+        ]
         sizes += [maths.actions, maths.numbers, last.count * len(last.weight)]
         sizes += [layers.nodes[0] * layers.nodes[1], layers.edges[0] * layers.edges[1]]
         sizes += [layers.nodes[1], layers.edges[1], len(last.weight)]
