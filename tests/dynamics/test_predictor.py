@@ -215,7 +215,7 @@ def test_binds_on_the_meta_device(scenes, make_model):
         assert predictor.step(state, action)[0].shape == (3, 8, 13)
 
 
-@pytest.mark.parametrize("strict", [False, True])
+@pytest.mark.parametrize("strict", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_torch_export_takes_a_bound_model(scenes, make_model, random_states, random_actions, strict):
     predictor = make_model(scenes["swimmer6"]).bind(scenes["swimmer6"]).requires_grad_(False)
     inputs = random_states(predictor.scene, 3), random_actions(predictor.scene, 3)

@@ -75,6 +75,7 @@ SWIMMERS = (
 )
 
 
+@pytest.mark.slow
 def test_one_graph_policy_learns_on_several_systems(tmp_path, call):
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     for folder, rounds in ((whole, 2), (resumed, 1), (resumed, 2)):

@@ -76,7 +76,7 @@ class NativeExecutor:
                 self.reason = str(error)
 
     def _load(self) -> None:
-        self._operator = load_operators().rollout.default
+        self._operator = load_operators().rollout.default._op  # without a frame of Python around it
 
     def pack(self, program: StepProgram) -> StepProgram:
         """The program with its core as :class:`PackedLayers`; itself if torch must run it."""
@@ -166,10 +166,11 @@ class NativeExecutor:
             or torch._C._get_tracing_state() is not None  # of torch.jit.trace
         ):
             return None
-        # A compiler takes no number of threads into its graph: 0 are torch's.
         packed = self.structure, weights, tables, sample_tables, numbers, self.channels
         try:
-            return self._operator(state, actions, *packed, many, 0 if compiling else native_threads())
+            if compiling:  # and takes no number of threads into its graph: 0 are torch's
+                return torch.ops.torchrl_gn.rollout.default(state, actions, *packed, many, 0)
+            return self._operator(state, actions, *packed, many, native_threads())
         except NotImplementedError:  # other dtypes and devices, no sample, states without traced state maths
             return None
 
