@@ -136,7 +136,7 @@ if __name__ == "__main__":
         import torchrl_gn
 
         part = Path(os.environ[PART])
-        times = measure(OmegaConf.create(json.loads(part.read_text())))
+        times = measure(DictConfig(json.loads(part.read_text())))
         part.write_text(json.dumps({"library": torchrl_gn.__file__, **times}))
     else:
         from _common import clean_exit, with_help
