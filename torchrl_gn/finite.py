@@ -15,14 +15,12 @@ def is_traced() -> bool:
 
 def require_real(value: object, what: str, *, whole: bool = True) -> None:
     """TypeError, naming ``what``, unless a value is a tensor of real numbers, which may be ``whole``: integers."""
-    if isinstance(value, Tensor) and value.is_floating_point():
-        return
     if not isinstance(value, Tensor):
         kind = f"{type(value).__module__}.{type(value).__name__}".removeprefix("builtins.")
         raise TypeError(f"{what} must be a tensor, not {kind}: give torch.as_tensor of it.")
     if value.dtype == torch.bool or value.is_complex():
         raise TypeError(f"{what} must be real numbers, not {str(value.dtype).removeprefix('torch.')}.")
-    if not whole:
+    if not (whole or value.is_floating_point()):
         kind = str(value.dtype).removeprefix("torch.")
         raise TypeError(f"{what} must be floating-point numbers, not {kind}: give its double().")
 

@@ -344,6 +344,9 @@ def test_states_and_actions_that_do_not_fit_are_refused(quick, inputs):
     rest = (states, actions, *model(predictor).values())
     with pytest.raises(ValueError, match="gradient does not fit"):
         OPS.rollout_adjoint(states[:, 1:], *rest, kept, True, 1, False)
+    for some in (states[:, :1], states[:, 1:]):
+        with wrong:
+            OPS.rollout_adjoint(states, some, *rest[1:], kept, True, 1, False)
     for other in (kept[1:], kept.double()):
         with pytest.raises(ValueError, match="is of another call"):
             OPS.rollout_adjoint(states, *rest, other, True, 1, False)

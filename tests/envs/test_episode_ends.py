@@ -148,7 +148,7 @@ def test_what_a_done_module_cannot_read_ahead_is_named(pendulum, actions):
 
 
 def test_alive_masks_as_torchrls_planners_do():
-    """Of 0.14.3 on: before, they counted rewards after the end."""
+    """Those of torchrl 0.14.0 counted rewards after the end."""
     masking = pytest.importorskip("torchrl.modules.planners.common")
     if not hasattr(masking, "_mask_post_done_reward"):
         pytest.skip("torchrl before its planners masked")

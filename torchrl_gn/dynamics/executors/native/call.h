@@ -24,8 +24,8 @@ struct Array {
 // What a rollout, or its adjoint, reads and writes.
 struct Call {
   int64_t batch, steps, tile, threads;
-  int64_t count;           // samples of the batch to compute; run() says which
-  const int64_t* samples;  // [count] of them; null: the first
+  int64_t count;           // samples to compute, which run() says
+  const int64_t* samples;  // [count] their places in the batch; null: all
   Array states;            // forward: start states [B, size]; adjoint: all states, sample stride below
   int64_t state_stride;    // from sample to sample, in numbers
   Array actions;           // [B, T, A]

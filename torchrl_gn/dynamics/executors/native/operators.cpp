@@ -110,7 +110,7 @@ void check_model(const gn::Structure& words, const Model& model, int64_t batch) 
                               "Native weights are of float32, float64 or bfloat16 on the processor.");
   TORCH_CHECK_VALUE(model.weights.numel() == count &&
                         model.tables.numel() == network.tables && model.weights.is_contiguous() &&
-                        model.tables.is_contiguous() && model.weights.is_cpu() && model.tables.is_cpu() &&
+                        model.tables.is_contiguous() && model.tables.is_cpu() &&
                         model.tables.scalar_type() == (paired ? at::kFloat : model.weights.scalar_type()),
                     "The packed weights do not fit the structure of the native step.");
   const auto& own = model.sample_tables;
@@ -150,15 +150,15 @@ struct Prepared {
     TORCH_CHECK_NOT_IMPLEMENTED(is_number(states) && is_number(actions) && states.numel() && states.is_cpu() &&
                                     actions.is_cpu(),
                                 "A native step is of float32 or float64 on the processor.");
-    const int64_t alone = many && !starts_alone ? 3 : 2, batch_dims = states.dim() - alone;  // dimensions of one sample
+    const int64_t sample_dims = many && !starts_alone ? 3 : 2, batch_dims = states.dim() - sample_dims;
     TORCH_CHECK_VALUE(batch_dims >= 0 && states.size(-1) == maths.channels && actions.dim() == batch_dims + 1 + many &&
                           states.size(-2) * maths.channels == maths.size && actions.size(-1) == maths.actions &&
                           states.sizes().slice(0, batch_dims) == actions.sizes().slice(0, batch_dims),
                       "States or actions do not fit the native step: ", states.sizes(), " and ", actions.sizes(), ".");
     call.steps = many ? actions.size(-2) : 1;
     TORCH_CHECK_NOT_IMPLEMENTED(call.steps, "A native rollout has a step.");
-    const int64_t rows = alone == 3 ? states.size(-3) : 1;
-    TORCH_CHECK_VALUE(rows == 1 || rows == call.steps + 1, "A gradient needs all states of a rollout.");
+    const int64_t rows = sample_dims == 3 ? states.size(-3) : 1;
+    TORCH_CHECK_VALUE(sample_dims == 2 || rows == call.steps + 1, "States do not fit the native step: a gradient needs all.");
     call.batch = states.numel() / (maths.size * rows);
     check_model(words, model, call.batch);
     call.threads = thread_count(threads);

@@ -220,11 +220,17 @@ int64_t tile_store(const Net& network, const Call& call) {
   return network.stored() * call.tile + network.activation_count(call.tile);
 }
 
-// T's that a call keeps for its adjoint.
+// T's that so many samples of a call keep for its adjoint.
+template <class Net>
+int64_t kept_count(const Net& network, const MathsWords& m, const Call& call, int64_t count) {
+  if (call.keeps_all) return tile_store(network, call) * ((count + call.tile - 1) / call.tile);
+  return (network.stored() + m.outputs) * count * call.steps;
+}
+
+// Those of the whole call: both groups of run() may end with a tile that is not full.
 template <class Net>
 int64_t stored_count(const Net& network, const MathsWords& m, const Call& call) {
-  if (call.keeps_all) return tile_store(network, call) * (call.batch / call.tile + 2);  // of both groups of run()
-  return (network.stored() + m.outputs) * call.batch * call.steps;
+  return kept_count(network, m, call, call.batch) + (call.keeps_all ? tile_store(network, call) : 0);
 }
 
 // Gradients of weights and tables, added up in as many parts as do not depend on the threads.
@@ -299,29 +305,18 @@ void run_group(const Maths& m, const Net& network, const Call& call, bool adjoin
 template <class Net>
 bool run(const Structure& structure, const Net& network, Call call, bool adjoint) {
   const Maths usual(structure, *structure.maths(0));
-  const int64_t batch = call.batch;
-  std::vector<int64_t> others, samples;
-  for (int64_t s = 0; s < batch; ++s)
-    if (!fits(usual, call.states, s * call.state_stride)) others.push_back(s);
-  call.count = batch - static_cast<int64_t>(others.size());
-  if (!others.empty() && !structure.maths(1)) return false;
-  if (!others.empty() && call.count) {
-    auto other = others.begin();
-    for (int64_t s = 0; s < batch; ++s)
-      if (other != others.end() && *other == s) ++other;
-      else samples.push_back(s);
-    call.samples = samples.data();
+  std::vector<int64_t> groups[2];
+  for (int64_t s = 0; s < call.batch; ++s) groups[fits(usual, call.states, s * call.state_stride) ? 0 : 1].push_back(s);
+  if (!groups[1].empty() && !structure.maths(1)) return false;
+  for (int which : {0, 1}) {
+    const std::vector<int64_t>& group = groups[which];
+    call.count = static_cast<int64_t>(group.size());
+    call.samples = call.count == call.batch ? nullptr : group.data();
+    if (group.empty()) continue;
+    run_group(which ? Maths(structure, *structure.maths(1)) : usual, network, call, adjoint);
+    if (call.stored)
+      call.stored = static_cast<typename Net::Number*>(call.stored) + kept_count(network, usual, call, call.count);
   }
-  if (call.count) run_group(usual, network, call, adjoint);
-  if (others.empty()) return true;
-  if (call.stored) {
-    const int64_t tiles = (call.count + call.tile - 1) / call.tile;
-    const int64_t used =
-        call.keeps_all ? tile_store(network, call) * tiles : (network.stored() + usual.outputs) * call.count * call.steps;
-    call.stored = static_cast<typename Net::Number*>(call.stored) + used;
-  }
-  call.count = others.size(), call.samples = others.data();
-  run_group(Maths(structure, *structure.maths(1)), network, call, adjoint);
   return true;
 }
 

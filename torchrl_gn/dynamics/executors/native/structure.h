@@ -59,7 +59,7 @@ struct TapeWords {
 struct MathsWords {
   int64_t size;            // channels of a state, N * C
   int64_t channels;        // C
-  int64_t varying_count;   // of them change
+  int64_t varying_count;   // channels of a state that change
   int64_t result_size;     // numbers of a result: a state, or a change N * 12
   int64_t result_count;    // of them are computed
   int64_t is_state;        // a result is a state: its other channels are copied, and steps follow each other
