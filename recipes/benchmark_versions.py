@@ -51,6 +51,8 @@ def start(cfg: DictConfig, checkout: Path) -> dict[str, float]:
 @hydra.main(version_base=None, config_path="config", config_name="benchmark_versions")
 @clean_exit
 def main(cfg: DictConfig) -> None:
+    if cfg.other is None:
+        raise ValueError("other=null must be the folder of a checkout of the other version.")
     if cfg.rounds < 1:
         raise ValueError(f"rounds={cfg.rounds} must be 1 or more.")
     run, tracker = open_run(cfg, "benchmark_versions")

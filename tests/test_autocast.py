@@ -1,4 +1,4 @@
-"""Within ``torch.autocast`` everything here computes as outside of it, bit for bit."""
+"""Within ``torch.autocast`` everything here computes as outside of it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchrl_gn.policies import Agent
 from torchrl_gn.rewards import make_reward
 
 
-def check(function) -> None:
+def check(function, atol: float = 0) -> None:
     """Compare tensors, or gradients of a number that is pulled back outside, as PyTorch asks."""
     results = []
     for enabled in (False, True):
@@ -27,7 +27,7 @@ def check(function) -> None:
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=enabled):
             out = function()
         results.append(out() if callable(out) else out)
-    torch.testing.assert_close(*results, rtol=0, atol=0)
+    torch.testing.assert_close(*results, rtol=0, atol=atol)
 
 
 def test_the_decorator_is_for_one_call():
@@ -141,4 +141,4 @@ def test_training(scenes, make_model):
         training.fit_policy(policy, episodes, steps=2)
         return [weight.detach() for each in (model, value, policy) for weight in each.parameters()]
 
-    check(trained)
+    check(trained, atol=1e-6)  # PyTorch's products promise no bits between two runs; autocast's rounding moves 1e-1
