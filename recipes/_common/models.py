@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchrl_gn.dynamics import (
+    Actuators,
     BodyState,
     Canonicalizer,
     Contacts,
     Controls,
     ForwardModel,
     JointAxes,
+    Joints,
     PairContacts,
     Wrenches,
 )
@@ -32,10 +34,12 @@ def build_model(
     """
     given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
-    optional = {"joint_axes": JointAxes(), "contacts": Contacts(), "contact_pairs": PairContacts()}
-    chosen = [feature for name, feature in optional.items() if shown.pop(name)]
+    optional = {"joint_axes": JointAxes(), "joints": Joints(), "actuators": Actuators(), "contacts": Contacts()}
+    optional["contact_pairs"] = PairContacts()
     first = scenes[0] if isinstance(scenes, Sequence) else scenes
-    features = (BodyState(**shown), Controls(), *chosen, *(Wrenches(),) * Wrenches.suits(first))
+    chosen = [each for name, each in optional.items() if shown.pop(name)]
+    chosen = [each for each in (*chosen, Wrenches()) if not isinstance(each, Actuators | Wrenches) or each.suits(first)]
+    features = (BodyState(**shown), Controls(), *chosen)
     return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
 
 

@@ -208,8 +208,8 @@ def test_joint_axes_turn_with_the_scene(make_model, random_states, random_action
     bound = make_model(scene).bind(scene)
     state, action = random_states(scene, 5), random_actions(scene, 5)
     features = edge_features(bound, state, action)
-    assert features.shape == (5, scene.num_edges, 7)
-    axes, pushes = features[..., 1:4], features[..., 4:]
+    assert features.shape == (5, scene.num_edges, 20)
+    axes, pushes = features[..., 1:4], features[..., 4:7]
     torch.testing.assert_close(axes.norm(dim=-1), torch.ones(5, scene.num_edges, dtype=axes.dtype))
     torch.testing.assert_close(pushes, features[..., :1] * axes)
     # With the place and yaw_frame as they are, every body turned by one rotation turns every axis.

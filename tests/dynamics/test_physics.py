@@ -86,13 +86,13 @@ def test_perfect_physics_are_corrected_by_exactly_nothing(tmp_path):
 
 
 def test_physics_of_an_arm_follow_mujoco_from_body_states():
-    for name in ("cartpole", "swimmer3", "cheetah", "tumbler", "arm"):
+    for name in ("cartpole", "swimmer3", "cheetah", "tumbler", "arm", "joints", "creature"):
         scene = zoo.load(name)
         data = collect_trajectories(scene, 3, 12, 0)
         state, action = data["state"], data["action"]
         error = BODY_STATE.delta(MujocoPhysics(scene)(state[:, :-1], action), state[:, 1:])
         assert float(error.abs().max()) < 1e-9, name
-    for name in ("joints", "creature"):
+    for name in ("parallel_hinges", "odd"):
         with pytest.raises(UnsupportedSceneError, match="do not follow from body states"):
             JointCoordinates(zoo.load(name))
 

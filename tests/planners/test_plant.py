@@ -75,7 +75,7 @@ def test_a_model_that_is_the_physics_has_its_linearization(name):
 
 
 def test_states_without_joint_coordinates_change_in_all_channels(make_model):
-    scene = zoo.load("joints")
+    scene = zoo.load("odd")
     plant = LearnedPlant(specialize(make_model(scene).double().requires_grad_(False).bind(scene)))
     physics, actions, simulator = path_of(scene, 2)
     local = plant.linearize(simulator.observe(physics).flatten(1).numpy(), actions)

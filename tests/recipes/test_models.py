@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from _common.models import build_model, model_overrides
-from torchrl_gn.dynamics import BodyState, Canonicalizer, Controls, ForwardModel, JointAxes, Wrenches
+from torchrl_gn.dynamics import BodyState, Canonicalizer, Controls, ForwardModel, JointAxes, Joints, Wrenches
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, plain_config, save_checkpoint
 
@@ -17,7 +17,7 @@ def test_the_block_says_what_the_model_is(compose):
     scene = load_scene("pendulum")
     options = ("model.features.contacts=false", "model.features.encoding=quaternion", "model.canonicalizer.yaw=false")
     model = build_model(scene, compose("forward_model", *options, "model.hidden=8", "model.parameters=none").model)
-    assert model.features == (BodyState(encoding="quaternion"), Controls(per_joint=1), JointAxes())
+    assert model.features == (BodyState(encoding="quaternion"), Controls(per_joint=1), JointAxes(), Joints())
     assert model.canonicalizer == Canonicalizer(yaw=False) and model.parameter_source == "none"
     assert model.core_options == {"hidden": 8, "activation": "silu"} and model.core_name == "gn"
     assert build_model(scene, compose("forward_model").model, core="mlp", hidden=[4]).core_options["hidden"] == [4]

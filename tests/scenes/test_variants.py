@@ -50,14 +50,18 @@ INERTIA = {f"inertia[{i}]" for i in range(3)}
 VARYING = {
     "pendulum": ({"mass", *INERTIA, "ipos[2]"}, {"actuator_acc0"}, set()),
     "cartpole": ({"mass", *INERTIA, "ipos[2]"}, {"actuator_acc0"}, set()),
-    "swimmer6": ({"mass", *INERTIA, "pos[1]"}, {"jnt_pos[1]", "actuator_acc0"}, {"parent_anchor", "child_anchor"}),
+    "swimmer6": (
+        {"mass", *INERTIA, "pos[1]"},
+        {"jnt_pos[1]", "actuator_acc0"},
+        {"parent_anchor", "child_anchor", "joint_pose", "joint"},
+    ),
     "cheetah": (
         {"mass", *INERTIA, "pos[0]", "pos[2]", "quat[0]", "quat[2]", "ipos[0]", "ipos[2]"}
         | {f"iquat[{i}]" for i in range(4)},
         {"actuator_acc0"},
-        {"parent_anchor", "contact_offset", "contact_radius"},
+        {"parent_anchor", "contact_offset", "contact_radius", "joint_pose"},
     ),
-    "jaco": ({"mass", *INERTIA}, {"actuator_gear[0]", "actuator_acc0"}, set()),
+    "jaco": ({"mass", *INERTIA}, {"actuator_gear[0]", "actuator_acc0"}, {"actuator"}),
 }
 COUNT = 12
 

@@ -14,7 +14,7 @@ import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
-FORMAT = 4
+FORMAT = 5
 SPLITS = ("train", "validation", "test")
 _KEYS = {"format", "request", "description", "features", "versions", "chunks"}
 _REMEDY = "Restore it from a copy, or delete the data set's folder and create it again."

@@ -5,12 +5,14 @@ from torchrl_gn.dynamics.bound import BoundPredictor as BoundPredictor
 from torchrl_gn.dynamics.bound import UnseenParameterWarning as UnseenParameterWarning
 from torchrl_gn.dynamics.export import export_c as export_c
 from torchrl_gn.dynamics.export import export_step as export_step
+from torchrl_gn.dynamics.features import Actuators as Actuators
 from torchrl_gn.dynamics.features import BodyState as BodyState
 from torchrl_gn.dynamics.features import Canonicalizer as Canonicalizer
 from torchrl_gn.dynamics.features import Contacts as Contacts
 from torchrl_gn.dynamics.features import Controls as Controls
 from torchrl_gn.dynamics.features import Feature as Feature
 from torchrl_gn.dynamics.features import JointAxes as JointAxes
+from torchrl_gn.dynamics.features import Joints as Joints
 from torchrl_gn.dynamics.features import PairContacts as PairContacts
 from torchrl_gn.dynamics.features import PhysicsChange as PhysicsChange
 from torchrl_gn.dynamics.features import Wrenches as Wrenches

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,126 +13,264 @@ from torch import Tensor
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.scenes.force_elements import JOINT_GROUPS, joint_constants, joint_groups, joint_poses
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
-_KINDS = mujoco.mjtJoint
+_HINGE, _SLIDE, _BALL, _FREE = (
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("HINGE", "SLIDE", "BALL", "FREE")
+)
+_LENGTHS = {_HINGE: (1, 1), _SLIDE: (1, 1), _BALL: (4, 3), _FREE: (7, 6)}  # of a joint in qpos and qvel
+_TINY = 1e-12  # keeps square roots and quotients differentiable where a ball is at rest or three hinges lock
+
+
+class JointStates(NamedTuple):
+    """Coordinates of all joints of a scene, 0 where they do not follow from body states."""
+
+    sine: Tensor  # [*B, J] of the angle of a hinge or ball from the reference pose; 0 of a slide
+    cosine: Tensor  # [*B, J]
+    coordinate: Tensor  # [*B, J] MuJoCo's of a hinge or slide, the angle of a ball; rad or m
+    rate: Tensor  # [*B, J] of the coordinate, rad/s or m/s
 
 
 class JointCoordinates(Float64Buffers):
-    """MuJoCo's ``qpos`` and ``qvel`` of body states, differentiable.
+    """Coordinates and rates of joints from body states, differentiable.
 
-    For bodies with a free joint, or with slides and then at most one hinge; a hinge's angle is the one nearest to the
-    middle of its range. Of states that the joints do not allow, it takes the nearest.
+    Of bodies whose joints :func:`~torchrl_gn.scenes.force_elements.joint_groups` knows. A hinge's angle is the one
+    nearest to the middle of its range; the middle one of three hinges is taken for within 90 degrees of its own. Of
+    states that the joints do not allow, it takes one near.
+
+    Args:
+        scene: the scene.
+        partly: leave joints of other bodies out (:attr:`known`) instead of refusing the scene.
 
     Raises:
-        UnsupportedSceneError: names the joint whose coordinate does not follow.
+        UnsupportedSceneError: names the joints whose coordinates do not follow.
     """
 
+    known: Tensor  # [J] bool
     parent: Tensor
-    position: Tensor
-    orientation: Tensor
-    anchor: Tensor
-    slide_node: Tensor
-    slide_row: Tensor
-    slide_start: Tensor
-    hinge_node: Tensor
-    hinge_axis: Tensor
-    hinge_start: Tensor
-    hinge_middle: Tensor
-    free_node: Tensor
+    pose: Tensor
+    joint: Tensor
+    start: Tensor
+    middle: Tensor
+    branch: Tensor
+    to_joints: Tensor
     to_position: Tensor
     to_velocity: Tensor
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, *, partly: bool = False) -> None:
         super().__init__()
-        model, count = scene.model, scene.num_nodes
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        anchors = np.zeros((count, 3))
-        slides, hinges, free = [], [], []
-        for node, body in enumerate(scene.body.tolist()):
-            if not node:
-                continue
-            joints = range(int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body]))
-            kinds = [int(model.jnt_type[joint]) for joint in joints]
-            if kinds == [_KINDS.mjJNT_FREE]:
-                free.append((node, joints[0]))
-                continue
-            axes = np.stack([model.jnt_axis[joint] for joint in joints], axis=1)
-            hinged = kinds[-1] == _KINDS.mjJNT_HINGE
-            slid = len(kinds) - hinged
-            if any(kind != _KINDS.mjJNT_SLIDE for kind in kinds[:slid]) or (
-                slid and np.linalg.matrix_rank(axes[:, :slid]) < slid  # NumPy 1 takes no empty matrix
-            ):
-                names = [scene.joint_names[joint] for joint in joints]
-                raise UnsupportedSceneError(
-                    f"The coordinates of joints {names} of scene {scene.name!r} do not follow from body states here: a"
-                    " body may have a free joint, or independent slides followed by at most one hinge."
-                )
-            slides += [(node, *each) for each in zip(joints, np.linalg.pinv(axes[:, :slid]), strict=False)]
-            if hinged:
-                anchors[node] = model.jnt_pos[joints[-1]]
-                hinges.append((node, joints[-1]))
-        # At the reference pose no joint has moved: bodies are where their joints start from.
-        upper = np.maximum(scene.parent, 0)
-        place, turn = (torch.from_numpy(of[scene.body].copy()) for of in (data.xpos, data.xquat))
-        back = quaternion.conjugate(turn[upper])
-        hinge_joints, slide_joints = [joint for _, joint in hinges], [joint for _, joint, _ in slides]
-        start = model.qpos0[model.jnt_qposadr[hinge_joints]] if hinges else np.zeros(0)
-        limited = model.jnt_limited[hinge_joints].astype(bool)
-        joints = [*slide_joints, *hinge_joints]
-        free_joints = [joint for _, joint in free]
-        to_position = [int(model.jnt_qposadr[joint]) for joint in joints]
-        to_velocity = [int(model.jnt_dofadr[joint]) for joint in joints]
-        to_position += [int(model.jnt_qposadr[joint]) + index for joint in free_joints for index in range(7)]
-        to_velocity += [int(model.jnt_dofadr[joint]) + index for joint in free_joints for index in range(6)]
+        model = scene.model
+        groups, others = joint_groups(model, scene.body)
+        if others and not partly:
+            names = [scene.joint_names[joint] for joint in others]
+            raise UnsupportedSceneError(
+                f"The coordinates of joints {names} of scene {scene.name!r} do not follow from body states here: a"
+                " body may have a free joint, or independent slides, then up to three hinges of which no two in a"
+                " row are parallel, or a ball."
+            )
+        order = [joint for name in JOINT_GROUPS for _, some in groups[name] for joint in some]
+        scalars = len(order) - len(groups["free"])
+        # Behind the joints found stands a 0 for all others.
+        to_joints = np.full(model.njnt, scalars)
+        to_joints[order[:scalars]] = np.arange(scalars)
+        places = [
+            [int(address[joint]) + i for joint in order for i in range(_LENGTHS[int(model.jnt_type[joint])][of])]
+            for of, address in enumerate((model.jnt_qposadr, model.jnt_dofadr))
+        ]
+        start = model.qpos0[model.jnt_qposadr] * np.isin(model.jnt_type, (_HINGE, _SLIDE))
+        middle = np.where(model.jnt_limited.astype(bool), model.jnt_range.mean(1), start)
+        for name, found in groups.items():
+            at = torch.tensor([node for node, _ in found], dtype=torch.long)
+            of = torch.tensor([some for _, some in found], dtype=torch.long).reshape(len(found), JOINT_GROUPS[name])
+            self.constants({f"{name}_node": at, f"{name}_joints": of})
         self.constants(
             {
-                "parent": upper,
-                "position": quaternion.rotate(back, place - place[upper]),
-                "orientation": quaternion.product(back, turn),
-                "anchor": anchors,
-                "slide_node": torch.tensor([node for node, *_ in slides], dtype=torch.long),
-                "slide_row": np.array([row for *_, row in slides]).reshape(-1, 3),
-                "slide_start": model.qpos0[model.jnt_qposadr[slide_joints]] if slides else np.zeros(0),
-                "hinge_node": torch.tensor([node for node, _ in hinges], dtype=torch.long),
-                "hinge_axis": model.jnt_axis[hinge_joints].reshape(-1, 3),
-                "hinge_start": start,
-                "hinge_middle": np.where(limited, model.jnt_range[hinge_joints].mean(1), start),
-                "free_node": torch.tensor([node for node, _ in free], dtype=torch.long),
-                "to_position": np.argsort(to_position),
-                "to_velocity": np.argsort(to_velocity),
+                "known": torch.from_numpy(to_joints < scalars),
+                "parent": np.maximum(scene.parent, 0),
+                "pose": joint_poses(scene),
+                "joint": joint_constants(scene)[: 2 * model.njnt : 2],
+                "start": start,
+                "middle": middle,
+                "branch": np.array([_branch(model, some, middle - start) for _, some in groups["three"]]),
+                "to_joints": to_joints,
+                "to_position": np.argsort(places[0]),
+                "to_velocity": np.argsort(places[1]),
             }
         )
+
+    def _of(self, name: str) -> tuple[Tensor, Tensor]:
+        """Nodes ``[K]`` of a group and their joints ``[K, n]``."""
+        return getattr(self, f"{name}_node"), getattr(self, f"{name}_joints")
+
+    def joints(
+        self, state: Tensor, matrices: Tensor, pose: Tensor | None = None, joint: Tensor | None = None
+    ) -> JointStates:
+        """Joints of states ``[*B, N, 13]`` with the matrices ``[*B, N, 3, 3]`` of their orientations.
+
+        ``pose`` and ``joint`` ``[*B, J, 8]`` are those of :class:`PhysicalParameters`; default: the scene's.
+        """
+        pose = (self.pose if pose is None else pose).to(state.dtype)
+        joint = (self.joint if joint is None else joint).to(state.dtype)
+        position, _, linear, angular = (state[..., where] for where in BODY_STATE.slices.values())
+        above = matrices[..., self.parent, :, :]
+        frame = above @ quaternion.to_matrix(pose[..., 3:]).unflatten(-1, (3, 3))
+        relative = frame.mT @ matrices
+        turning = angular - angular[..., self.parent, :]
+        spin = _turned(matrices.mT, turning)
+        parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+
+        at, which = self._of("slide")
+        if len(at):
+            axis, anchor = (joint[..., which[:, 0], part] for part in (slice(3), slice(3, 6)))
+            arm = _turned(matrices[..., at, :, :], anchor)
+            up = self.parent[at]
+            moved = position[..., at, :] - position[..., up, :] - _turned(above[..., at, :, :], pose[..., at, :3])
+            to_frame = frame[..., at, :, :].mT
+            place = _turned(to_frame, moved + arm) - anchor
+            # The parent's frame carries the body along, the body's own turn its anchor.
+            carried = torch.linalg.cross(angular[..., up, :], position[..., at, :] - position[..., up, :])
+            rate = linear[..., at, :] - linear[..., up, :] - carried
+            rate = _turned(to_frame, rate + torch.linalg.cross(turning[..., at, :], arm))
+            coordinate = (place * axis).sum(-1) + self.start[which[:, 0]].to(state.dtype)
+            parts.append(
+                (torch.zeros_like(coordinate), torch.zeros_like(coordinate), coordinate, (rate * axis).sum(-1))
+            )
+
+        for name, hinges in (("one", _one_hinge), ("two", _two_hinges), ("three", _three_hinges)):
+            at, which = self._of(name)
+            if len(at):
+                axes = [joint[..., each, :3] for each in which.unbind(-1)]
+                more = (self.branch,) if name == "three" else ()
+                found = hinges(relative[..., at, :, :], spin[..., at, :], *axes, *more)
+                sine, cosine, rate = (torch.stack(each, dim=-1) for each in zip(*found, strict=True))  # [*B, K, n]
+                sine, cosine, rate = (each.flatten(-2) for each in (sine, cosine, rate))
+                coordinate = self._angles(sine, cosine, which.flatten())
+                parts.append((sine, cosine, coordinate, rate))
+
+        at, which = self._of("ball")
+        if len(at):
+            twice, cosine = _twice_sine_axis(relative[..., at, :, :]), _cosine(relative[..., at, :, :])
+            sine = (0.25 * twice.square().sum(-1) + _TINY).sqrt()
+            rate = 0.5 * (twice * spin[..., at, :]).sum(-1) / sine
+            parts.append((sine, cosine, torch.atan2(sine, cosine), rate))
+
+        none = state.new_zeros((*state.shape[:-2], 1))
+        columns = zip(*parts, strict=True) if parts else ((),) * 4
+        return JointStates(*(torch.cat((*column, none), dim=-1)[..., self.to_joints] for column in columns))
+
+    def _angles(self, sine: Tensor, cosine: Tensor, which: Tensor) -> Tensor:
+        """Angles within half a turn of the middle of the joints' ranges; sine and cosine may have any length."""
+        middle = self.middle[which].to(sine.dtype)
+        offset = middle - self.start[which].to(sine.dtype)
+        turned = sine * offset.cos() - cosine * offset.sin(), cosine * offset.cos() + sine * offset.sin()
+        return torch.atan2(*turned) + middle
 
     def forward(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """``qpos`` ``[*B, nq]`` and ``qvel`` ``[*B, nv]``, float64, of states ``[*B, N, 13]``."""
         state = state.double()
         position, orientation, linear, angular = (state[..., where] for where in BODY_STATE.slices.values())
-        above = [each[..., self.parent, :] for each in (position, orientation, linear, angular)]
-        from_frame = quaternion.product(above[1], self.orientation.expand_as(orientation))
-        relative = quaternion.product(quaternion.conjugate(from_frame), orientation)
-        turning = angular - above[3]
-
-        # Slides: what is left of a body's place when the parent's frame and the hinge are accounted for.
-        to_frame = quaternion.conjugate(from_frame)
-        arm = quaternion.rotate(orientation, self.anchor.expand_as(position))
-        moved = position - above[0] - quaternion.rotate(above[1], self.position.expand_as(position))
-        place = quaternion.rotate(to_frame, moved + arm) - self.anchor
-        rate = linear - above[2] - torch.linalg.cross(above[3], position - above[0]) + torch.linalg.cross(turning, arm)
-        rate = quaternion.rotate(to_frame, rate)
-        slides = (place[..., self.slide_node, :] * self.slide_row).sum(-1) + self.slide_start
-        slide_rates = (rate[..., self.slide_node, :] * self.slide_row).sum(-1)
-
-        rotation = relative[..., self.hinge_node, :]
-        angle = 2 * torch.atan2((rotation[..., 1:] * self.hinge_axis).sum(-1), rotation[..., 0]) + self.hinge_start
-        turns = ((angle - self.hinge_middle) / (2 * math.pi)).detach().round()
-        own = quaternion.rotate(quaternion.conjugate(orientation), turning)[..., self.hinge_node, :]
-        hinge_rates = (own * self.hinge_axis).sum(-1)
-
-        free, local = self.free_node, quaternion.rotate(quaternion.conjugate(orientation), angular)
+        matrices = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
+        found, positions, velocities = self.joints(state, matrices), [], []
+        for name in ("slide", "one", "two", "three"):
+            which = self._of(name)[1].flatten()
+            positions.append(found.coordinate[..., which])
+            velocities.append(found.rate[..., which])
+        local = _turned(matrices.mT, angular)
+        ball, free = self._of("ball")[0], self._of("free")[0]
+        if len(ball):
+            up = self.parent[ball]
+            frame = quaternion.product(orientation[..., up, :], self.pose[ball, 3:].expand_as(orientation[..., up, :]))
+            turn = quaternion.product(quaternion.conjugate(frame), orientation[..., ball, :])
+            spin = _turned(matrices.mT, angular - angular[..., self.parent, :])[..., ball, :]
+            positions.append(turn.flatten(-2))
+            velocities.append(spin.flatten(-2))
         pose = torch.cat((position[..., free, :], orientation[..., free, :]), dim=-1).flatten(-2)
         twist = torch.cat((linear[..., free, :], local[..., free, :]), dim=-1).flatten(-2)
-        found = torch.cat((slides, angle - 2 * math.pi * turns, pose), dim=-1)
-        rates = torch.cat((slide_rates, hinge_rates, twist), dim=-1)
-        return found[..., self.to_position], rates[..., self.to_velocity]
+        qpos, qvel = (torch.cat(each, dim=-1) for each in ((*positions, pose), (*velocities, twist)))
+        return qpos[..., self.to_position], qvel[..., self.to_velocity]
+
+
+def _branch(model: mujoco.MjModel, joints: list[int], middle: np.ndarray) -> float:
+    """Which of its two angles the middle one of three hinges takes: the sign of the one nearer to its range."""
+    first, second, third = model.jnt_axis[joints]
+    zero = math.atan2(first @ np.cross(second, third), first @ third - (first @ second) * (second @ third))
+    return 1.0 if math.sin(middle[joints[1]] - zero) >= 0 else -1.0
+
+
+def _turned(matrices: Tensor, vectors: Tensor) -> Tensor:
+    return (matrices @ vectors.unsqueeze(-1)).squeeze(-1)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(-1)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return torch.linalg.cross(*torch.broadcast_tensors(a, b))
+
+
+def _twice_sine_axis(rotation: Tensor) -> Tensor:
+    """Twice the sine times the axis ``[..., 3]`` of rotation matrices."""
+    minus = rotation - rotation.mT
+    return torch.stack((minus[..., 2, 1], minus[..., 0, 2], minus[..., 1, 0]), dim=-1)
+
+
+def _cosine(rotation: Tensor) -> Tensor:
+    return 0.5 * (rotation[..., 0, 0] + rotation[..., 1, 1] + rotation[..., 2, 2] - 1)
+
+
+def _about(axis: Tensor, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+    """Sine and cosine, of unit length, of the angle about an axis that turns one vector into the other."""
+    sine, cosine = _dot(axis, _cross(before, after)), _dot(before, after) - _dot(axis, before) * _dot(axis, after)
+    length = (sine.square() + cosine.square() + _TINY).sqrt()
+    return sine / length, cosine / length
+
+
+def _rotated(axis: Tensor, sine: Tensor, cosine: Tensor, vector: Tensor) -> Tensor:
+    """A vector turned about an axis (Rodrigues' formula)."""
+    along = _dot(axis, vector).unsqueeze(-1) * axis
+    return along + cosine.unsqueeze(-1) * (vector - along) + sine.unsqueeze(-1) * _cross(axis, vector)
+
+
+_Hinge = tuple[Tensor, Tensor, Tensor]  # sine and cosine of its angle, and its rate
+
+
+def _one_hinge(relative: Tensor, spin: Tensor, axis: Tensor) -> tuple[_Hinge]:
+    """A hinge's angle and rate of a body's rotation ``[*B, K, 3, 3]`` and angular velocity against its parent."""
+    return ((0.5 * _dot(axis, _twice_sine_axis(relative)), _cosine(relative), _dot(axis, spin)),)
+
+
+def _two_hinges(relative: Tensor, spin: Tensor, first: Tensor, second: Tensor) -> tuple[_Hinge, _Hinge]:
+    """Those of two hinges: what the first does to the second's axis, and the inverse of the second to the first's."""
+    before = _turned(relative.mT, first.expand(relative.shape[:-1]))
+    one = _about(first, second, _turned(relative, second.expand(relative.shape[:-1])))
+    sine, cosine = _about(second, first, before)
+    between = _dot(first, second)
+    left, right = _dot(before, spin), _dot(second, spin)
+    scale = 1 / (1 - between * between)
+    return (*one, (left - between * right) * scale), (-sine, cosine, (right - between * left) * scale)
+
+
+def _three_hinges(
+    relative: Tensor, spin: Tensor, first: Tensor, second: Tensor, third: Tensor, branch: Tensor
+) -> tuple[_Hinge, _Hinge, _Hinge]:
+    """Those of three hinges (Davenport's angles): the middle one is the angle between the outer two's axes."""
+    shape = relative.shape[:-1]
+    after, before = _turned(relative, third.expand(shape)), _turned(relative.mT, first.expand(shape))
+    # first . after = k + a cos + b sin of the middle angle.
+    k = _dot(first, second) * _dot(second, third)
+    a, b = _dot(first, third) - k, _dot(first, _cross(second, third))
+    length = (a * a + b * b).sqrt()
+    a, b, apart = a / length, b / length, ((_dot(first, after) - k) / length).clamp(-1, 1)
+    rest = branch.to(relative.dtype) * (1 - apart * apart).clamp(min=_TINY).sqrt()
+    cosine, sine = a * apart - b * rest, b * apart + a * rest
+    one = _about(first, _rotated(second, sine, cosine, third.expand(shape)), after)
+    backwards = _about(third, _rotated(second, -sine, cosine, first.expand(shape)), before)
+    middle = _rotated(third, *backwards, second.expand(shape))
+    # spin = before rate_1 + middle rate_2 + third rate_3; where they lock, no rate is infinite.
+    across = _cross(middle, third)
+    volume = _dot(before, across)
+    scale = volume / (volume * volume + _TINY)
+    rates = [_dot(each, spin) * scale for each in (across, _cross(third, before), _cross(before, middle))]
+    return (*one, rates[0]), (sine, cosine, rates[1]), (-backwards[0], backwards[1], rates[2])

@@ -14,12 +14,14 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics.bound import DYNAMIC_FLOOR, BoundPredictor
 from torchrl_gn.dynamics.features import (
     FEATURES,
+    Actuators,
     BodyState,
     Canonicalizer,
     Contacts,
     Controls,
     Feature,
     JointAxes,
+    Joints,
     PhysicsChange,
     Wrenches,
     graph_edges,
@@ -73,7 +75,7 @@ class ForwardModel(nn.Module):
         parameters: ParameterSource = "scene",
         inferred: Sequence[int] = (10, 10, 10),
         layout: StateLayout = BODY_STATE,
-        features: Sequence[Feature] = (BodyState(), Controls(), JointAxes(), Contacts()),
+        features: Sequence[Feature] = (BodyState(), Controls(), JointAxes(), Joints(), Contacts()),
         canonicalizer: Canonicalizer | None = None,
         integrate: bool = True,
         project: bool = True,
@@ -141,8 +143,8 @@ class ForwardModel(nn.Module):
         layout = layout_of(first)
         if features is None:
             spatial = "orientation" in layout.names
-            features = (BodyState(), Controls(), *((JointAxes(), Contacts()) if spatial else ()))
-            features += (Wrenches(),) * (spatial and Wrenches.suits(first))
+            features = (BodyState(), Controls(), *((JointAxes(), Joints(), Contacts()) if spatial else ()))
+            features += tuple(kind() for kind in (Actuators, Wrenches) if spatial and kind.suits(first))
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)

@@ -168,6 +168,7 @@ class KinematicTree:
         n, e, static = self.num_nodes, self.num_edges, self.static
         arrays = (static.nodes, static.edges, static.globals_, np.zeros((e, 3)), np.array([1.0, 0, 0, 0]), np.zeros(3))
         arrays += (np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 3)), np.zeros((n, 0)))
+        arrays += (np.zeros((n, 7)), np.zeros((e, 8)), np.zeros((e, 0, 9)))
         return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     def description(self) -> dict:

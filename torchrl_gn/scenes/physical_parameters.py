@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchrl_gn.scenes.contact_points import contact_slots
+from torchrl_gn.scenes.force_elements import actuator_laws, joint_constants, joint_poses
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.static_features import is_member
 
@@ -34,6 +35,9 @@ class PhysicalParameters(NamedTuple):
     child_anchor: Tensor  # [*B, N, 3] anchor of each node in its own frame, metres
     contact_offset: Tensor  # [*B, N, 4, 3] contact points in the node's frame, metres
     contact_radius: Tensor  # [*B, N, 4] metres
+    joint_pose: Tensor  # [*B, N, 7] of each node in its parent's frame when no joint has moved
+    joint: Tensor  # [*B, E, 8] axis, anchor and limits of each edge's joint, see joint_constants
+    actuator: Tensor  # [*B, E, C, 9] law of the actuator in each control slot, see actuator_laws
 
     @classmethod
     def of(cls, scene: Scene | KinematicTree) -> PhysicalParameters:
@@ -45,6 +49,7 @@ class PhysicalParameters(NamedTuple):
         rest, pivot = identity if yaw_frame is None else (yaw_frame.rest, yaw_frame.pivot)
         arrays = (static.nodes, static.edges, static.globals_, joint_axes(scene)[1].repeat(2, axis=0), rest, pivot)
         arrays += (anchors.parent_anchor, anchors.child_anchor, *contact_slots(scene)[:2])
+        arrays += (joint_poses(scene), joint_constants(scene), actuator_laws(scene))
         return cls(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     @classmethod

@@ -13,6 +13,7 @@ import numpy as np
 from torchrl_gn.scenes.contact_pairs import ContactPairs, find_contact_pairs, possible_contacts
 from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.fingerprint import physics
+from torchrl_gn.scenes.force_elements import joint_groups, known_slots, limited_joints
 from torchrl_gn.scenes.topology import EdgePair, JointAnchors, named
 from torchrl_gn.scenes.yaw_frame import YawFrame
 
@@ -176,13 +177,18 @@ class Scene:
             free = (_axes(self.movable[node, :3]), _axes(self.movable[node, 3:6]))
             rows.append((name, parent, f"{mass[node]:.4g}", *free, ", ".join(welded) or "-"))
         lines += _table(rows)
-        rows = [("joint", "type", "between", "action", "bounds")]
-        for pair, slots in zip(self.pairs, self.edge_action[::2].tolist(), strict=True):
+        rows = [("joint", "type", "between", "limits", "action", "bounds")]
+        limited = limited_joints(self.model)
+        for index, (pair, slots) in enumerate(zip(self.pairs, self.edge_action[::2].tolist(), strict=True)):
+            limits = "-"
+            if index < len(limited) and limited[index]:
+                low, high = self.model.jnt_range[index]
+                limits = f"[{low:.4g}, {high:.4g}]"
             actions = [action for action in slots if action >= 0]
             motors = ", ".join(f"{action}: {self.actuator_names[action]}" for action in actions)
             bounds = ", ".join(f"[{self.action_low[a]:.4g}, {self.action_high[a]:.4g}]" for a in actions)
             between = f"{self.node_names[pair.first]} - {self.node_names[pair.second]}"
-            rows.append((pair.name, pair.kind, between, motors or "-", bounds or "-"))
+            rows.append((pair.name, pair.kind, between, limits, motors or "-", bounds or "-"))
         return "\n".join([*lines, *_table(rows), *self._notes(), *self._contacts()])
 
     def _notes(self) -> list[str]:
@@ -194,9 +200,13 @@ class Scene:
         shown = {pair.name for pair in self.pairs if pair.element == "constraint"}
         equalities = [named(model, kind.mjOBJ_EQUALITY, one) for one in np.flatnonzero(model.eq_active0).tolist()]
         mocap = [named(model, kind.mjOBJ_BODY, body) for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
+        hidden = [self.joint_names[joint] for joint in joint_groups(model, self.body)[1]]
+        forces = np.setdiff1d(self.edge_action[self.edge_action >= 0], self.edge_action[::2][known_slots(self)])
         notes = {
             "no bounds": self.unbounded,
             "actuators that move nothing": idle,
+            "joints without features, as their bodies do not show them": hidden,
+            "actuators without features of their forces": [self.actuator_names[action] for action in forces],
             "passive tendons, without edges": tendons,
             "constraints without edges": [name for name in equalities if name not in shown],
             "mocap bodies, fixed at the pose of the model": mocap,

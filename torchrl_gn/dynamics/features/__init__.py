@@ -4,6 +4,7 @@ A feature of your own subclasses :class:`~torchrl_gn.dynamics.features.feature.F
 before a checkpoint names it.
 """
 
+from torchrl_gn.dynamics.features.actuators import Actuators as Actuators
 from torchrl_gn.dynamics.features.body_state import BodyState as BodyState
 from torchrl_gn.dynamics.features.canonical_state import Canonicalizer as Canonicalizer
 from torchrl_gn.dynamics.features.canonical_state import CanonicalState as CanonicalState
@@ -13,16 +14,19 @@ from torchrl_gn.dynamics.features.feature import Feature as Feature
 from torchrl_gn.dynamics.features.feature import StepInputs as StepInputs
 from torchrl_gn.dynamics.features.feature import graph_edges as graph_edges
 from torchrl_gn.dynamics.features.joint_axes import JointAxes as JointAxes
+from torchrl_gn.dynamics.features.joints import Joints as Joints
 from torchrl_gn.dynamics.features.pair_contacts import PairContacts as PairContacts
 from torchrl_gn.dynamics.features.physics_change import PhysicsChange as PhysicsChange
 from torchrl_gn.dynamics.features.wrenches import Wrenches as Wrenches
 
 FEATURES: dict[str, type[Feature]] = {
+    "actuators": Actuators,
     "body_state": BodyState,
     "contact_pairs": PairContacts,
     "contacts": Contacts,
     "controls": Controls,
     "joint_axes": JointAxes,
+    "joints": Joints,
     "physics_change": PhysicsChange,
     "wrenches": Wrenches,
 }

@@ -15,7 +15,7 @@ from torchrl_gn.dynamics.executors.native.trace import Array
 from torchrl_gn.dynamics.program import StepProgram, parameter_inputs
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
-_DIMS = (2, 2, 1, 2, 1, 1, 2, 2, 3, 2)  # of each physical parameter without batch
+_DIMS = (2, 2, 1, 2, 1, 1, 2, 2, 3, 2, 2, 2, 3)  # of each physical parameter without batch
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,254 @@
+"""Features of joints and actuators against MuJoCo."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from torchrl_gn.data import collect_trajectories
+from torchrl_gn.dynamics import Actuators, Canonicalizer, ForwardModel, Joints, specialize
+from torchrl_gn.dynamics.features import StepInputs
+from torchrl_gn.dynamics.features.controls import ControlInputs
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.evaluation import evaluate_errors
+from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.scenes import PhysicalParameters, Scene
+from torchrl_gn.scenes.force_elements import known_slots
+from torchrl_gn.training import fit
+
+from .. import zoo
+from ..sizes import SMALL
+
+_KINDS = mujoco.mjtJoint
+SCENES = ("cheetah", "jaco", "joints", "creature", "two_hinges", "machine", "limited_joints", "tendon_arm", "servos")
+
+
+def poses(scene: Scene, count: int, *, beyond: float = 0.0, speed: float = 1.0):
+    """MuJoCo's data and body states ``[N, 13]`` at random coordinates, ``beyond`` the limits by this share of them."""
+    model, rng = scene.model, np.random.default_rng(0)
+    data = mujoco.MjData(model)
+    for _ in range(count):
+        mujoco.mj_resetData(model, data)
+        data.qvel[:] = speed * rng.normal(size=model.nv)
+        for joint in range(model.njnt):
+            at, kind, (low, high) = model.jnt_qposadr[joint], _KINDS(model.jnt_type[joint]), model.jnt_range[joint]
+            turn = rng.normal(size=4)
+            turn /= np.linalg.norm(turn)
+            if kind == _KINDS.mjJNT_FREE:
+                data.qpos[at : at + 7] = *rng.normal(size=3), *turn
+            elif kind == _KINDS.mjJNT_BALL:
+                data.qpos[at : at + 4] = turn
+            elif model.jnt_limited[joint]:
+                middle, half = (low + high) / 2, (1 + beyond) * min((high - low) / 2, 1.4)
+                data.qpos[at] = rng.uniform(middle - half, middle + half)
+            else:
+                data.qpos[at] = model.qpos0[at] + rng.uniform(-1.4, 1.4)
+        data.ctrl[:] = rng.uniform(scene.action_low.clip(-5), scene.action_high.clip(max=5))
+        mujoco.mj_forward(model, data)
+        state = data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy()
+        yield data, torch.from_numpy(state)
+
+
+def inputs_of(scene: Scene, state, control) -> StepInputs:
+    parameters = PhysicalParameters.of(scene)
+    canonical = Canonicalizer(recenter=False, yaw=False).bind(scene, BODY_STATE)(state, parameters)
+    return StepInputs(canonical, ControlInputs(scene)(torch.as_tensor(control)), parameters)
+
+
+def bind(feature, scene: Scene):
+    return feature.resolved(scene).bind(scene, BODY_STATE, Canonicalizer().bind(scene, BODY_STATE))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_coordinates_and_rates_are_mujocos(name):
+    scene = zoo.load(name)
+    coordinates = JointCoordinates(scene)
+    for data, state in poses(scene, 10):
+        position, velocity = (each.numpy() for each in coordinates(state))
+        for joint in range(scene.model.njnt):  # a quaternion has either sign
+            at = scene.model.jnt_qposadr[joint] + 3 * (scene.model.jnt_type[joint] == int(_KINDS.mjJNT_FREE))
+            if scene.model.jnt_type[joint] in (int(_KINDS.mjJNT_FREE), int(_KINDS.mjJNT_BALL)):
+                position[at : at + 4] *= np.sign(position[at : at + 4] @ data.qpos[at : at + 4])
+        np.testing.assert_allclose(position, data.qpos, atol=1e-9)
+        np.testing.assert_allclose(velocity, data.qvel, atol=1e-8)
+
+
+def test_joints_that_do_not_follow_from_their_body_have_no_features():
+    scene = zoo.load("parallel_hinges")
+    coordinates = JointCoordinates(scene, partly=True)
+    assert coordinates.known.tolist() == [True, False, False]
+    state = next(poses(scene, 1))[1]
+    features = bind(Joints(), scene)(inputs_of(scene, state, np.zeros(scene.num_actions)))
+    assert not features[2:].any() and features[:2].any()
+
+
+@pytest.mark.parametrize("name", [*SCENES, "walker2d"])
+def test_limits_set_in_where_mujocos_do(name):
+    scene = zoo.load(name)
+    feature, model, found = bind(Joints(), scene), scene.model, 0
+    inert = torch.from_numpy(model.jnt_limited.astype(bool)) & ~torch.as_tensor(feature.limited).bool()
+    for data, state in poses(scene, 20, beyond=0.3):
+        features = feature(inputs_of(scene, state, data.ctrl)).unflatten(0, (-1, 2))
+        torch.testing.assert_close(features[:, 0], features[:, 1])
+        within = (features[:, 0, 4:6] >= 0).all(-1) | inert
+        active = data.efc_id[data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)]
+        expected = torch.ones(model.njnt, dtype=torch.bool)
+        expected[active.astype(int)] = False
+        assert torch.equal(within, expected | inert)
+        found += len(active)
+    assert found or not model.jnt_limited.any()
+    assert int(inert.sum()) == (1 if name == "servos" else 0)  # more than a turn, which its body does not show
+
+
+def test_the_step_on_and_the_friction():
+    scene = zoo.load("servos")
+    feature = bind(Joints(), scene)
+    near, compared = torch.tensor([0.1, 0.1, 0.1, 0.1, 0.02], dtype=torch.float64), 0
+    for _, state in poses(scene, 30, speed=0.01):
+        features = feature(inputs_of(scene, state, np.zeros(6)))[::2]
+        moved = scene.timestep * features[:, 3] / near
+        for now, sign in ((4, 1), (5, -1)):
+            free = (features[:, [now, now + 2]].abs() < 0.99).all(-1) & (features[:, now] != 0)
+            torch.testing.assert_close((features[:, now + 2] - features[:, now])[free], sign * moved[free])
+            compared += int(free.sum())
+    assert compared > 10
+    assert features[:, 8].nonzero().flatten().tolist() == [3]
+    torch.testing.assert_close(features[3, 8], (features[3, 3] / 0.05).clamp(-1, 1))
+
+
+@pytest.mark.parametrize("name", ["servos", "jaco", "gripper", "arm"])
+def test_forces_are_mujocos(name):
+    """The sum over an edge's actuators is ``qfrc_actuator``."""
+    scene = zoo.load(name)
+    feature = bind(Actuators(), scene)
+    slots = scene.edge_action.shape[1]
+    for data, state in poses(scene, 20):
+        if name == "servos":  # whose joint's whole turns do not show: its target must be near
+            data.ctrl[0] = data.qpos[0] + np.clip(data.ctrl[0], -0.1, 0.1)
+            mujoco.mj_forward(scene.model, data)
+        features = feature(inputs_of(scene, state, data.ctrl)).unflatten(-1, (slots, 4))
+        force = features[: 2 * scene.model.njnt : 2, :, 0].sum(-1).numpy()
+        np.testing.assert_allclose(force, data.qfrc_actuator[scene.model.jnt_dofadr], atol=1e-8)
+
+
+def test_forces_of_spatial_tendons_are_left_out():
+    scene = zoo.load("tendon_arm")
+    turn = scene.actuator_names.index("turn")
+    assert np.argwhere(known_slots(scene)).tolist() == np.argwhere(scene.edge_action[::2] == turn).tolist()
+
+
+def test_a_servos_error_and_its_force_a_step_on():
+    scene = zoo.load("servos")
+    feature, finger = bind(Actuators(), scene), scene.actuator_names.index("finger")
+    data, state = next(poses(scene, 1, speed=0.1))
+    slot = scene.edge_action[8].tolist().index(finger)
+    for offset in (0.001, -0.003, 0.02):
+        position, rate = data.qpos[4], data.qvel[4]
+        control = data.ctrl.copy()
+        control[finger] = np.clip(position + 10 / 400 * rate + offset, 0, 0.04)
+        error = control[finger] - position - 10 / 400 * rate
+        found = feature(inputs_of(scene, state, control))[8].unflatten(-1, (-1, 4))[slot]
+        expected = [400 * error, 400 * (error - scene.timestep * rate)]
+        expected += [np.clip(error / near, -1, 1) for near in (0.05, 0.005)]
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_servo_whose_joint_winds_is_near_its_target():
+    scene = zoo.load("servos")
+    feature, model = bind(Actuators(), scene), scene.model
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    data.qpos[0], data.ctrl[0] = 7.0, 7.02
+    mujoco.mj_forward(model, data)
+    state = torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy())
+    found = feature(inputs_of(scene, state, data.ctrl))[0, :4]
+    np.testing.assert_allclose(found, [1.0, 1.0, 0.4, 1.0], atol=1e-9)
+    assert data.qfrc_actuator[0] == pytest.approx(1.0)
+
+
+def test_scenes_that_actuators_suit():
+    suits = {"servos": True, "jaco": True, "swimmer6": False, "cheetah": False, "falling": False}
+    for name, expected in suits.items():
+        scene = zoo.load(name)
+        assert Actuators.suits(scene) == expected, name
+        kinds = [type(each) for each in ForwardModel.for_scene(scene, **SMALL).features]
+        assert (Actuators in kinds) == expected and Joints in kinds
+
+
+@pytest.mark.parametrize("name", ["servos", "joints", "creature", "limited_joints"])
+def test_gradients_are_finite_at_rest_and_right_elsewhere(name):
+    scene = zoo.load(name)
+    kinds = [bind(Joints(), scene), bind(Actuators(), scene)]
+    weights = torch.linspace(-1, 1, 400, dtype=torch.float64)
+
+    def total(state, control):
+        given = inputs_of(scene, state, control)
+        return sum((each * weights[: each.shape[-1]]).sum() for each in (kind(given) for kind in kinds))
+
+    data = mujoco.MjData(scene.model)
+    mujoco.mj_forward(scene.model, data)
+    rest = torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy()).requires_grad_()
+    control = torch.zeros(scene.num_actions, dtype=torch.float64, requires_grad=True)
+    for gradient in torch.autograd.grad(total(rest, control), (rest, control), allow_unused=True):
+        assert gradient is None or gradient.isfinite().all()
+    for _, state in poses(scene, 3):
+        change = torch.randn(scene.num_nodes, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+        def along(step, state=state, change=change):
+            return total(BODY_STATE.apply(state, step * change), control.detach())
+
+        zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(along, zero, atol=1e-4, rtol=1e-4)
+
+
+def test_variants_bring_their_own_joints_and_laws(random_states, random_actions):
+    """Samples that bring a variant's numbers get the features of that variant's scene."""
+    from torchrl_gn.scenes.variants import sample_variants
+
+    for name in ("cheetah", "jaco", "swimmer6"):
+        scene = zoo.load(name)
+        for variant in sample_variants(name, 2, 0):
+            own, there = PhysicalParameters.of(scene), PhysicalParameters.of(variant)
+            assert not torch.equal(own.joint_pose, there.joint_pose) or not torch.equal(own.actuator, there.actuator)
+            state, action = random_states(scene, 4), random_actions(scene, 4)
+            for feature in (Joints(), Actuators()):
+                here, expected = bind(feature, scene), bind(feature, variant)
+                given = inputs_of(variant, state, action)
+                torch.testing.assert_close(here(given), expected(given), rtol=0, atol=1e-12)
+
+
+def test_batches_of_any_shape_and_the_native_step(fit, random_states, random_actions):
+    scene = zoo.load("servos")
+    torch.manual_seed(0)
+    model = fit(ForwardModel.for_scene(scene, **SMALL), scene)
+    assert {Joints, Actuators} <= {type(each) for each in model.features}
+    state, action = random_states(scene, 2, 3), random_actions(scene, 2, 3)
+    predictor = specialize(model.bind(scene), executor="native")
+    expected = model.bind(scene, reference=True).step(state, action)[0]
+    torch.testing.assert_close(predictor.step(state, action)[0], expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_stiff_servo_arm_is_learned_from_slow_targets():
+    """The case of the SO-101 arm: without its servos' forces the error stays above 1, that of standing still."""
+    scene = zoo.load("servo_arm")
+    torch.manual_seed(0)
+    model = ForwardModel.for_scene(scene, hidden=64).bind(scene)
+    fit(model, collect_trajectories(scene, 500, seed=0), steps=700, progress=False)
+    errors = evaluate_errors(model, collect_trajectories(scene, 30, seed=1), horizons=(100,))
+    assert errors["rollout_error_100"].total < 0.1
+
+
+def test_orientations_of_either_sign_give_the_same(random_states):
+    scene = zoo.load("servos")
+    state = random_states(scene, 3)
+    at = BODY_STATE.slices["orientation"]
+    turned = torch.cat((state[..., : at.start], -state[..., at], state[..., at.stop :]), dim=-1)
+    assert quaternion.angle(turned[..., at], state[..., at]).max() < 1e-12
+    for feature in (bind(Joints(), scene), bind(Actuators(), scene)):
+        torch.testing.assert_close(
+            feature(inputs_of(scene, turned, torch.zeros(3, 6))), feature(inputs_of(scene, state, torch.zeros(3, 6)))
+        )

@@ -1,0 +1,93 @@
+"""Coordinates, rates and limits of joints as features of their edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.scenes.force_elements import limited_joints, winding_joints
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
+    from torchrl_gn.scenes import Scene
+
+NEAR_ANGLE, NEAR_PLACE = 0.1, 0.02  # rad and metres: up to this distance from a limit its features vary
+_SLOW = 0.05  # rad/s or m/s: up to this rate the sign of friction varies
+_SIZE = 9
+
+
+@dataclass(frozen=True)
+class Joints(Feature):
+    """Each joint's coordinate and rate, and its distances from both limits.
+
+    Limits, springs and friction act on coordinates, which the network need not compute from two rotation matrices.
+    Paper: it sees bodies alone.
+    """
+
+    part: ClassVar[Literal["nodes", "edges"]] = "edges"
+
+    def size(self, layout: StateLayout) -> int:
+        return _SIZE
+
+    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        if layout != BODY_STATE:
+            raise ValueError(f"Joints needs states of bodies; scene {scene.name!r} has others: leave the feature out.")
+        return _Bound(scene)
+
+
+class _Bound(Float64Buffers):
+    shown: Tensor
+    near: Tensor
+    limited: Tensor
+    rubs: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        model = scene.model
+        self.timestep, self.edges = float(scene.timestep), 2 * model.njnt
+        self.coordinates = JointCoordinates(scene, partly=True)
+        kinds, turns = model.jnt_type, (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
+        limited = limited_joints(model) & ~winding_joints(scene) & self.coordinates.known.numpy()
+        springs = model.jnt_stiffness.reshape(model.njnt, -1)[:, 0] != 0
+        self.constants(
+            {
+                "near": np.where(np.isin(kinds, turns), NEAR_ANGLE, NEAR_PLACE),
+                # Where a coordinate tells nothing, it would only break an invariance.
+                "shown": (limited | springs).astype(float),
+                "limited": limited.astype(float),
+                "rubs": (model.dof_frictionloss[model.jnt_dofadr] > 0).astype(float),
+            }
+        )
+
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """Features ``[*B, 2 J, 9]`` of the joints' edges; 0 where coordinates do not follow from body states.
+
+        Sine and cosine of a hinge's angle; the coordinate of a joint with limits or a spring (rad or m); its rate; the
+        distances from the lower and the upper limit, now and a step on, clipped to 0.1 rad or 2 cm and scaled to 1; and
+        the rate of a joint with dry friction, clipped to 0.05 a second and scaled to 1.
+        """
+        state, matrices = inputs.canonical[:2]
+        assert matrices is not None
+        if not self.edges:
+            return state.new_zeros((*state.shape[:-2], 0, _SIZE))
+        joint = inputs.parameters.joint[..., : self.edges : 2, :].to(state.dtype)
+        found = self.coordinates.joints(state, matrices, inputs.parameters.joint_pose, joint)
+        shown, limited, near, rubs = (each.to(state.dtype) for each in (self.shown, self.limited, self.near, self.rubs))
+        soon = found.coordinate + self.timestep * found.rate
+        low, high = joint[..., 6], joint[..., 7]
+        margins = [each for at in (found.coordinate, soon) for each in (at - low, high - at)]
+        features = (
+            *(found.sine, found.cosine, shown * found.coordinate, found.rate),
+            *(limited * (margin / near).clamp(-1, 1) for margin in margins),
+            rubs * (found.rate / _SLOW).clamp(-1, 1),
+        )
+        return torch.stack(features, dim=-1).repeat_interleave(2, dim=-2)

@@ -1,0 +1,153 @@
+"""Numbers of the elements that make forces at joints: where joints are limited, what actuators exert."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.scene import Scene
+
+_JOINT, _GAIN, _BIAS, _TRANSMISSION = mujoco.mjtJoint, mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtTrn
+FAR = 1e10
+"""Limit of joints and forces that have none."""
+JOINT_GROUPS = {"slide": 1, "one": 1, "two": 2, "three": 3, "ball": 1, "free": 1}
+"""Slides, hinges of bodies that have one, two or three, balls and free joints: how many joints go together."""
+_HINGES = ("one", "two", "three")
+_PARALLEL = 1e-3  # sine of the angle between consecutive hinges of a body below which they are one
+
+
+def joint_groups(model: mujoco.MjModel, bodies: np.ndarray) -> tuple[dict[str, list[tuple[int, list[int]]]], list[int]]:
+    """Joints whose coordinates follow from the poses of nodes with root ``bodies`` ``[N]``, and all others.
+
+    By group, nodes and their joints: a free joint, or independent slides, then up to three hinges of which no two in a
+    row are parallel, or a ball.
+    """
+    groups: dict[str, list[tuple[int, list[int]]]] = {name: [] for name in JOINT_GROUPS}
+    others = []
+    for node, body in enumerate(bodies.tolist()[1:], start=1):
+        first = int(model.body_jntadr[body])
+        joints = list(range(first, first + int(model.body_jntnum[body])))
+        found = _parts(model, joints)
+        for name, some in found or ():
+            groups[name].append((node, some))
+        others += joints if found is None else []
+    return groups, others
+
+
+def _parts(model: mujoco.MjModel, joints: list[int]) -> list[tuple[str, list[int]]] | None:
+    """Groups of a body's joints; None if their coordinates do not follow from the body's pose."""
+    kinds, axes = [_JOINT(model.jnt_type[joint]) for joint in joints], model.jnt_axis[joints]
+    if kinds == [_JOINT.mjJNT_FREE]:
+        return [("free", joints)]
+    slid = next((index for index, kind in enumerate(kinds) if kind != _JOINT.mjJNT_SLIDE), len(kinds))
+    rest = joints[slid:]
+    if slid and (np.linalg.matrix_rank(axes[:slid]) < slid or (rest and np.ptp(model.jnt_pos[rest], axis=0).any())):
+        return None
+    slides = [("slide", [joint]) for joint in joints[:slid]]
+    if not rest:
+        return slides
+    if kinds[slid:] == [_JOINT.mjJNT_BALL]:
+        return [*slides, ("ball", rest)]
+    across = np.linalg.norm(np.cross(axes[slid:-1], axes[slid + 1 :]), axis=-1)
+    if len(rest) > 3 or set(kinds[slid:]) != {_JOINT.mjJNT_HINGE} or (across < _PARALLEL).any():
+        return None
+    return [*slides, (_HINGES[len(rest) - 1], rest)]
+
+
+def joint_poses(scene: Scene) -> np.ndarray:
+    """Pose ``[N, 7]`` of each node in its parent's frame, position and quaternion, when no joint has moved."""
+    columns = [*(f"pos[{index}]" for index in range(3)), *(f"quat[{index}]" for index in range(4))]
+    return scene.static.nodes[:, [scene.static.node_names.index(name) for name in columns]]
+
+
+def joint_constants(scene: Scene) -> np.ndarray:
+    """``[E, 8]`` of each edge's joint: axis ``[3]`` and anchor ``[3]`` in the child's frame, and both limits.
+
+    Of slides that precede one another the axis is the vector whose product with the place gives the coordinate. Limits,
+    in rad or m, are where the constraint's force sets in, beyond ``jnt_margin``; of a ball 0 and its largest angle.
+    """
+    model = scene.model
+    found = np.zeros((len(scene.pairs), 8))
+    found[:, 6:] = -FAR, FAR
+    for joint in range(model.njnt):
+        body = int(model.jnt_bodyid[joint])
+        found[joint, :3], found[joint, 3:6] = model.jnt_axis[joint], model.jnt_pos[joint]
+        if model.jnt_type[joint] == _JOINT.mjJNT_SLIDE:
+            first = int(model.body_jntadr[body])
+            alike = [each for each in range(first, first + int(model.body_jntnum[body])) if _slides(model, each)]
+            found[joint, :3] = np.linalg.pinv(model.jnt_axis[alike].T)[alike.index(joint)]
+        if limited_joints(model)[joint]:
+            low, high = model.jnt_range[joint]
+            margin = float(model.jnt_margin[joint])
+            ball = model.jnt_type[joint] == _JOINT.mjJNT_BALL
+            found[joint, 6:] = (-FAR, high - margin) if ball else (low + margin, high - margin)
+    return np.repeat(found, 2, axis=0)
+
+
+def _slides(model: mujoco.MjModel, joint: int) -> bool:
+    return bool(model.jnt_type[joint] == _JOINT.mjJNT_SLIDE)
+
+
+def limited_joints(model: mujoco.MjModel) -> np.ndarray:
+    """``[J]`` bool, joints that have limits that are in force."""
+    off = mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    in_force = not model.opt.disableflags & off
+    return model.jnt_limited.astype(bool) & in_force
+
+
+def winding_joints(scene: Scene) -> np.ndarray:
+    """``[J]`` bool, hinges that may make a whole turn, which the state of their body does not show."""
+    model = scene.model
+    wide = np.ptp(model.jnt_range, axis=1) > 2 * np.pi + 1e-9
+    return (model.jnt_type == int(_JOINT.mjJNT_HINGE)) & (~limited_joints(model) | wide)
+
+
+def actuator_laws(scene: Scene) -> np.ndarray:
+    """``[E, C, 9]`` of the actuator in each control slot of an edge; 0 where its force is not known here.
+
+    Its gain and its bias are each a constant, a slope in the actuator's length and one in its velocity; then the
+    force's two limits, and its gear at the edge: what a unit of force exerts there, and how much longer the actuator
+    gets with the joint's coordinate.
+    """
+    model, action = scene.model, scene.edge_action[::2]
+    laws = np.zeros((*action.shape, 9))
+    for pair, slot in np.argwhere(known_slots(scene)).tolist():
+        actuator = int(action[pair, slot])
+        gear = scene.static.edge_names.index("actuator_gear[0]" + f"/{slot}" * (slot > 0))
+        gain, bias = model.actuator_gainprm[actuator, :3].copy(), model.actuator_biasprm[actuator, :3].copy()
+        if model.actuator_gaintype[actuator] == _GAIN.mjGAIN_FIXED:
+            gain[1:] = 0
+        if model.actuator_biastype[actuator] == _BIAS.mjBIAS_NONE:
+            bias[:] = 0
+        limits = model.actuator_forcerange[actuator] if model.actuator_forcelimited[actuator] else (-FAR, FAR)
+        laws[pair, slot] = *gain, *bias, *limits, scene.static.edges[2 * pair, gear]
+    return np.repeat(laws, 2, axis=0)
+
+
+def _of_coordinates(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator's length is a sum of joint coordinates: that of a joint, or of a fixed tendon."""
+    kind, target = _TRANSMISSION(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind != _TRANSMISSION.mjTRN_TENDON:
+        return kind in (_TRANSMISSION.mjTRN_JOINT, _TRANSMISSION.mjTRN_JOINTINPARENT)
+    limited = getattr(model, "tendon_actfrclimited", None)  # of all actuators of a tendon; MuJoCo before 3.3 has none
+    fixed = model.wrap_type[model.tendon_adr[target]] == mujoco.mjtWrap.mjWRAP_JOINT
+    return bool(fixed) and not (limited is not None and limited[target])
+
+
+def known_slots(scene: Scene) -> np.ndarray:
+    """``[E / 2, C]`` bool, control slots of actuators whose force follows from coordinates of hinges and slides."""
+    model, action = scene.model, scene.edge_action[::2]
+    groups, _ = joint_groups(model, scene.body)
+    straight = np.zeros(len(action), dtype=bool)
+    straight[[joint for name in ("slide", *_HINGES) for _, joints in groups[name] for joint in joints]] = True
+    known = np.zeros(action.shape, dtype=bool)
+    for actuator in range(model.nu):
+        where = action == actuator
+        gain, bias = _GAIN(model.actuator_gaintype[actuator]), _BIAS(model.actuator_biastype[actuator])
+        affine = gain in (_GAIN.mjGAIN_FIXED, _GAIN.mjGAIN_AFFINE) and bias in (_BIAS.mjBIAS_NONE, _BIAS.mjBIAS_AFFINE)
+        if affine and _of_coordinates(model, actuator) and straight[where.any(1)].all():
+            known |= where
+    return known
