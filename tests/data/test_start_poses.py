@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from torchrl_gn.data import StartPoseWarning, sample_start_states
+from torchrl_gn.data import StartPoseWarning, collect_trajectories, sample_start_states
 from torchrl_gn.scenes import Scene, load_scene, scene_from_description
 
 ROBOT = """
@@ -164,3 +164,48 @@ def test_what_touches_nothing_turns_in_place() -> None:
         if not rest or "contact" in rest:
             assert (qpos[:, :3] == [1, 2, 3]).all()
         assert qpos[:, 3].min() < 0.2
+
+
+def test_a_keyframe_places_mocap_bodies_in_the_simulation_too():
+    """As in the bimanual tasks of mujoco_mpc: a weld holds to the keyframe's target, not to that of the file."""
+    held = """<mujoco model="held"><option gravity="0 0 0"/><worldbody>
+      <body name="target" mocap="true" pos=".1 0 0"/><body name="hand"><freejoint/><geom size=".1" mass="1"/></body>
+      <body name="other" mocap="true" pos="0 3 0" quat="0 1 0 0"/></worldbody>
+      <equality><weld body1="target" body2="hand" relpose="0 0 0 1 0 0 0"/></equality>{}</mujoco>"""
+    key = '<keyframe><key name="home" mpos="1 0 0 0 4 0" mquat="1 0 0 0 0 1 0 0" qpos="1 0 0 1 0 0 0"/></keyframe>'
+    for text, place in ((held.format(key), 1.0), (held.format(""), 0.1)):
+        scene = load_scene(text)
+        data = collect_trajectories(scene, 3, steps=20, seed=0)
+        np.testing.assert_allclose(data["state"][:, :, 1, 0], place, atol=1e-4)
+        assert data["state"][..., 7:].abs().max() < 1e-2
+        again = scene_from_description(scene.description())
+        np.testing.assert_array_equal(again.model.body_pos, scene.model.body_pos)
+    bare = load_scene(held.format('<keyframe><key qpos="0 0 0 1 0 0 0"/></keyframe>'))  # names no mocap pose
+    target, other = (bare.model.body(name) for name in ("target", "other"))
+    np.testing.assert_array_equal([target.pos, other.pos], [[0.1, 0, 0], [0, 3, 0]])
+    np.testing.assert_array_equal(other.quat, [0, 1, 0, 0])
+
+
+REACH = """<mujoco model="reach"><worldbody>
+  <body name="target" mocap="true" pos="{} 0 0"/>
+  <body name="upper"><joint name="shoulder" axis="0 1 0" range="-170 170"/>
+    <geom type="capsule" fromto="0 0 0 .5 0 0" size=".03"/>
+    <body name="lower" pos=".5 0 0" euler="0 2 0"><joint name="elbow" axis="0 1 0" range="-170 170"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".03"/>
+      <body name="hand" pos=".5 0 0"><joint name="wrist" axis="0 1 0" range="-170 170"/><geom size=".04"/></body></body>
+    </body></worldbody>
+  <equality><weld body1="target" body2="hand" relpose="0 0 0 1 0 0 0"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize("distance", [0.6, 0.99, 1.5])
+def test_a_weld_to_a_far_target_winds_no_joint_up(distance):
+    """As of Meta-World's Sawyer: a nearly straight arm whose hand must be elsewhere; 1.5 m are out of its reach."""
+    scene = load_scene(REACH.format(distance))
+    data = collect_trajectories(scene, 4, steps=50, seed=0)
+    angles = data["physics"][:, :, 1:4].rad2deg()
+    assert angles.abs().max() < 172
+    if distance < 1:
+        np.testing.assert_allclose(data["state"][:, :, 3, 0], distance, atol=1e-3)
+        assert data["state"][..., 10:].abs().max() < 1
+    if distance == 0.6:  # where MuJoCo settles by itself
+        np.testing.assert_allclose(angles[:, 0], [[-53, 104, -53]] * 4, atol=1)

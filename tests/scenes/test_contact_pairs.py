@@ -120,3 +120,25 @@ def test_print_does_not_look_for_the_pairs_of_a_large_scene():
     assert "528 pairs of geoms may collide; scene.contact_pairs finds which" in str(scene)
     assert "contact_pairs" not in vars(scene)
     assert len(scene.contact_pairs.nodes) > 0 and "can meet: " in str(scene)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "masks"),
+    [("0 0 0 .2 0 0 .2 .2 0 0 .2 0", 'contype="0" conaffinity="0"'), ("0 0 0 .2 0 0 .2 .2 0 0 .2 0.1", "")],
+)
+def test_flat_meshes(vertices, masks):
+    """A logo on a table: a flat mesh has no volume, one that is a mere picture meets nothing."""
+    scene = load_scene(f"""<mujoco>
+      <asset><mesh name="logo" inertia="shell" vertex="{vertices}" face="0 1 2 0 2 3"/></asset>
+      <worldbody><geom type="box" size=".5 .5 .05"/><geom type="mesh" mesh="logo" pos="0 0 .051" {masks}/>
+      <body name="ball" pos="0 0 .5"><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
+    assert names(scene) == {"world - ball"}
+    assert "can meet: world - ball" in str(scene)
+
+
+def test_bodies_are_moved_near_what_they_can_touch():
+    """Among many pictures a body still finds the only box that it can stand on."""
+    pictures = "".join(f'<geom size=".01" pos="{index} 0 0" contype="0" conaffinity="0"/>' for index in range(300))
+    scene = load_scene(f"""<mujoco><worldbody><geom type="box" size=".1 .1 .1" pos="300 5 0"/>{pictures}
+      <body name="ball" pos="0 0 9"><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
+    assert names(scene) == {"world - ball"}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import zipfile
 
 import mujoco
 import numpy as np
@@ -223,3 +225,76 @@ def test_printed_summary():
     for part in ("along xy", "segment_4", "head - segment_0", "0: motor_0", "[-1, 1]", "7 nodes"):
         assert part in text
     assert "1 action\n" in str(load_scene("pendulum"))
+
+
+BODY = '<body name="p" pos="0 0 1"><joint name="j"/><geom size=".1"/></body>'
+INCLUDED = f"<mujocoinclude>{BODY}</mujocoinclude>"
+
+
+@pytest.mark.parametrize(
+    ("main", "files"),
+    [
+        (
+            '<mujoco><!-- ---- robot ---- --><worldbody><include file="part.xml"/></worldbody></mujoco>',
+            {"part.xml": "<mujocoinclude><!-- -- --->" + BODY + "</mujocoinclude>"},
+        ),
+        (
+            '<mujoco><worldbody><include file="sub/outer.xml"/></worldbody></mujoco>',
+            {"sub/outer.xml": '<mujocoinclude><include file="inner.xml"/></mujocoinclude>', "sub/inner.xml": INCLUDED},
+        ),
+        ('<?xml version="1.0" encoding="gbk"?><mujoco><!-- 底座 --><worldbody>' + BODY + "</worldbody></mujoco>", {}),
+        (
+            "<mujoco><!-- 底座 --><worldbody><include file='part.xml'/></worldbody></mujoco>",
+            {"part.xml": "<mujocoinclude><!-- 底座 -->" + BODY + "</mujocoinclude>"},
+        ),
+    ],
+    ids=["dashes in comments", "beside the included file", "another encoding", "another encoding, included"],
+)
+def test_files_that_mujoco_reads(main, files, tmp_path, monkeypatch):
+    for name, text in {"main.xml": main, **files}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(text.encode("gbk"))
+    scene = load_scene(tmp_path / "main.xml")
+    assert scene.joint_names == ("j",)
+    shutil.rmtree(tmp_path)
+    assert scene_from_description(scene.description()).joint_names == ("j",)
+
+
+def test_paths_are_shortened_before_links_are_followed(tmp_path):
+    (tmp_path / "sub" / "deep").mkdir(parents=True)
+    (tmp_path / "part.xml").write_text(INCLUDED)
+    main = '<mujoco><worldbody><include file="../part.xml"/></worldbody></mujoco>'
+    (tmp_path / "sub" / "deep" / "main.xml").write_text(main)
+    (tmp_path / "link").symlink_to(tmp_path / "sub" / "deep")
+    assert load_scene(tmp_path / "link" / "main.xml").joint_names == ("j",)
+
+
+def test_what_cannot_be_stored_is_refused_by_name(tmp_path):
+    with zipfile.ZipFile(tmp_path / "robot.mjz", "w") as archive:
+        archive.writestr("model.xml", f"<mujoco><worldbody>{BODY}</worldbody></mujoco>")
+    with pytest.raises(SceneError, match=r"robot\.mjz is an archive"):
+        load_scene(tmp_path / "robot.mjz")
+
+
+def test_attached_models_and_flexes_are_stored(tmp_path):
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "robots" / "meshes").mkdir(parents=True)
+    (tmp_path / "robots" / "meshes" / "part.obj").write_text(corners)
+    (tmp_path / "cloth.obj").write_text(corners)
+    (tmp_path / "robots" / "link.xml").write_text(INCLUDED.replace('"p"', '"arm"'))
+    (tmp_path / "robots" / "arm.xml").write_text(
+        '<mujoco model="arm"><compiler meshdir="meshes"/>'
+        '<asset><mesh name="m" file="part.obj" scale=".1 .1 .1"/></asset>'
+        '<worldbody><include file="link.xml"/></worldbody></mujoco>'
+    )
+    (tmp_path / "main.xml").write_text(
+        '<mujoco><asset><model name="arm" file="robots/arm.xml"/></asset><worldbody><frame pos="0 0 1">'
+        '<attach model="arm" body="arm" prefix="left_"/></frame><body name="soft" pos="0 0 2"><freejoint/>'
+        '<geom size=".01" mass="1"/><flexcomp name="cloth" type="mesh" file="cloth.obj" rigid="true" scale=".1 .1 .1"/>'
+        "</body></worldbody></mujoco>"
+    )
+    scene = load_scene(tmp_path / "main.xml")
+    shutil.rmtree(tmp_path)
+    again = scene_from_description(scene.description())
+    assert "left_arm" in again.node_names and again.model.nflex == 1
+    assert again.fingerprint() == scene.fingerprint()

@@ -435,3 +435,32 @@ def test_friction_pyramids_show_the_yaw(name):
     frame = _frame(model)
     assert frame is not None and not frame.exact
     assert max(_differ(model, 2, before=before)[0] for before in (100, 300, 500)) > 1e-6
+
+
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "geom_surfacevel"), reason="MuJoCo before 3.11 moves no surfaces")
+@pytest.mark.parametrize(
+    ("surface", "exact", "shifts"),
+    [("0 0 0 0 0 0", True, True), ("1 0 0 0 0 0", False, True), ("0 0 0 0 0 2", False, False)],
+)
+def test_surfaces_that_move_themselves(surface, exact, shifts):
+    """A conveyor shows the yaw, a turntable where the scene is, too."""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option cone="elliptic"/><worldbody>
+      <geom type="plane" size="5 5 .1" surfacevel="{surface}"/>
+      <body pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>""")
+    frame = _frame(model)
+    assert frame is not None and frame.exact == exact
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    assert translation_invariant(model, data, topology(model)).tolist() == [shifts, shifts, False]
+
+    def displacement(angle: float, *place: float) -> np.ndarray:
+        """Of the box, within half a second, in its own frame."""
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = *place, 0.1, np.cos(angle / 2), 0, 0, np.sin(angle / 2)
+        mujoco.mj_step(model, data, 250)
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return turn @ (data.qpos[:2] - place)
+
+    here, turned, shifted = displacement(0.0, 0.5, 0.0), displacement(0.7, 0.5, 0.0), displacement(0.0, 1.0, -2.0)
+    assert (np.abs(turned - here).max() < 1e-9) == exact
+    assert (np.abs(shifted - here).max() < 1e-9) == shifts

@@ -9,9 +9,9 @@ import numpy as np
 
 from torchrl_gn.data.controls import check_knot_interval, evaluate_cubics, spline_controls
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.data.start_poses import reference_keyframe
 from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints, holding_controls
 from torchrl_gn.scenes.control_bounds import require_bounds
+from torchrl_gn.scenes.keyframes import reference_keyframe
 
 _SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # of targets, rad/s or m/s
 _SCALES = (0.2, 1.0)  # of motors, velocity targets and the speed of position targets, by sequence

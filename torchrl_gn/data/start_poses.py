@@ -9,6 +9,7 @@ import numpy as np
 
 from torchrl_gn.data.clearance import clearance, find_bases
 from torchrl_gn.scenes.collisions import colliding_geoms
+from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import named, weld_roots
 
@@ -16,10 +17,10 @@ _NEAR = 0.3  # largest perturbation of the others, as a share of that
 _TILT = 0.5  # rad, of the base of a robot
 _DEPTH = 1e-3  # metres that two geoms may overlap, more than in the reference pose
 _REDRAWS, _SHRINKS, _SHRINK = 8, 16, 0.7  # attempts at full size, then at sizes that fall to 0.3 %
-_EQUALITY_STEPS, _EQUALITY_ERROR = 20, 1e-4
+_EQUALITY_STEPS, _EQUALITY_ERROR = 50, 1e-4
+_DAMPING, _MOST_DAMPING = 1e-6, 1e6  # of the steps onto equality constraints: at first, and where they end
 _BEYOND = 0.05  # of a joint's range: a reference pose farther beyond it, or a draw, is not used
 _SEARCH = 100  # random poses, if the reference pose penetrates
-_KEYFRAMES = ("home", "stand")
 _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
@@ -179,22 +180,40 @@ class StartPoses:
         mujoco.mj_kinematics(self.model, self._data)
 
     def _hold_equalities(self) -> float:
-        """Update the kinematics after Gauss-Newton steps onto equality constraints; returns the error that is left."""
+        """Update the kinematics after steps onto equality constraints within the limits; returns the error left.
+
+        Levenberg-Marquardt: no step makes the error larger, so that constraints out of reach wind no joint up.
+        """
         model, data = self.model, self._data
         if not data.eq_active.any():
             mujoco.mj_kinematics(model, data)
             return 0.0
-        worst = np.inf
+        there, low, high = self._limited
+        error, jacobian = self._equalities()
+        damping, best = _DAMPING, data.qpos.copy()
         for _ in range(_EQUALITY_STEPS):
-            mujoco.mj_fwdPosition(model, data)
-            rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-            error = data.efc_pos[: data.nefc][rows]
-            worst = float(np.abs(error).max(initial=0.0))
-            if worst <= self._equality_error:
+            if np.abs(error).max(initial=0.0) <= self._equality_error or damping > _MOST_DAMPING:
                 break
-            jacobian = _constraint_jacobian(model, data)[rows]
-            mujoco.mj_integratePos(model, data.qpos, -np.linalg.pinv(jacobian) @ error, 1.0)
-        return worst
+            square = jacobian @ jacobian.T
+            step = jacobian.T @ np.linalg.solve(square + damping * np.eye(len(square)), error)
+            mujoco.mj_integratePos(model, data.qpos, -step, 1.0)
+            data.qpos[there] = np.clip(data.qpos[there], np.minimum(low, best[there]), np.maximum(high, best[there]))
+            tried, its_jacobian = self._equalities()
+            if tried @ tried < error @ error:
+                error, jacobian, best, damping = tried, its_jacobian, data.qpos.copy(), damping / 10
+            else:
+                data.qpos[:] = best
+                damping *= 10
+        data.qpos[:] = best
+        mujoco.mj_kinematics(model, data)
+        return float(np.abs(error).max(initial=0.0))
+
+    def _equalities(self) -> tuple[np.ndarray, np.ndarray]:
+        """Errors ``[R]`` of the equality constraints and their Jacobian ``[R, nv]``."""
+        model, data = self.model, self._data
+        mujoco.mj_fwdPosition(model, data)
+        rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        return data.efc_pos[: data.nefc][rows].copy(), _constraint_jacobian(model, data)[rows].copy()
 
     def _depths(self) -> dict[tuple[int, int], float]:
         """Depth of each pair of geoms that overlap by more than 1 mm beyond what is allowed; needs the kinematics."""
@@ -211,12 +230,6 @@ class StartPoses:
             if -distance > self._allowed.get(pair, 0.0) + _DEPTH:
                 depths[pair] = max(depths.get(pair, 0.0), -float(distance))
         return depths
-
-
-def reference_keyframe(model: mujoco.MjModel) -> int | None:
-    """The keyframe ``home``, else ``stand``, else the first, or None if there is none."""
-    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, key) for key in range(model.nkey)]
-    return next((names.index(name) for name in _KEYFRAMES if name in names), 0 if names else None)
 
 
 def _constraint_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

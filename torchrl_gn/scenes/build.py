@@ -8,6 +8,7 @@ import numpy as np
 from torchrl_gn.scenes.contact_points import find_contact_points
 from torchrl_gn.scenes.control_bounds import ActionBounds, set_control_bounds
 from torchrl_gn.scenes.invariance import movable_components, translation_invariant
+from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import EdgePair, Topology, find_joint_anchors, named, offset, topology
@@ -43,6 +44,7 @@ def build_scene(
     Default ``timestep`` [s] and errors as of :func:`~torchrl_gn.scenes.load_scene`.
     """
     model, graph = _compile(spec, name)
+    _place_mocap_bodies(model)
     transmissions = find_transmissions(model, graph)
     pairs = transmissions.pairs
     actuator_names = tuple(named(model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator) for actuator in range(model.nu))
@@ -105,6 +107,15 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     if model.njnt == 0:
         raise SceneError(f"Scene {name!r} has no joint, so nothing can move. Add one.")
     return model, graph
+
+
+def _place_mocap_bodies(model: mujoco.MjModel) -> None:
+    """Put mocap bodies where the reference keyframe has them: simulations start from there, and nothing moves them."""
+    if model.nmocap and (key := reference_keyframe(model)) is not None:
+        bodies = np.flatnonzero(model.body_mocapid >= 0)
+        which = model.body_mocapid[bodies]
+        model.body_pos[bodies] = model.key_mpos[key].reshape(-1, 3)[which]
+        model.body_quat[bodies] = model.key_mquat[key].reshape(-1, 4)[which]
 
 
 def _copy(spec: mujoco.MjSpec) -> mujoco.MjSpec:

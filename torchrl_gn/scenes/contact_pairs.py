@@ -190,13 +190,13 @@ def _is_near(data: mujoco.MjData, candidate: Candidate, first: int, second: int)
 def _configurations(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
     """Random configurations within the joints' limits, kinematics done."""
     rng = np.random.default_rng(0)
-    floating = _floating(model)
+    floating, colliding = _floating(model), colliding_geoms(model)
     for _ in range(_CONFIGURATIONS):
         _random_joints(model, data, rng)
         mujoco.mj_kinematics(model, data)
         for body in rng.permutation(np.array(list(floating), dtype=np.int64)).tolist():
             if rng.random() < 0.8:
-                _move_near(model, data, rng, body, floating[body])
+                _move_near(model, data, rng, body, floating[body], colliding)
                 mujoco.mj_kinematics(model, data)
         yield
 
@@ -230,18 +230,26 @@ def _floating(model: mujoco.MjModel) -> dict[int, list[int]]:
 
 
 def _move_near(
-    model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator, body: int, joints: list[int]
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    rng: np.random.Generator,
+    body: int,
+    joints: list[int],
+    colliding: np.ndarray,
 ) -> None:
-    """Move a floating body so that a random geom of its tree is near a random other one."""
+    """Move a floating body so that a random geom of its tree is near a random other one that it can touch."""
     own = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
-    if own.all() or not own.any():
+    meeting = colliding & own[:, None] & ~own
+    if not meeting.any():
         return
-    geom, other = int(rng.choice(np.flatnonzero(own))), int(rng.choice(np.flatnonzero(~own)))
+    geom = int(rng.choice(np.flatnonzero(meeting.any(1))))
+    other = int(rng.choice(np.flatnonzero(meeting[geom])))
     if model.geom_type[other] == _GEOM.mjGEOM_PLANE:
         place, axis, side = np.append(rng.normal(size=2), 0), 2, 1
     else:  # on a side of its bounding box, a large one more often
         middle, half = model.geom_aabb[other, :3], model.geom_aabb[other, 3:]
-        area = np.prod(half) / half
+        area = half[[1, 0, 0]] * half[[2, 2, 1]]
+        area = np.ones(3) if not area.any() else area  # a line or point has none
         axis, side = rng.choice(3, p=area / area.sum()), rng.choice([-1, 1])
         place = middle + rng.uniform(-half, half)
         place[axis] = middle[axis] + side * half[axis]

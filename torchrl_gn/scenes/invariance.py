@@ -87,11 +87,16 @@ def actuators_of(model: mujoco.MjModel, *joints: int) -> np.ndarray:
 
 
 def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
-    """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis``."""
+    """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis`` that does not turn."""
     fixed = graph.node_of_body[model.geom_bodyid] == 0
-    plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    plane = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & ~surface_velocities(model)[:, 3:].any(1)
     parallel = plane & (np.abs(data.geom_xmat[:, 2::3] @ axis) < TOLERANCE)
     return bool(colliding_geoms(model)[np.ix_(fixed & ~parallel, ~fixed)].any())
+
+
+def surface_velocities(model: mujoco.MjModel) -> np.ndarray:
+    """Velocity of each geom's surface ``[G, 6]`` in its frame, linear and angular, as of a conveyor or turntable."""
+    return getattr(model, "geom_surfacevel", np.zeros((model.ngeom, 6))).reshape(model.ngeom, 6)  # since MuJoCo 3.11
 
 
 def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -> bool:

@@ -6,11 +6,11 @@ import base64
 import difflib
 import os
 import warnings
+import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
-from xml.etree import ElementTree
 
 import mujoco
 
@@ -18,6 +18,7 @@ from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.control_bounds import ActionBounds, plain_bounds
 from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
+from torchrl_gn.scenes.mjcf_text import encoded_assets, inlined, is_among, read_text
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
 from torchrl_gn.scenes.variants import build_system, make_variant
@@ -139,65 +140,38 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
     path = None if isinstance(source, str) and _is_mjcf(source) else Path(source)
     if path is not None and not path.is_file():
         raise FileNotFoundError(f"MJCF file not found: {path}")
+    if path is not None and zipfile.is_zipfile(path):
+        raise SceneError(f"{path} is an archive: unpack it, and load the XML file in it.")
     try:
         kind = mujoco.MjSpec
         spec = kind.from_string(str(source)) if path is None else kind.from_file(str(path))
     except ValueError as error:
         label = "string" if path is None else f"file {path}"
         raise SceneError(f"MuJoCo cannot read the MJCF {label}: {error}") from error
-    text, folder = (str(source), Path()) if path is None else (path.read_text(), path.parent)
-    if dropped := drop_missing_visuals(spec, lambda file: (folder / file).is_file()):
+    text, folder = (str(source), Path()) if path is None else (read_text(path), path.parent)
+    text = inlined(text, folder)
+    assets = encoded_assets(spec, text, folder)
+    if dropped := drop_missing_visuals(spec, lambda file: is_among(file, assets, text)):
         few = ", ".join(dropped[:3]) + ", ..." * (len(dropped) > 3)
         warnings.warn(
             f"{len(dropped)} visual meshes of {path or 'the MJCF text'} are missing ({few}): drawn without them.",
             MissingMeshWarning,
             stacklevel=3,
         )
-    return spec, {"mjcf": _inline(text, folder), "assets": _assets(spec, folder)}
+    return spec, {"mjcf": text, "assets": assets}
 
 
 def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
     """Parse what :func:`_read_mjcf` stored."""
     assets = {name: zlib.decompress(base64.b64decode(content)) for name, content in origin["assets"].items()}
-    spec = mujoco.MjSpec.from_string(origin["mjcf"], assets=assets)
-    drop_missing_visuals(spec, lambda file: str(file) in assets)
+    text = origin["mjcf"]
+    # Attached models and flexes are read with the text, other files when it is compiled.
+    early: dict[str, Any] = {"include": assets} if "<model" in text or "<flexcomp" in text else {}
+    spec = mujoco.MjSpec.from_string(text, assets=assets, **early)
+    drop_missing_visuals(spec, lambda file: is_among(file, assets, text))
     return spec
 
 
 def _is_mjcf(source: str) -> bool:
     """Whether a string is MJCF text rather than a name or a path."""
     return source.lstrip().startswith("<")
-
-
-def _inline(text: str, folder: Path) -> str:
-    """Replace every ``<include file=.../>`` by the content of its file."""
-    if "<include" not in text:
-        return text
-    root = ElementTree.fromstring(text)
-    _inline_children(root, folder)
-    return ElementTree.tostring(root, encoding="unicode")
-
-
-def _inline_children(element: ElementTree.Element, folder: Path) -> None:
-    children = list(element)
-    element[:] = []
-    for child in children:
-        included = child.tag == "include"  # always relative to the main file
-        if included:
-            child = ElementTree.parse(folder / child.attrib["file"]).getroot()
-        _inline_children(child, folder)
-        element.extend(list(child) if included else [child])
-
-
-def _assets(spec: mujoco.MjSpec, folder: Path) -> dict[str, str]:
-    """Encode and compress the files that a model reads, by the path under which MuJoCo asks for them."""
-    textures = [texture.file for texture in spec.textures]
-    textures += [file for texture in spec.textures for file in texture.cubefiles]
-    wanted = [(spec.meshdir, mesh.file) for mesh in [*spec.meshes, *spec.hfields, *spec.skins]]
-    wanted += [(spec.texturedir, file) for file in textures]
-    assets = {}
-    for directory, file in wanted:
-        path = folder / directory / file
-        if file and path.is_file():
-            assets[str(Path(directory, file))] = base64.b64encode(zlib.compress(path.read_bytes())).decode("ascii")
-    return assets

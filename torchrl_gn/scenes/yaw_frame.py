@@ -15,6 +15,7 @@ from torchrl_gn.scenes.invariance import (
     actuators_of,
     depends_on_position,
     reference_rotation,
+    surface_velocities,
 )
 from torchrl_gn.scenes.topology import Topology
 
@@ -125,12 +126,14 @@ def _isotropic(model: mujoco.MjModel, dofs: np.ndarray) -> bool:
 def contacts_depend_on_yaw(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: int) -> bool:
     """Whether contact forces change, other than by rotation, when the scene rotates about a world axis.
 
-    They do if a moving geom can touch a fixed one other than a plane across the axis, or if a friction pyramid is in
-    between: its edges are along world axes, but for a capsule's on a plane, which are along the capsule.
+    They do if a moving geom can touch a fixed one other than a plane across the axis whose surface does not move, or if
+    a friction pyramid is in between: its edges are along world axes, but for a capsule's on a plane, which are along
+    the capsule.
     """
     pairs = _colliding_pairs(model, graph)
     kind, plane = model.geom_type, int(mujoco.mjtGeom.mjGEOM_PLANE)
-    across = (kind == plane) & (np.abs(np.abs(data.geom_xmat[:, 2::3][:, axis]) - 1) < TOLERANCE)
+    still = ~surface_velocities(model).any(1)
+    across = still & (kind == plane) & (np.abs(np.abs(data.geom_xmat[:, 2::3][:, axis]) - 1) < TOLERANCE)
     fixed = graph.node_of_body[model.geom_bodyid] == 0
     pyramids = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
     for first, second, size, friction in pairs:

@@ -1,0 +1,100 @@
+"""The text of an MJCF model and of the files that it reads, from which its scene is rebuilt anywhere."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+
+from torchrl_gn.scenes.scene import SceneError
+
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_DECLARATION = re.compile(r"^\s*<\?xml.*?\?>", re.DOTALL)
+
+
+def read_text(path: Path) -> str:
+    """Text of an MJCF file in any encoding: its elements are ASCII or UTF-8, only comments may be otherwise."""
+    return path.read_bytes().decode("utf-8-sig", errors="replace")
+
+
+def inlined(text: str, folder: Path) -> str:
+    """The text with the content of every included file in place of its ``<include>``.
+
+    Raises:
+        SceneError: if an included file is not XML, or not found.
+    """
+    if "<include" not in _COMMENT.sub("", text):
+        return text
+    root = _parsed(text, "the MJCF text")
+    _inline_children(root, folder, folder)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _parsed(text: str, what: str) -> ElementTree.Element:
+    # MuJoCo reads comments with "--" in them, which are no XML.
+    try:
+        return ElementTree.fromstring(_DECLARATION.sub("", _COMMENT.sub("", text)))
+    except ElementTree.ParseError as error:
+        raise SceneError(f"MuJoCo reads {what}, but it is no XML that can be stored: {error}") from error
+
+
+def _inline_children(element: ElementTree.Element, folder: Path, here: Path) -> None:
+    """``folder`` is that of the main file, ``here`` that of the file with the element: MuJoCo looks in both."""
+    children = list(element)
+    element[:] = []
+    for child in children:
+        if child.tag != "include":
+            _inline_children(child, folder, here)
+            element.append(child)
+            continue
+        path = _found(child.attrib["file"], folder, here)
+        if path is None:
+            raise SceneError(f"The file {child.attrib['file']!r} that the model includes is not found from {folder}.")
+        root = _parsed(read_text(path), f"the included file {path}")
+        _inline_children(root, folder, path.parent)
+        element.extend(root)
+
+
+def _found(file: str, *folders: Path) -> Path | None:
+    """A file in one of some folders; paths are shortened before links are followed, as MuJoCo does."""
+    for folder in folders:
+        for path in (Path(os.path.normpath(folder / file)), folder / file):
+            if path.is_file():
+                return path
+    return None
+
+
+def encoded_assets(spec: mujoco.MjSpec, text: str, folder: Path) -> dict[str, str]:
+    """Files that a model reads, compressed and encoded, by the path under which MuJoCo asks for them."""
+    files = _files(spec, text, folder)
+    return {name: base64.b64encode(zlib.compress(content)).decode("ascii") for name, content in files}
+
+
+def _files(spec: mujoco.MjSpec, text: str, folder: Path) -> Iterator[tuple[str, bytes]]:
+    textures = [texture.file for texture in spec.textures]
+    textures += [file for texture in spec.textures for file in texture.cubefiles]
+    wanted = [(spec.meshdir, mesh.file) for mesh in [*spec.meshes, *spec.hfields, *spec.skins]]
+    wanted += [(spec.texturedir, file) for file in textures]
+    root = _parsed(text, "the MJCF text") if "<model" in text or "<flexcomp" in text else ElementTree.Element("none")
+    wanted += [(place, flex.get("file")) for flex in root.iter("flexcomp") for place in (spec.meshdir, "")]
+    for directory, file in wanted:
+        if file and (path := _found(str(Path(directory, file)), folder)):
+            yield str(Path(directory, file)), path.read_bytes()
+    # Models that are attached, with what these read in turn.
+    for model in root.iter("model"):
+        if (file := model.get("file")) and (path := _found(file, folder)):
+            own = inlined(read_text(path), path.parent)
+            yield file, own.encode()
+            for name, content in _files(mujoco.MjSpec.from_file(str(path)), own, path.parent):
+                yield str(Path(file).parent / name), content
+
+
+def is_among(file: Path, assets: Mapping[str, object], text: str) -> bool:
+    """Whether a mesh is among a model's stored files; one of an attached model does not say in which folder it is."""
+    return str(file) in assets or ("<model" in text and any(Path(name).name == file.name for name in assets))
