@@ -36,9 +36,13 @@ def build_model(
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
     optional = {"joint_axes": JointAxes(), "joints": Joints(), "actuators": Actuators(), "contacts": Contacts()}
     optional["contact_pairs"] = PairContacts()
-    first = scenes[0] if isinstance(scenes, Sequence) else scenes
+    all_scenes = scenes if isinstance(scenes, Sequence) else [scenes]
     chosen = [each for name, each in optional.items() if shown.pop(name)]
-    chosen = [each for each in (*chosen, Wrenches()) if not isinstance(each, Actuators | Wrenches) or each.suits(first)]
+    chosen = [
+        each
+        for each in (*chosen, Wrenches())
+        if not isinstance(each, Actuators | Wrenches) or any(map(each.suits, all_scenes))
+    ]
     features = (BodyState(**shown), Controls(), *chosen)
     return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
 

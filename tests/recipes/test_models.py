@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from _common.models import build_model, model_overrides
-from torchrl_gn.dynamics import BodyState, Canonicalizer, Controls, ForwardModel, JointAxes, Joints, Wrenches
+from torchrl_gn.dynamics import Actuators, BodyState, Canonicalizer, Controls, ForwardModel, JointAxes, Joints, Wrenches
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, plain_config, save_checkpoint
 
@@ -53,3 +53,11 @@ def test_a_checkpoint_of_an_ablated_core_is_loaded(compose, tmp_path):
     again = load_pretrained(tmp_path / "model.safetensors").model
     assert again.core_name == "ablated" and again.description() == model.description()
     assert all(torch.equal(a, b) for a, b in zip(model.parameters(), again.parameters(), strict=True))
+
+
+def test_servos_of_any_of_several_scenes_are_seen(compose):
+    scenes = [load_scene("pendulum"), load_scene(ROOT / "tests" / "zoo" / "servo_arm.xml")]
+    for model in (build_model(scenes, compose("forward_model").model), ForwardModel.for_scene(scenes)):
+        assert Actuators() in model.features
+    shown = build_model(scenes, compose("forward_model", "model.features.actuators=false").model).features
+    assert Actuators() not in shown and Joints() in shown

@@ -139,12 +139,13 @@ class ForwardModel(nn.Module):
         ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core.
         """
         given = as_scene(scene)
-        first = cast(Scene, given if isinstance(given, (Scene, KinematicTree)) else given[0])
+        scenes = [given] if isinstance(given, (Scene, KinematicTree)) else list(given)
+        first = cast(Scene, scenes[0])
         layout = layout_of(first)
         if features is None:
             spatial = "orientation" in layout.names
             features = (BodyState(), Controls(), *((JointAxes(), Joints(), Contacts()) if spatial else ()))
-            features += tuple(kind() for kind in (Actuators, Wrenches) if spatial and kind.suits(first))
+            features += tuple(kind() for kind in (Actuators, Wrenches) if spatial and any(map(kind.suits, scenes)))
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)
