@@ -90,7 +90,7 @@ def check(seed: int, executor: str) -> str:
     assert states.isfinite().all()
     model = fitted_model(scene, states, actions, seed).double()
     error = difference(model, scene, states, actions, executor)
-    assert error <= 1e-10, f"seed {seed}: {executor} differs by {error}"
+    assert error <= 1e-9, f"seed {seed}: {executor} differs by {error}"
     return "loaded"
 
 

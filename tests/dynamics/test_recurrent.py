@@ -174,7 +174,7 @@ def test_it_learns_what_a_state_does_not_say():
         loss.fit_normalizers(trajectory_buffer(late, batch_size=500, seed=0).sample())
         optimizer = torch.optim.Adam(model.core.parameters(), 1e-2)
         buffer = trajectory_buffer(late, batch_size=32, window=6, seed=0)
-        for _ in range(70):
+        for _ in range(140):
             optimizer.zero_grad()
             loss(buffer.sample())["loss_forward_model"].backward()
             optimizer.step()

@@ -18,7 +18,7 @@ _TILT = 0.5  # rad, of the base of a robot
 _DEPTH = 1e-3  # metres that two geoms may overlap, more than in the reference pose
 _REDRAWS, _SHRINKS, _SHRINK = 8, 16, 0.7  # attempts at full size, then at sizes that fall to 0.3 %
 _EQUALITY_STEPS, _EQUALITY_ERROR = 50, 1e-4
-_DAMPING, _MOST_DAMPING = 1e-6, 1e6  # of the steps onto equality constraints: at first, and where they end
+_DAMPING, _MOST_DAMPING = 1e-6, 1e6  # of the steps onto equality constraints: the least, and where they end
 _BEYOND = 0.05  # of a joint's range: a reference pose farther beyond it, or a draw, is not used
 _SEARCH = 100  # random poses, if the reference pose penetrates
 _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -195,12 +195,13 @@ class StartPoses:
             if np.abs(error).max(initial=0.0) <= self._equality_error or damping > _MOST_DAMPING:
                 break
             square = jacobian @ jacobian.T
-            step = jacobian.T @ np.linalg.solve(square + damping * np.eye(len(square)), error)
+            floor = damping * max(np.trace(square) / len(square), _EQUALITY_ERROR)
+            step = jacobian.T @ np.linalg.lstsq(square + floor * np.eye(len(square)), error, rcond=None)[0]
             mujoco.mj_integratePos(model, data.qpos, -step, 1.0)
             data.qpos[there] = np.clip(data.qpos[there], np.minimum(low, best[there]), np.maximum(high, best[there]))
             tried, its_jacobian = self._equalities()
             if tried @ tried < error @ error:
-                error, jacobian, best, damping = tried, its_jacobian, data.qpos.copy(), damping / 10
+                error, jacobian, best, damping = tried, its_jacobian, data.qpos.copy(), max(damping / 10, _DAMPING)
             else:
                 data.qpos[:] = best
                 damping *= 10

@@ -20,7 +20,8 @@ _HINGE, _SLIDE, _BALL, _FREE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("HINGE", "SLIDE", "BALL", "FREE")
 )
 _LENGTHS = {_HINGE: (1, 1), _SLIDE: (1, 1), _BALL: (4, 3), _FREE: (7, 6)}  # of a joint in qpos and qvel
-_TINY = 1e-12  # keeps square roots and quotients differentiable where a ball is at rest or three hinges lock
+_TINY = 1e-12  # keeps square roots and quotients differentiable where three hinges lock
+_REST = 1e-10  # the same where a ball is at rest: a squared sine
 
 
 class JointStates(NamedTuple):
@@ -80,10 +81,15 @@ class JointCoordinates(Float64Buffers):
         ]
         start = model.qpos0[model.jnt_qposadr] * np.isin(model.jnt_type, (_HINGE, _SLIDE))
         middle = np.where(model.jnt_limited.astype(bool), model.jnt_range.mean(1), start)
-        for name, found in groups.items():
+        self.groups = tuple(name for name, found in groups.items() if found)  # torch.export saves no empty tensors
+        for name in self.groups:
+            found = groups[name]
             at = torch.tensor([node for node, _ in found], dtype=torch.long)
             of = torch.tensor([some for _, some in found], dtype=torch.long).reshape(len(found), JOINT_GROUPS[name])
             self.constants({f"{name}_node": at, f"{name}_joints": of})
+        if groups["three"]:
+            branches = [_branch(model, some, middle - start) for _, some in groups["three"]]
+            self.constants({"branch": np.array(branches)})
         self.constants(
             {
                 "known": torch.from_numpy(to_joints < scalars),
@@ -92,7 +98,6 @@ class JointCoordinates(Float64Buffers):
                 "joint": joint_constants(scene)[: 2 * model.njnt : 2],
                 "start": start,
                 "middle": middle,
-                "branch": np.array([_branch(model, some, middle - start) for _, some in groups["three"]]),
                 "to_joints": to_joints,
                 "to_position": np.argsort(places[0]),
                 "to_velocity": np.argsort(places[1]),
@@ -120,8 +125,8 @@ class JointCoordinates(Float64Buffers):
         spin = _turned(matrices.mT, turning)
         parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
 
-        at, which = self._of("slide")
-        if len(at):
+        if "slide" in self.groups:
+            at, which = self._of("slide")
             axis, anchor = (joint[..., which[:, 0], part] for part in (slice(3), slice(3, 6)))
             arm = _turned(matrices[..., at, :, :], anchor)
             up = self.parent[at]
@@ -138,8 +143,8 @@ class JointCoordinates(Float64Buffers):
             )
 
         for name, hinges in (("one", _one_hinge), ("two", _two_hinges), ("three", _three_hinges)):
-            at, which = self._of(name)
-            if len(at):
+            if name in self.groups:
+                at, which = self._of(name)
                 axes = [joint[..., each, :3] for each in which.unbind(-1)]
                 more = (self.branch,) if name == "three" else ()
                 found = hinges(relative[..., at, :, :], spin[..., at, :], *axes, *more)
@@ -148,10 +153,10 @@ class JointCoordinates(Float64Buffers):
                 coordinate = self._angles(sine, cosine, which.flatten())
                 parts.append((sine, cosine, coordinate, rate))
 
-        at, which = self._of("ball")
-        if len(at):
+        if "ball" in self.groups:
+            at = self._of("ball")[0]
             twice, cosine = _twice_sine_axis(relative[..., at, :, :]), _cosine(relative[..., at, :, :])
-            sine = (0.25 * twice.square().sum(-1) + _TINY).sqrt()
+            sine = (0.25 * twice.square().sum(-1) + _REST).sqrt()
             rate = 0.5 * (twice * spin[..., at, :]).sum(-1) / sine
             parts.append((sine, cosine, torch.atan2(sine, cosine), rate))
 
@@ -172,22 +177,26 @@ class JointCoordinates(Float64Buffers):
         position, orientation, linear, angular = (state[..., where] for where in BODY_STATE.slices.values())
         matrices = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
         found, positions, velocities = self.joints(state, matrices), [], []
-        for name in ("slide", "one", "two", "three"):
+        for name in self.groups:
+            if name in ("ball", "free"):
+                continue
             which = self._of(name)[1].flatten()
             positions.append(found.coordinate[..., which])
             velocities.append(found.rate[..., which])
-        local = _turned(matrices.mT, angular)
-        ball, free = self._of("ball")[0], self._of("free")[0]
-        if len(ball):
+        if "ball" in self.groups:
+            ball = self._of("ball")[0]
             up = self.parent[ball]
             frame = quaternion.product(orientation[..., up, :], self.pose[ball, 3:].expand_as(orientation[..., up, :]))
             turn = quaternion.product(quaternion.conjugate(frame), orientation[..., ball, :])
             spin = _turned(matrices.mT, angular - angular[..., self.parent, :])[..., ball, :]
             positions.append(turn.flatten(-2))
             velocities.append(spin.flatten(-2))
-        pose = torch.cat((position[..., free, :], orientation[..., free, :]), dim=-1).flatten(-2)
-        twist = torch.cat((linear[..., free, :], local[..., free, :]), dim=-1).flatten(-2)
-        qpos, qvel = (torch.cat(each, dim=-1) for each in ((*positions, pose), (*velocities, twist)))
+        if "free" in self.groups:
+            free = self._of("free")[0]
+            local = _turned(matrices.mT, angular)[..., free, :]
+            positions.append(torch.cat((position[..., free, :], orientation[..., free, :]), dim=-1).flatten(-2))
+            velocities.append(torch.cat((linear[..., free, :], local), dim=-1).flatten(-2))
+        qpos, qvel = (torch.cat(each, dim=-1) for each in (positions, velocities))
         return qpos[..., self.to_position], qvel[..., self.to_velocity]
 
 
