@@ -15,7 +15,7 @@ from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
-from torchrl_gn.scenes import PhysicalParameters, Scene
+from torchrl_gn.scenes import PhysicalParameters, Scene, load_scene
 from torchrl_gn.scenes.force_elements import known_slots
 from torchrl_gn.training import fit
 
@@ -62,9 +62,17 @@ def bind(feature, scene: Scene):
     return feature.resolved(scene).bind(scene, BODY_STATE, Canonicalizer().bind(scene, BODY_STATE))
 
 
-@pytest.mark.parametrize("name", SCENES)
+ANCHORED = """<mujoco><worldbody><body pos=".3 0 1" euler="10 20 30">
+  <joint name="x" type="slide" axis="1 .2 0" pos=".1 0 .2"/><joint name="y" type="slide" axis="0 1 .1" ref=".1"/>
+  <joint name="a" axis="0 1 0" pos=".1 -.2 .3" ref="20"/><joint name="b" axis="1 .3 0" pos=".1 -.2 .3"/><geom size=".1"/>
+  <body pos="0 .4 0" euler="0 50 0"><joint name="z" type="slide" axis="0 0 1" pos=".2 .1 0"/>
+    <joint name="ball" type="ball" pos="0 .1 .2"/><geom size=".1"/>
+    <body pos=".2 0 0"><joint name="c" pos=".1 0 .1"/><geom size=".1"/></body></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("name", [*SCENES, "anchored"])
 def test_coordinates_and_rates_are_mujocos(name):
-    scene = zoo.load(name)
+    scene = load_scene(ANCHORED) if name == "anchored" else zoo.load(name)
     coordinates = JointCoordinates(scene)
     for data, state in poses(scene, 10):
         position, velocity = (each.numpy() for each in coordinates(state))

@@ -66,8 +66,8 @@ def joint_poses(scene: Scene) -> np.ndarray:
 def joint_constants(scene: Scene) -> np.ndarray:
     """``[E, 8]`` of each edge's joint: axis ``[3]`` and anchor ``[3]`` in the child's frame, and both limits.
 
-    Of slides that precede one another the axis is the vector whose product with the place gives the coordinate. Limits,
-    in rad or m, are where the constraint's force sets in, beyond ``jnt_margin``; of a ball 0 and its largest angle.
+    Of slides the axis is the vector whose product with the place gives the coordinate, the anchor that of the hinges or
+    ball which follow them. Limits, in rad or m, are where the constraint's force sets in, beyond ``jnt_margin``; of a ball 0 and its largest angle.
     """
     model = scene.model
     found = np.zeros((len(scene.pairs), 8))
@@ -77,8 +77,10 @@ def joint_constants(scene: Scene) -> np.ndarray:
         found[joint, :3], found[joint, 3:6] = model.jnt_axis[joint], model.jnt_pos[joint]
         if model.jnt_type[joint] == _JOINT.mjJNT_SLIDE:
             first = int(model.body_jntadr[body])
-            alike = [each for each in range(first, first + int(model.body_jntnum[body])) if _slides(model, each)]
+            own = range(first, first + int(model.body_jntnum[body]))
+            alike = [each for each in own if _slides(model, each)]
             found[joint, :3] = np.linalg.pinv(model.jnt_axis[alike].T)[alike.index(joint)]
+            found[joint, 3:6] = model.jnt_pos[own[-1]] if own[-1] not in alike else 0.0
         if limited_joints(model)[joint]:
             low, high = model.jnt_range[joint]
             margin = float(model.jnt_margin[joint])

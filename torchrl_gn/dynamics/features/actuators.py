@@ -66,7 +66,6 @@ class Actuators(Feature):
 
 class _Bound(Float64Buffers):
     sums: Tensor
-    own: Tensor
     bound_low: Tensor
     bound_high: Tensor
     winds: Tensor
