@@ -64,7 +64,8 @@ def bind(feature, scene: Scene):
 
 ANCHORED = """<mujoco><worldbody><body pos=".3 0 1" euler="10 20 30">
   <joint name="x" type="slide" axis="1 .2 0" pos=".1 0 .2"/><joint name="y" type="slide" axis="0 1 .1" ref=".1"/>
-  <joint name="a" axis="0 1 0" pos=".1 -.2 .3" ref="20"/><joint name="b" axis="1 .3 0" pos=".1 -.2 .3"/><geom size=".1"/>
+  <joint name="a" axis="0 1 0" pos=".1 -.2 .3" ref="20"/><joint name="b" axis="1 .3 0" pos=".1 -.2 .3"/>
+  <geom size=".1"/>
   <body pos="0 .4 0" euler="0 50 0"><joint name="z" type="slide" axis="0 0 1" pos=".2 .1 0"/>
     <joint name="ball" type="ball" pos="0 .1 .2"/><geom size=".1"/>
     <body pos=".2 0 0"><joint name="c" pos=".1 0 .1"/><geom size=".1"/></body></body></body></worldbody></mujoco>"""

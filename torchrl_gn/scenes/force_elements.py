@@ -67,7 +67,8 @@ def joint_constants(scene: Scene) -> np.ndarray:
     """``[E, 8]`` of each edge's joint: axis ``[3]`` and anchor ``[3]`` in the child's frame, and both limits.
 
     Of slides the axis is the vector whose product with the place gives the coordinate, the anchor that of the hinges or
-    ball which follow them. Limits, in rad or m, are where the constraint's force sets in, beyond ``jnt_margin``; of a ball 0 and its largest angle.
+    ball which follow them. Limits, in rad or m, are where the constraint's force sets in, beyond ``jnt_margin``; of a
+    ball 0 and its largest angle.
     """
     model = scene.model
     found = np.zeros((len(scene.pairs), 8))
