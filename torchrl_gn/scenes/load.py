@@ -167,7 +167,10 @@ def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
     text = origin["mjcf"]
     # Attached models and flexes are read with the text, other files when it is compiled.
     early: dict[str, Any] = {"include": assets} if "<model" in text or "<flexcomp" in text else {}
-    spec = mujoco.MjSpec.from_string(text, assets=assets, **early)
+    try:
+        spec = mujoco.MjSpec.from_string(text, assets=assets, **early)
+    except ValueError as error:
+        raise SceneError(f"MuJoCo {mujoco.__version__} cannot read a stored scene: {error}") from error
     drop_missing_visuals(spec, lambda file: is_among(file, assets, text))
     return spec
 
