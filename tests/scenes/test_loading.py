@@ -310,7 +310,8 @@ def test_files_of_flexes_are_stored(tmp_path):
     (tmp_path / "cloth.obj").write_text(CORNERS)
     (tmp_path / "main.xml").write_text(
         '<mujoco><worldbody><body name="soft" pos="0 0 2"><freejoint/><geom size=".01" mass="1"/>'
-        '<flexcomp name="cloth" type="mesh" file="cloth.obj" rigid="true" scale=".1 .1 .1"/></body></worldbody></mujoco>'
+        '<flexcomp name="cloth" type="mesh" file="cloth.obj" rigid="true" scale=".1 .1 .1"/>'
+        "</body></worldbody></mujoco>"
     )
     scene = load_scene(tmp_path / "main.xml")
     shutil.rmtree(tmp_path)

@@ -68,7 +68,7 @@ def joint_constants(scene: Scene) -> np.ndarray:
 
     Of slides the axis is the vector whose product with the place gives the coordinate, the anchor that of the hinges or
     ball which follow them. Limits, in rad or m, are where the constraint's force sets in, beyond ``jnt_margin``; of a
-    ball 0 and its largest angle.
+    ball the largest angle alone.
     """
     model = scene.model
     found = np.zeros((len(scene.pairs), 8))
