@@ -34,16 +34,16 @@ def build_model(
     """
     given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
-    optional = {"joint_axes": JointAxes(), "joints": Joints(), "actuators": Actuators(), "contacts": Contacts()}
-    optional["contact_pairs"] = PairContacts()
+    optional = {
+        "joint_axes": JointAxes(),
+        "joints": Joints(),
+        "actuators": Actuators(),
+        "contacts": Contacts(),
+        "contact_pairs": PairContacts(),
+    }
+    chosen = [*(feature for name, feature in optional.items() if shown.pop(name)), Wrenches()]
     all_scenes = scenes if isinstance(scenes, Sequence) else [scenes]
-    chosen = [each for name, each in optional.items() if shown.pop(name)]
-    chosen = [
-        each
-        for each in (*chosen, Wrenches())
-        if not isinstance(each, Actuators | Wrenches) or any(map(each.suits, all_scenes))
-    ]
-    features = (BodyState(**shown), Controls(), *chosen)
+    features = (BodyState(**shown), Controls(), *(each for each in chosen if any(map(each.suits, all_scenes))))
     return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
 
 

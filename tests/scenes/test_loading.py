@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import zipfile
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from torchrl_gn.scenes import (
     SYSTEMS,
+    Scene,
     SceneChangedWarning,
     SceneError,
     UnsupportedSceneError,
@@ -283,6 +285,16 @@ def test_what_cannot_be_stored_is_refused_by_name(tmp_path):
 CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
+def without_files(scene: Scene, folder: Path, refusal: str) -> Scene | None:
+    """The scene from its description alone; None where MuJoCo, before 3.4, reads such files from the disk only."""
+    shutil.rmtree(folder)
+    try:
+        return scene_from_description(scene.description())
+    except SceneError as error:
+        assert refusal in str(error) and not hasattr(mujoco, "MjVfs")
+        return None
+
+
 def test_attached_models_are_stored_with_their_files(tmp_path):
     (tmp_path / "robots" / "meshes").mkdir(parents=True)
     (tmp_path / "robots" / "meshes" / "part.obj").write_text(CORNERS)
@@ -297,13 +309,8 @@ def test_attached_models_are_stored_with_their_files(tmp_path):
         '<attach model="arm" body="arm" prefix="left_"/></frame></worldbody></mujoco>'
     )
     scene = load_scene(tmp_path / "main.xml")
-    shutil.rmtree(tmp_path)
-    try:
-        again = scene_from_description(scene.description())
-    except SceneError as error:  # MuJoCo before 3.4 reads meshes of attached models from the disk alone
-        assert "part.obj" in str(error) and not hasattr(mujoco, "MjVfs")
-        return
-    assert "left_arm" in again.node_names and again.fingerprint() == scene.fingerprint()
+    if (again := without_files(scene, tmp_path, "part.obj")) is not None:
+        assert "left_arm" in again.node_names and again.fingerprint() == scene.fingerprint()
 
 
 def test_files_of_flexes_are_stored(tmp_path):
@@ -314,10 +321,5 @@ def test_files_of_flexes_are_stored(tmp_path):
         "</body></worldbody></mujoco>"
     )
     scene = load_scene(tmp_path / "main.xml")
-    shutil.rmtree(tmp_path)
-    try:
-        again = scene_from_description(scene.description())
-    except SceneError as error:  # MuJoCo before 3.4 reads flexes from the disk alone
-        assert "cannot read a stored scene" in str(error) and not hasattr(mujoco, "MjVfs")
-        return
-    assert again.model.nflex == 1 and again.fingerprint() == scene.fingerprint()
+    if (again := without_files(scene, tmp_path, "cannot read a stored scene")) is not None:
+        assert again.model.nflex == 1 and again.fingerprint() == scene.fingerprint()

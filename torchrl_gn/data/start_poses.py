@@ -39,7 +39,7 @@ class StartPoses:
     - Free bodies turn about the vertical and shift by up to their size; bases of robots tilt by up to 0.5 rad. Without
       gravity, or where they can touch nothing fixed, they stay in place in any orientation.
     - Bodies that move up and down freely keep the reference pose's distance to planes below, or touch them.
-    - Equality constraints hold, by Gauss-Newton steps from the draw.
+    - Equality constraints hold, by Levenberg-Marquardt steps from the draw.
     - Draws with geoms over 1 mm deeper in each other than in the reference pose are redrawn, then shrunk towards it.
     """
 
@@ -205,7 +205,6 @@ class StartPoses:
             else:
                 data.qpos[:] = best
                 damping *= 10
-        data.qpos[:] = best
         mujoco.mj_kinematics(model, data)
         return float(np.abs(error).max(initial=0.0))
 
@@ -214,7 +213,7 @@ class StartPoses:
         model, data = self.model, self._data
         mujoco.mj_fwdPosition(model, data)
         rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-        return data.efc_pos[: data.nefc][rows].copy(), _constraint_jacobian(model, data)[rows].copy()
+        return data.efc_pos[: data.nefc][rows], _constraint_jacobian(model, data)[rows]
 
     def _depths(self) -> dict[tuple[int, int], float]:
         """Depth of each pair of geoms that overlap by more than 1 mm beyond what is allowed; needs the kinematics."""

@@ -145,7 +145,7 @@ class ForwardModel(nn.Module):
         if features is None:
             spatial = "orientation" in layout.names
             features = (BodyState(), Controls(), *((JointAxes(), Joints(), Contacts()) if spatial else ()))
-            features += tuple(kind() for kind in (Actuators, Wrenches) if spatial and any(map(kind.suits, scenes)))
+            features += tuple(kind() for kind in (Actuators, Wrenches) if any(map(kind.suits, scenes)))
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)

@@ -71,27 +71,20 @@ def joint_constants(scene: Scene) -> np.ndarray:
     ball the largest angle alone.
     """
     model = scene.model
+    kinds, axes, places, count = model.jnt_type, model.jnt_axis, model.jnt_pos, model.njnt
     found = np.zeros((len(scene.pairs), 8))
+    found[:count, :3], found[:count, 3:6] = axes, places
+    for joint in np.flatnonzero(kinds == int(_JOINT.mjJNT_SLIDE)).tolist():
+        own = np.flatnonzero(model.jnt_bodyid == model.jnt_bodyid[joint])
+        slides = own[kinds[own] == kinds[joint]].tolist()
+        found[joint, :3] = np.linalg.pinv(axes[slides].T)[slides.index(joint)]
+        found[joint, 3:6] = places[own[-1]] if own[-1] not in slides else 0.0
     found[:, 6:] = -FAR, FAR
-    for joint in range(model.njnt):
-        body = int(model.jnt_bodyid[joint])
-        found[joint, :3], found[joint, 3:6] = model.jnt_axis[joint], model.jnt_pos[joint]
-        if model.jnt_type[joint] == _JOINT.mjJNT_SLIDE:
-            first = int(model.body_jntadr[body])
-            own = range(first, first + int(model.body_jntnum[body]))
-            alike = [each for each in own if _slides(model, each)]
-            found[joint, :3] = np.linalg.pinv(model.jnt_axis[alike].T)[alike.index(joint)]
-            found[joint, 3:6] = model.jnt_pos[own[-1]] if own[-1] not in alike else 0.0
-        if limited_joints(model)[joint]:
-            low, high = model.jnt_range[joint]
-            margin = float(model.jnt_margin[joint])
-            ball = model.jnt_type[joint] == _JOINT.mjJNT_BALL
-            found[joint, 6:] = (-FAR, high - margin) if ball else (low + margin, high - margin)
+    limited = limited_joints(model)
+    within = model.jnt_range + model.jnt_margin[:, None] * [1, -1]
+    found[:count][limited, 6:] = within[limited]
+    found[:count][kinds == int(_JOINT.mjJNT_BALL), 6] = -FAR
     return np.repeat(found, 2, axis=0)
-
-
-def _slides(model: mujoco.MjModel, joint: int) -> bool:
-    return bool(model.jnt_type[joint] == _JOINT.mjJNT_SLIDE)
 
 
 def limited_joints(model: mujoco.MjModel) -> np.ndarray:
@@ -115,18 +108,15 @@ def actuator_laws(scene: Scene) -> np.ndarray:
     force's two limits, and its gear at the edge: what a unit of force exerts there, and how much longer the actuator
     gets with the joint's coordinate.
     """
-    model, action = scene.model, scene.edge_action[::2]
+    model, action, known = scene.model, scene.edge_action[::2], known_slots(scene)
+    gain, bias = model.actuator_gainprm[:, :3].copy(), model.actuator_biasprm[:, :3].copy()
+    gain[model.actuator_gaintype == int(_GAIN.mjGAIN_FIXED), 1:] = 0
+    bias[model.actuator_biastype == int(_BIAS.mjBIAS_NONE)] = 0
+    limits = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, (-FAR, FAR))
+    names = ["actuator_gear[0]" + f"/{slot}" * (slot > 0) for slot in range(action.shape[1])]
+    gear = scene.static.edges[::2, [scene.static.edge_names.index(name) for name in names]]
     laws = np.zeros((*action.shape, 9))
-    for pair, slot in np.argwhere(known_slots(scene)).tolist():
-        actuator = int(action[pair, slot])
-        gear = scene.static.edge_names.index("actuator_gear[0]" + f"/{slot}" * (slot > 0))
-        gain, bias = model.actuator_gainprm[actuator, :3].copy(), model.actuator_biasprm[actuator, :3].copy()
-        if model.actuator_gaintype[actuator] == _GAIN.mjGAIN_FIXED:
-            gain[1:] = 0
-        if model.actuator_biastype[actuator] == _BIAS.mjBIAS_NONE:
-            bias[:] = 0
-        limits = model.actuator_forcerange[actuator] if model.actuator_forcelimited[actuator] else (-FAR, FAR)
-        laws[pair, slot] = *gain, *bias, *limits, scene.static.edges[2 * pair, gear]
+    laws[known, :8], laws[known, 8] = np.concatenate((gain, bias, limits), axis=1)[action[known]], gear[known]
     return np.repeat(laws, 2, axis=0)
 
 
@@ -146,11 +136,8 @@ def known_slots(scene: Scene) -> np.ndarray:
     groups, _ = joint_groups(model, scene.body)
     straight = np.zeros(len(action), dtype=bool)
     straight[[joint for name in ("slide", *_HINGES) for _, joints in groups[name] for joint in joints]] = True
-    known = np.zeros(action.shape, dtype=bool)
-    for actuator in range(model.nu):
-        where = action == actuator
-        gain, bias = _GAIN(model.actuator_gaintype[actuator]), _BIAS(model.actuator_biastype[actuator])
-        affine = gain in (_GAIN.mjGAIN_FIXED, _GAIN.mjGAIN_AFFINE) and bias in (_BIAS.mjBIAS_NONE, _BIAS.mjBIAS_AFFINE)
-        if affine and _of_coordinates(model, actuator) and straight[where.any(1)].all():
-            known |= where
-    return known
+    known = np.isin(model.actuator_gaintype, (int(_GAIN.mjGAIN_FIXED), int(_GAIN.mjGAIN_AFFINE)))
+    known &= np.isin(model.actuator_biastype, (int(_BIAS.mjBIAS_NONE), int(_BIAS.mjBIAS_AFFINE)))
+    known &= np.array([_of_coordinates(model, actuator) for actuator in range(model.nu)], dtype=bool)
+    known &= ~np.isin(np.arange(model.nu), action[~straight])
+    return np.append(known, False)[action]  # -1: no actuator

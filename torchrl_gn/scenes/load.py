@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import difflib
 import os
 import warnings
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -18,7 +16,7 @@ from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.control_bounds import ActionBounds, plain_bounds
 from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
-from torchrl_gn.scenes.mjcf_text import encoded_assets, inlined, is_among, read_text
+from torchrl_gn.scenes.mjcf_text import decoded_assets, encoded_assets, inlined, is_among, read_text, reads_files_early
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
 from torchrl_gn.scenes.variants import build_system, make_variant
@@ -163,10 +161,9 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
 
 def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
     """Parse what :func:`_read_mjcf` stored."""
-    assets = {name: zlib.decompress(base64.b64decode(content)) for name, content in origin["assets"].items()}
-    text = origin["mjcf"]
+    assets, text = decoded_assets(origin["assets"]), origin["mjcf"]
     # Attached models and flexes are read with the text, other files when it is compiled.
-    early: dict[str, Any] = {"include": assets} if "<model" in text or "<flexcomp" in text else {}
+    early: dict[str, Any] = {"include": assets} if reads_files_early(text) else {}
     try:
         spec = mujoco.MjSpec.from_string(text, assets=assets, **early)
     except ValueError as error:

@@ -76,12 +76,22 @@ def encoded_assets(spec: mujoco.MjSpec, text: str, folder: Path) -> dict[str, st
     return {name: base64.b64encode(zlib.compress(content)).decode("ascii") for name, content in files}
 
 
+def decoded_assets(assets: Mapping[str, str]) -> dict[str, bytes]:
+    """Content of the files of :func:`encoded_assets`."""
+    return {name: zlib.decompress(base64.b64decode(content)) for name, content in assets.items()}
+
+
+def reads_files_early(text: str) -> bool:
+    """Whether a model attaches others, or has flexes, whose files MuJoCo reads with the text."""
+    return "<model" in text or "<flexcomp" in text
+
+
 def _files(spec: mujoco.MjSpec, text: str, folder: Path) -> Iterator[tuple[str, bytes]]:
     textures = [texture.file for texture in spec.textures]
     textures += [file for texture in spec.textures for file in texture.cubefiles]
     wanted = [(spec.meshdir, mesh.file) for mesh in [*spec.meshes, *spec.hfields, *spec.skins]]
     wanted += [(spec.texturedir, file) for file in textures]
-    root = _parsed(text, "the MJCF text") if "<model" in text or "<flexcomp" in text else ElementTree.Element("none")
+    root = _parsed(text, "the MJCF text") if reads_files_early(text) else ElementTree.Element("none")
     wanted += [(place, flex.get("file")) for flex in root.iter("flexcomp") for place in (spec.meshdir, "")]
     for directory, file in wanted:
         if file and (path := _found(str(Path(directory, file)), folder)):

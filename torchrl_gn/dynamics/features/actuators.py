@@ -10,11 +10,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from torchrl_gn.dynamics.features.controls import controls_per_edge
+from torchrl_gn.dynamics.features.controls import controls_per_edge, require_slots
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.maths.float64_buffers import Float64Buffers
-from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
 from torchrl_gn.scenes.force_elements import FAR, actuator_laws, winding_joints
 
@@ -52,15 +52,8 @@ class Actuators(Feature):
         return _SIZE * self.per_joint
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        if layout != BODY_STATE:
-            raise ValueError(
-                f"Actuators needs states of bodies; scene {scene.name!r} has others: leave the feature out."
-            )
-        if (there := controls_per_edge(scene)) != self.per_joint:
-            raise ValueError(
-                f"The model reads {self.per_joint} actuators at each edge, scene {scene.name!r} has {there}:"
-                " build the model with ForwardModel.for_scene."
-            )
+        self.require_bodies(scene, layout)
+        require_slots(scene, self.per_joint, "actuators at each edge")
         return _Bound(scene)
 
 

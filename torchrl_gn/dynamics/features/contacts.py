@@ -35,10 +35,7 @@ class Contacts(Feature):
         return 6 * SLOTS
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        if layout != BODY_STATE:
-            raise ValueError(
-                f"Contacts needs states of bodies; scene {scene.name!r} has others: leave the feature out."
-            )
+        self.require_bodies(scene, layout)
         return BoundContacts(scene)
 
 

@@ -35,12 +35,7 @@ class Controls(Feature):
         return 1 if self.per_joint is None else self.per_joint
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        there, here = controls_per_edge(scene), self.size(layout)
-        if there != here:
-            raise ValueError(
-                f"The model reads {here} controls at each edge, scene {scene.name!r} has {there}: build the model with"
-                " ForwardModel.for_scene."
-            )
+        require_slots(scene, self.size(layout), "controls at each edge")
         return _Bound()
 
 
@@ -52,6 +47,15 @@ class _Bound(nn.Module):
 def controls_per_edge(scene: Scene) -> int:
     """Most controls ``C`` that act at one edge of a scene, or 1."""
     return int(scene.edge_action.shape[1])
+
+
+def require_slots(scene: Scene, count: int, what: str) -> None:
+    """Raise ValueError unless a model that reads ``count`` of the controls at each edge suits a scene."""
+    if (there := controls_per_edge(scene)) != count:
+        raise ValueError(
+            f"The model reads {count} {what}, scene {scene.name!r} has {there}: build the model with"
+            " ForwardModel.for_scene."
+        )
 
 
 def present_actions(scene: Scene | KinematicTree) -> int:

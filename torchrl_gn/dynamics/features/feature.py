@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer, CanonicalState
@@ -33,6 +33,11 @@ class Feature:
     part: ClassVar[Literal["nodes", "edges"]]  # whether nodes or edges get the features
     adds_edges: ClassVar[bool] = False  # whether it adds edges behind the scene's
 
+    @staticmethod
+    def suits(scene: object) -> bool:
+        """Whether it tells something of a scene: models show it of themselves only if it does."""
+        return True
+
     def resolved(self, scene: Scene) -> Feature:
         """The same feature with its open options read from a scene."""
         return self
@@ -51,6 +56,13 @@ class Feature:
         Edges behind the last that it gives features to have 0.
         """
         raise NotImplementedError
+
+    def require_bodies(self, scene: Scene, layout: StateLayout) -> None:
+        """Raise ValueError unless states are those of bodies."""
+        if layout != BODY_STATE:
+            raise ValueError(
+                f"{type(self).__name__} needs states of bodies; scene {scene.name!r} has others: leave the feature out."
+            )
 
     def options(self) -> dict:
         """Its options as plain values."""

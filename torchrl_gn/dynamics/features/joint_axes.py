@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from torchrl_gn.dynamics.features.controls import controls_per_edge
+from torchrl_gn.dynamics.features.controls import controls_per_edge, require_slots
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
@@ -41,11 +41,7 @@ class JointAxes(Feature):
             raise ValueError(
                 f"JointAxes needs states with orientations; scene {scene.name!r} has others: leave the feature out."
             )
-        if (there := controls_per_edge(scene)) != self.per_joint:
-            raise ValueError(
-                f"The model reads {self.per_joint} controls along each axis, scene {scene.name!r} has {there}:"
-                " build the model with ForwardModel.for_scene."
-            )
+        require_slots(scene, self.per_joint, "controls along each axis")
         return _Bound(scene)
 
 

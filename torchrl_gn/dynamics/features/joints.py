@@ -13,14 +13,14 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.maths.float64_buffers import Float64Buffers
-from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes.force_elements import limited_joints, winding_joints
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
     from torchrl_gn.scenes import Scene
 
-NEAR_ANGLE, NEAR_PLACE = 0.1, 0.02  # rad and metres: up to this distance from a limit its features vary
+_NEAR_ANGLE, _NEAR_PLACE = 0.1, 0.02  # rad and metres: up to this distance from a limit its features vary
 _SLOW = 0.05  # rad/s or m/s: up to this rate the sign of friction varies
 _SIZE = 9
 
@@ -39,8 +39,7 @@ class Joints(Feature):
         return _SIZE
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        if layout != BODY_STATE:
-            raise ValueError(f"Joints needs states of bodies; scene {scene.name!r} has others: leave the feature out.")
+        self.require_bodies(scene, layout)
         return _Bound(scene)
 
 
@@ -60,7 +59,7 @@ class _Bound(Float64Buffers):
         springs = model.jnt_stiffness.reshape(model.njnt, -1)[:, 0] != 0
         self.constants(
             {
-                "near": np.where(np.isin(kinds, turns), NEAR_ANGLE, NEAR_PLACE),
+                "near": np.where(np.isin(kinds, turns), _NEAR_ANGLE, _NEAR_PLACE),
                 # Where a coordinate tells nothing, it would only break an invariance.
                 "shown": (limited | springs).astype(float),
                 "limited": limited.astype(float),
