@@ -115,9 +115,10 @@ def variant(scene: Scene, substeps: int, iterations: int | None = None) -> Scene
         raise ValueError(f"system={scene.name!r} is not one of the built-in systems, whose settings can be varied.")
     spec = system.build()
     spec.option.timestep = scene.timestep / substeps
+    other = load_scene(spec, timestep=scene.timestep, name=scene.name)
     if iterations is not None:
-        spec.option.iterations = iterations
-    return load_scene(spec, timestep=scene.timestep, name=scene.name)
+        other.model.opt.iterations = iterations  # a scene has at least MuJoCo's default
+    return other
 
 
 def simulate(simulators: dict[int, Simulator], physics: Tensor, _: Tensor, actions: Tensor) -> Tensor:

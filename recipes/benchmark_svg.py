@@ -21,7 +21,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import ValueEstimators
 
-from _common import clean_exit, finish_run, open_run, with_help
+from _common import as_list, clean_exit, finish_run, open_run, with_help
 from _common.timing import time_in_turn
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.envs import observation_env
@@ -63,7 +63,7 @@ def main(cfg: DictConfig) -> None:
     policy, start = Agent(graph, hidden=cfg.hidden).policy, env.reset()
     experience = torch.no_grad()(lambda: env.step(policy(start.copy())))
     ways: dict[str, Callable] = {f"{cfg.num_envs} environment steps": experience}
-    for horizon in cfg.horizons:
+    for horizon in as_list(cfg.horizons):
         of = ("reference", "folded", "compiled", "mlp", "mlp compiled") if horizon else ("reference", "compiled")
         for way in of if cfg.compile else (way for way in of if "compiled" not in way):
             ways[f"SVG({horizon}), {way}"] = make_update(cfg, graph, env, data, horizon, way)

@@ -8,6 +8,8 @@ random trajectories of the true physics, trains the forward model on them, and e
 trajectories never trained on. Ctrl-C saves everything; the same `run_dir` goes on.
 
 - Several systems have equal shares of every batch (paper: "Learning a forward model for multiple systems").
+- An MJCF file's errors are also shown apart for calm and full random controls (`data.pace`), where these differ, and
+  below them those of MuJoCo itself at half its physics step: how far rollouts of the robot are determined at all.
 - `zero_shot` systems are only evaluated (paper: Figure "Zero-shot dynamics prediction").
 - `parametrized=true` trains on random variants of the systems, each sequence of its own (paper: SM "Datasets"), and
   evaluates on new variants and on the standard systems. Of several systems, those without variants stay as they are.
@@ -34,15 +36,17 @@ from tqdm import tqdm
 from _common import as_list, clean_exit, finish_run, load_system, resumed_checkpoint, with_help
 from _common.known_physics import load_physics
 from _common.models import build_model
-from _common.progress import cut_short_note, train_with_progress
+from _common.progress import check_lengths, cut_short_note, poor_note, train_with_progress
 from _common.training_data import Task, make_buffer, make_tasks
 from torchrl_gn import load_pretrained
-from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.data import Simulator, collect_trajectories, has_paces, trajectory_buffer
+from torchrl_gn.data.collect import check_bounds
 from torchrl_gn.dynamics import ForwardModel, Physics
 from torchrl_gn.evaluation import (
     ErrorTable,
     baseline_errors,
     evaluate_errors,
+    half_step_errors,
     plot_errors,
     plot_training_curve,
     report,
@@ -52,6 +56,7 @@ from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import Budget, RunFolder, Tracker, Trainer, Workers, join_workers, make_optimizer, plain_config
 
+_SIDE_SEQUENCES = 200  # of what is shown beside a system: its paces, and MuJoCo at half its step
 # Options that may differ when a run goes on.
 MAY_CHANGE = (
     "minutes",
@@ -63,6 +68,7 @@ MAY_CHANGE = (
     "run_dir",
     "checkpoint_seconds",
     "patience",
+    "horizons",
     "zero_shot",
     "data.ray",
 )
@@ -84,14 +90,14 @@ def make_model(cfg: DictConfig, scenes: list[Scene], physics: Physics | None) ->
 
 def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], workers: Workers) -> Trainer:
     """Wire data, loss and optimiser together."""
-    losses = []
+    losses, device = [], next(model.parameters()).device
     for index, task in enumerate(tasks):
         noise = torch.Generator().manual_seed(cfg.seed + 1000 * index + 1_000_000 * workers.rank)
-        loss = ForwardModelLoss(task.bind(model), noise=cfg.noise, generator=noise)
-        losses.append(loss.to(next(model.parameters()).device))
+        loss = ForwardModelLoss(task.bind(model), noise=cfg.noise, size_floor=cfg.size_floor, generator=noise)
+        losses.append(loss.to(device))
     unroll = None
     if cfg.unroll_fraction > 0:
-        unroll = make_buffer(tasks, cfg.unroll_batch_size, cfg.unroll_steps, cfg.seed + 1, workers)
+        unroll = make_buffer(tasks, cfg.unroll_batch_size, cfg.unroll_steps, cfg.seed + 1, workers, device)
 
     def validate() -> float:
         """Geometric mean over the systems, so that each counts by its own scale."""
@@ -105,7 +111,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
 
     return Trainer(
         losses[0] if len(losses) == 1 else SeveralScenesLoss(losses),
-        make_buffer(tasks, cfg.batch_size, 1, cfg.seed, workers),
+        make_buffer(tasks, cfg.batch_size, 1, cfg.seed, workers, device),
         make_optimizer(model, cfg.optimizer, lr=cfg.lr),
         Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock),
         unroll=unroll,
@@ -129,20 +135,28 @@ def evaluate(
     cfg: DictConfig, model: ForwardModel, tasks: list[Task], unseen: list[Scene], folder: Path
 ) -> tuple[dict[str, ErrorTable], list[Path]]:
     """Error tables of every system by name, and figures and videos of those trained on."""
-    tables, files = {}, []
+    tables, files, horizons = {}, [], tuple(as_list(cfg.horizons))
     for task in tasks:
         name, test = task.scene.name, task.dataset.test
         place = folder if len(tasks) == 1 else folder / name
         scene = task.dataset.scene_of("test", 0)
-        tables[name], written = report(task.bind(model), test, place, scene=scene, horizons=tuple(cfg.horizons))
+        tables[name], written = report(task.bind(model), test, place, scene=scene, horizons=horizons)
         files += written
         if model.physics is not None:
-            tables |= baseline_errors(task.scene, test, model.physics, horizons=tuple(cfg.horizons))
-    others = {f"standard {task.scene.name}": task.scene for task in tasks if task.parametrized}
-    others |= {f"{scene.name} (zero-shot)": scene for scene in unseen}
-    for name, scene in tqdm(others.items(), desc="evaluating", disable=not others, leave=False):
-        sequences = collect_trajectories(scene, cfg.data.test, cfg.data.length, cfg.data.seed, split=3)
-        tables[name] = evaluate_errors(model.bind(scene), sequences, horizons=tuple(cfg.horizons))
+            tables |= baseline_errors(task.scene, test, model.physics, horizons=horizons)
+    others = {f"standard {task.scene.name}": (task.scene, cfg.data.test, {}) for task in tasks if task.parametrized}
+    others |= {f"{scene.name} (zero-shot)": (scene, cfg.data.test, {}) for scene in unseen}
+    few = min(cfg.data.test, _SIDE_SEQUENCES)
+    for scene in [task.scene for task in tasks] if cfg.data.pace == "mixed" else []:
+        for pace in ("calm", "fast", "full") if has_paces(Simulator(scene, 1)) else ():
+            others[f"{scene.name} ({pace})"] = scene, few, {"pace": pace, "bounds": cfg.data.bounds}
+    for name, (scene, count, options) in tqdm(others.items(), desc="evaluating", disable=not others, leave=False):
+        sequences = collect_trajectories(scene, count, cfg.data.length, cfg.data.seed, split=3, **options)
+        tables[name] = evaluate_errors(model.bind(scene), sequences, horizons=horizons)
+    for scene in [task.scene for task in tasks if "system" not in task.scene.origin]:
+        options = {"pace": cfg.data.pace, "bounds": cfg.data.bounds, "split": 3}
+        sequences = collect_trajectories(scene, few, cfg.data.length, cfg.data.seed, **options)
+        tables[f"{scene.name}: MuJoCo at half its step"] = half_step_errors(scene, sequences, horizons=horizons)
     if len(tables) > 1:
         files.append(plot_errors(tables, folder / "errors.png"))
     return tables, list(dict.fromkeys(files))
@@ -153,6 +167,8 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     torch.manual_seed(cfg.seed)
     if cfg.threads is not None or cfg.clock == "processor":  # that clock adds up the time of all threads
         torch.set_num_threads(cfg.threads or 1)
+    check_lengths(cfg.data, as_list(cfg.horizons))
+    check_bounds(cfg.data.bounds)
     scenes, unseen = load_scenes(cfg, cfg.system), load_scenes(cfg, cfg.zero_shot)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)  # refuse a bad budget before anything is written
     if cfg.physics is not None and len(scenes) > 1:
@@ -194,8 +210,9 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     for name, table in tables.items():
         tracker.log_table(f"errors of {name}", table.rows())
     print(tables[scenes[0].name] if len(tables) == 1 else summary(tables))
-    if note := cut_short_note(trainer, run.path):
-        print(note)
+    for note in (poor_note(tables, trainer.step), cut_short_note(trainer, run.path)):
+        if note:
+            print(note)
     finish_run(cfg, run, tracker, metrics, files=files, checkpoints=[run.checkpoint], step=trainer.step)
 
 

@@ -30,7 +30,7 @@ from torch import nn
 from _common import clean_exit, finish_run, open_log, resumed_checkpoint, with_help
 from _common.identification import TestSystems, control_figure, identified_errors, probe
 from _common.models import build_model, model_overrides
-from _common.progress import dataset_with_progress, train_with_progress
+from _common.progress import check_lengths, dataset_with_progress, train_with_progress
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
 from torchrl_gn.evaluation import (
@@ -101,6 +101,7 @@ def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset
 
 def refuse_sizes(cfg: DictConfig) -> None:
     """Refuse at once what would fail when the training is done."""
+    check_lengths(cfg.data)
     if cfg.context_length + 20 > cfg.data.length:
         raise ValueError(
             f"context_length={cfg.context_length} leaves fewer than 20 of data.length={cfg.data.length} steps to"

@@ -14,7 +14,6 @@ folder.
 from __future__ import annotations
 
 import itertools
-import json
 from pathlib import Path
 from statistics import mean
 
@@ -24,6 +23,7 @@ from omegaconf import DictConfig
 
 from _common import as_list, clean_exit, open_log, with_help
 from _common.sweeps import RECIPES, Run, folder_name, refuse_changes, report_sweep, run_all
+from torchrl_gn.atomic import read_json
 from torchrl_gn.evaluation import plot_learning_curves
 from torchrl_gn.training import RunFolder
 
@@ -86,7 +86,7 @@ def main(cfg: DictConfig) -> None:
         done = {seed: values for seed, (_, values) in found.items() if values}
         if not done:
             continue
-        of_seed = {seed: json.loads((found[seed][0].folder / "curve.json").read_text()) for seed in done}
+        of_seed = {seed: read_json(found[seed][0].folder / "curve.json") for seed in done}
         frames, returns = next(iter(of_seed.values()))["frames"], [curve["returns"] for curve in of_seed.values()]
         curves[name] = (frames, returns)
         cells = [name, str(len(done))]

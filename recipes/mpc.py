@@ -66,6 +66,7 @@ from _common.planning_task import (
 from torchrl_gn.data import spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards
+from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.planners import BoundedPolicy, GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.rewards import FreezeGoal
@@ -128,34 +129,45 @@ def make_planner(
     return MPPIPlanner(where, ReturnToGo(), chosen.temperature, planning_horizon=cfg.horizon, **sizes)
 
 
+def play_step(
+    cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv | None, episodes: Episodes
+) -> tuple[TensorDictBase, dict[str, Tensor]]:
+    """Plan and execute the next step: where the episodes are after it, and its records."""
+    started = time.perf_counter()
+    now = policy(episodes.now.copy())
+    step = {"action": now["action"], "seconds": torch.tensor(time.perf_counter() - started)}
+    if name in ("gn", "ilqr", "ilqg") and not cfg.delay:
+        step["planned"] = planned_state(env, None if name == "ilqg" else imagined, now)
+    stepped = env.step(now)
+    after = stepped.exclude("next", "action", "done", "terminated")
+    after.update(stepped["next"].exclude("reward", "done", "terminated"))
+    # An unstable simulation stays at its last good state; NaN marks that its episode is over.
+    over = stepped["next", "terminated"].squeeze(-1) | episodes.over
+    step["reward"] = stepped["next", "reward"].squeeze(-1).masked_fill(over, torch.nan)
+    step["state"] = after["state"].masked_fill(over[:, None, None], torch.nan)
+    return after, step
+
+
 def execute(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv | None, episodes: Episodes) -> None:
-    """Run the episodes to their end or to Ctrl-C, and save them."""
+    """Run the episodes to their end or to Ctrl-C, which comes between whole steps, and save them."""
     last = time.monotonic()
-    try:
-        with torch.no_grad(), tqdm(total=cfg.steps, initial=len(episodes), desc=name, unit="step", leave=False) as bar:
+    with (
+        held(),
+        torch.no_grad(),
+        tqdm(total=cfg.steps, initial=len(episodes), desc=name, unit="step", leave=False) as bar,
+    ):
+        try:
             while len(episodes) < cfg.steps:
-                started = time.perf_counter()
-                now = policy(episodes.now.copy())
-                seconds = time.perf_counter() - started
-                if name in ("gn", "ilqr", "ilqg") and not cfg.delay:
-                    episodes.records["planned"].append(planned_state(env, None if name == "ilqg" else imagined, now))
-                stepped = env.step(now)
-                episodes.now = stepped.exclude("next", "action", "done", "terminated")
-                episodes.now.update(stepped["next"].exclude("reward", "done", "terminated"))
-                # An unstable simulation stays at its last good state; NaN marks that its episode is over.
-                over = stepped["next", "terminated"].squeeze(-1) | episodes.over
-                reward = stepped["next", "reward"].squeeze(-1).masked_fill(over, torch.nan)
-                state = episodes.now["state"].masked_fill(over[:, None, None], torch.nan)
-                for key, value in (("state", state), ("action", now["action"]), ("reward", reward)):
-                    episodes.records[key].append(value)
-                episodes.records["seconds"].append(torch.tensor(seconds))
-                bar.set_postfix(reward=f"{float(reward.nanmean()):.3g}", refresh=False)
+                with let_in_at_once():
+                    after, step = play_step(cfg, name, policy, env, imagined, episodes)
+                episodes.record(after, step)
+                bar.set_postfix(reward=f"{float(step['reward'].nanmean()):.3g}", refresh=False)
                 bar.update()
                 if time.monotonic() - last > SAVE_SECONDS:
                     episodes.save()
                     last = time.monotonic()
-    finally:
-        episodes.save()
+        finally:
+            episodes.save()
 
 
 @with_help

@@ -28,8 +28,8 @@ import hydra
 from omegaconf import DictConfig
 
 from _common import as_list, clean_exit, load_system, open_log, scene_options, with_help
+from _common.episodes import read_episodes
 from _common.sweeps import FORWARD_MODEL, MPC, VALUE, Run, override, refuse_changes, report_sweep, run_all
-from _common.tensor_files import load_tensors
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.training import RunFolder, load_pretrained, pretrained_names
 
@@ -149,7 +149,7 @@ def main(cfg: DictConfig) -> None:
             cells = [f"{value:.1e}" for value in errors.values()] if planner == cfg.planner and errors else ["", ""]
             lines.append(f"| {label} | {reward} | {of['planning_ms']:.0f} | " + " | ".join(cells) + " |")
     kept = [run for run in executed if run.metrics is not None]
-    rewards = [load_tensors(run.folder / f"{cfg.planner}.safetensors")["reward"] for run in kept]
+    rewards = [read_episodes(run.folder / f"{cfg.planner}.safetensors", "reward")["reward"] for run in kept]
     if rewards:
         curves = {f"round {index}": values for index, values in enumerate(rewards)}
         plot_rewards(curves, folder.file("rewards.png"), timestep=scene.timestep, ylabel="reward")

@@ -25,7 +25,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
-from _common import clean_exit, finish_run, open_log, with_help
+from _common import as_list, clean_exit, finish_run, open_log, with_help
 from _common.known_physics import load_physics
 from _common.mirrored import mirrored
 from _common.models import build_model
@@ -107,7 +107,7 @@ def rollout_horizons(cfg: DictConfig) -> set[int]:
     longest = cfg.length - cfg.burn_in
     if longest < 1:
         raise ValueError(f"length={cfg.length} leaves no step behind burn_in={cfg.burn_in} to predict.")
-    return {steps for steps in cfg.horizons if steps <= longest} | {longest}
+    return {steps for steps in as_list(cfg.horizons) if steps <= longest} | {longest}
 
 
 def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data: dict[str, TensorDictBase]) -> Trainer:

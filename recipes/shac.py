@@ -16,7 +16,6 @@ once, and each has its own value, model and video. All options: recipes/config/s
 
 from __future__ import annotations
 
-import json
 import shutil
 import statistics
 import time
@@ -33,9 +32,10 @@ from _common import as_list, clean_exit, finish_run, load_system, open_log, refu
 from _common.actor_critic import WINDOW
 from _common.actor_critic_rounds import ActorCritic, Round, Task
 from _common.planning_task import reward_of
-from torchrl_gn.atomic import atomic_path, write_json
+from torchrl_gn.atomic import atomic_path, read_json, write_json
 from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation import evaluate_errors, plot_learning_curves, rollout_video
+from torchrl_gn.interrupts import held
 from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.training import RunFolder, load_pretrained
@@ -170,11 +170,13 @@ def main(cfg: DictConfig) -> None:
     tracker = open_log(cfg, run, label=f"shac-{tasks[0].scene.name}")
     for task in tasks:
         task.collect(done)
-    rounds: list[dict[str, Any]] = [json.loads(each.numbers.read_text()) for each in done]
-    judged: list[TensorDict] = []
+    rounds: list[dict[str, Any]] = [read_json(each.numbers) for each in done]
     latest = [run.path / "policy.safetensors"]
-    latest += [run.path / task.folder / "value.safetensors" for task in tasks]
-    latest += [run.path / task.folder / CHECKPOINT_FILE for task in tasks]
+    latest += [run.path / task.folder / name for name in ("value.safetensors", CHECKPOINT_FILE) for task in tasks]
+    policy, judged = None, []
+    if done:  # whose last may have ended before these were written
+        policy = learner.averaged(run.path, len(done) - 1)
+        keep_latest(learner, done[-1], policy, latest)
     with tqdm(total=cfg.rounds, initial=len(done), desc="rounds", leave=False) as bar:
         for index in range(len(done), cfg.rounds):
             began, seed = time.process_time(), cfg.seed + 1000 * (index + 1)
@@ -195,22 +197,31 @@ def main(cfg: DictConfig) -> None:
                     **losses,
                 }
             )
-            learner.save(now)
-            for task, trajectories in zip(tasks, played, strict=True):
-                task.add(trajectories, now)
-            write_json(now.numbers, rounds[-1])
-            learner.save_policy(latest[0], policy)
-            files = [now.of(what, task) for what in ("value", "model") for task in tasks]
-            for source, target in zip(files, latest[1:], strict=True):
-                copy_to(source, target)
-            tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
+            with held():  # Ctrl-C does not cost a round that is played
+                learner.save(now)
+                for task, trajectories in zip(tasks, played, strict=True):
+                    task.add(trajectories, now)
+                write_json(now.numbers, rounds[-1])
+                keep_latest(learner, now, policy, latest)
+                tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
+    assert policy is not None
+    if not judged:
+        judged, _ = judge_all(cfg, tasks, policy)  # for the videos
     zero_shot: dict[str, float] = {}
     if others:
         kept = load_pretrained(latest[0]).policy
         zero_shot = {f"zero_shot/{task.scene.name}": judge(cfg, task, kept)[1]["return"] for task in others}
     finish_run(cfg, run, tracker, report(run, tasks, rounds, judged, zero_shot), checkpoints=latest)
+
+
+def keep_latest(learner: ActorCritic, last: Round, policy: BoundedPolicy, latest: list[Path]) -> None:
+    """Write the averaged policy, and the values and models of the last round, to their places in the run folder."""
+    learner.save_policy(latest[0], policy)
+    files = [last.of(what, task) for what in ("value", "model") for task in learner.tasks]
+    for source, target in zip(files, latest[1:], strict=True):
+        copy_to(source, target)
 
 
 def copy_to(source: Path, target: Path) -> None:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from _common import clean_exit, finish_run, open_log, refuse_other_options, scene_options, with_help
 from _common.episodes import transitions
+from _common.options import SCENE_OPTIONS
 from _common.planning_task import reward_of
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.planners import StatePolicy, StateValue, task_invariances
@@ -32,7 +33,7 @@ from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, fit_policy, fit_value, plain_config, save_checkpoint
 from torchrl_gn.training.run_folder import CONFIG_FILE
 
-TASK = ("system", "timestep", "action_bounds", "wide_starts", "reward")  # options of an episode that its value is for
+TASK = ("system", *SCENE_OPTIONS, "reward")  # options of an episode that its value is for
 
 
 def task_of(files: list[Path]) -> DictConfig:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
+import signal
 import tempfile
 from collections.abc import Callable, Iterator
 
@@ -30,14 +32,16 @@ def scenes() -> dict[str, Scene]:
 
 
 def _random_states(scene: Scene, *batch: int, seed: int = 0, scale: float = 1.0) -> Tensor:
-    """``[*batch, N, 13]`` float64 states that differ in movable components only."""
+    """``[*batch, N, C]`` float64 states that differ in movable components only."""
     generator = torch.Generator().manual_seed(seed)
-    movable = torch.as_tensor(scene.movable, dtype=torch.float64)
+    bodies, activated = torch.as_tensor(scene.movable, dtype=torch.float64).split((12, scene.state_size - 13), dim=-1)
     shape = (*batch, scene.num_nodes, 12)
-    noise = scale * movable * torch.randn(shape, generator=generator, dtype=torch.float64)
+    noise = scale * bodies * torch.randn(shape, generator=generator, dtype=torch.float64)
     offset = torch.zeros(scene.num_nodes, 3, dtype=torch.float64)
     offset[1:, 2] = 0.5
-    return torch.cat((offset + noise[..., :3], quaternion.exp(noise[..., 3:6]), noise[..., 6:]), dim=-1)
+    activations = activated * torch.rand(*batch, *activated.shape, generator=generator, dtype=torch.float64)
+    poses = offset + noise[..., :3], quaternion.exp(noise[..., 3:6])
+    return torch.cat((*poses, noise[..., 6:], activations), dim=-1)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +79,8 @@ def fit(random_states, random_actions) -> Callable[..., ForwardModel]:
         state = random_states(scene, 100)
         update_parameter_normalizers(bound)
         generator = torch.Generator().manual_seed(1)
-        change = 0.02 * torch.randn(100, scene.num_nodes, 12, generator=generator, dtype=torch.float64)
+        shape = 100, scene.num_nodes, model.layout.delta_size
+        change = 0.02 * torch.randn(shape, generator=generator, dtype=torch.float64)
         change = change * torch.as_tensor(scene.movable)
         update_dynamic_normalizers(bound, state, random_actions(scene, 100), model.layout.apply(state, change))
         return model
@@ -200,3 +205,24 @@ def folds(monkeypatch) -> list:
 
     monkeypatch.setattr(GNCore, "fold", watched)
     return folded
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[Callable[..., Callable]]:
+    """Make a function that Ctrl-C, or another signal, interrupts after its so-manieth call, before it returns."""
+    # Where pytest runs in the background, as in CI, its shell may have had it ignore Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def interrupt(function: Callable, count: int, number: int = signal.SIGINT) -> Callable:
+        calls = itertools.count(1)
+
+        def interrupted(*arguments, **options):
+            result = function(*arguments, **options)
+            if next(calls) == count:
+                os.kill(os.getpid(), number)
+            return result
+
+        return interrupted
+
+    yield interrupt
+    signal.signal(signal.SIGINT, before)

@@ -21,12 +21,11 @@ PACKAGE = Path(torchrl_gn.__file__).parent
 
 # A folder imports from itself and from those before it: the data flow is the reading order.
 ORDER = (
-    "scenes", "data", "maths", "networks", "dynamics", "identification", "policies", "rewards",
+    "maths", "scenes", "data", "networks", "dynamics", "identification", "policies", "rewards",
     "drawing", "envs", "planners", "objectives", "evaluation", "training",
 )  # fmt: skip
 # Earlier folders that a folder does not import either.
 APART = {
-    "maths": {"scenes", "data"},
     "networks": {"scenes", "data"},
     "dynamics": {"data"},
     "identification": {"data"},
@@ -36,7 +35,8 @@ APART = {
     "objectives": {"data", "rewards", "drawing"},
 }
 ALLOWED = {folder: {*ORDER[:index], folder} - APART.get(folder, set()) for index, folder in enumerate(ORDER)}
-ANYWHERE = {"atomic", "finite", "processor"}  # modules beside the folders, which import none of them
+# Modules beside the folders, which import none of them.
+ANYWHERE = {"atomic", "cache", "finite", "interrupts", "processor"}
 ABOVE = {"__init__", "__main__", "doctor"}  # these may import all folders, and no folder imports them
 LATER = (ast.FunctionDef, ast.AsyncFunctionDef)  # what is imported in there is not when the package is
 WITH_PILLOW = {"panels.py"}  # imported to draw a video, once Pillow was found

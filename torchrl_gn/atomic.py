@@ -1,33 +1,74 @@
-"""Atomic writes: a file is complete or unchanged."""
+"""Atomic writes: a file is complete and on disk, or unchanged."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # a full disk, a quota, a limit on the size of files
+
+_TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")  # names of atomic_path's temporary files
+
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path, with the same suffix, that replaces ``path`` if the block succeeds.
 
-    Makes missing parent folders. If the block fails, ``path`` is unchanged.
+    Makes missing parent folders. The file is on disk before it takes the name, and its folder after, so that a power
+    cut leaves the old file or the new one. If the block fails, ``path`` is unchanged.
+
+    Raises:
+        OSError: if there is no space, with the path and what to do.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(path.parent)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         yield temporary
         # Some writers deny access to others: give the file the user's default mode.
         os.umask(mask := os.umask(0))
         temporary.chmod(0o666 & ~mask)
+        _sync(temporary)
         os.replace(temporary, path)
+        sync_folder(path.parent)
+    except OSError as error:
+        if error.errno in NO_SPACE and str(path) not in str(error):
+            raise OSError(
+                error.errno,
+                f"{path} cannot be written: {os.strerror(error.errno)}. What was there is as it was; make room and run"
+                " the same again",
+            ) from error
+        raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names of a folder's files are on disk."""
+    try:
+        _sync(folder)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that cannot, or need not
+            raise
+
+
+def remove_leftovers(folder: str | os.PathLike, *, of: Path | None = None) -> list[Path]:
+    """Remove the temporary files that killed processes left in a folder and those in it; return their paths.
+
+    ``of`` one file only, if it is given. Nobody else may be writing there.
+    """
+    found = Path(folder).rglob(".*") if of is None else of.parent.glob(f".{of.stem}.*{of.suffix}")
+    left = [path for path in found if _TEMPORARY.fullmatch(path.name) and path.is_file()]
+    for path in left:
+        path.unlink(missing_ok=True)
+    return left
 
 
 def write_json(path: str | os.PathLike, values: Any) -> None:
@@ -38,3 +79,27 @@ def write_json(path: str | os.PathLike, values: Any) -> None:
         raise ValueError(f"{path}: {error}; JSON holds finite numbers only.") from error
     with atomic_path(path) as temporary:
         temporary.write_text(text + "\n")
+
+
+def read_json(path: str | os.PathLike) -> Any:
+    """Read what :func:`write_json` wrote; raise ValueError, naming the file, if it is damaged."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}); delete it, and run again what made it.") from error
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder and its missing parents, with names that a power cut does not lose."""
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for each in reversed(missing):
+        sync_folder(each.parent)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

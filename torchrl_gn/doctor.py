@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import re
-import subprocess
 import sys
 import time
 from functools import partial
@@ -14,7 +13,7 @@ from tqdm import tqdm
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import specialize
-from torchrl_gn.dynamics.executors.native.build import find_compiler
+from torchrl_gn.dynamics.executors.native.build import compiler_version, find_compiler
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import instruction_sets, processor_name, product_speeds, restrictions, usable_cores
@@ -109,12 +108,9 @@ def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
 
 def _compiler() -> str | None:
     try:
-        if (command := find_compiler()) is None:
-            return None
-        done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=30)
+        return None if (command := find_compiler()) is None else compiler_version(command) or None
     except (OSError, ValueError):  # ValueError: quotes of CXX that do not close
         return None
-    return done.stdout.splitlines()[0] if done.returncode == 0 and done.stdout else None
 
 
 def _advice(seconds: dict[str, tuple[float, float]], threads: int, compiler: bool, gpu: bool) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -37,3 +39,14 @@ def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> No
     if not bool(finite.all()):
         index = tuple((~finite).nonzero()[0].tolist())
         raise ValueError(f"{what} has {float(value[index])} at index {index}; every number must be finite.")
+
+
+def require_all_finite(values: Mapping[str, Tensor]) -> None:
+    """As :func:`require_finite` of each, by what it is; waits for a device once."""
+    if is_traced():
+        return
+    elsewhere = [value for value in values.values() if not value.is_cpu]
+    if elsewhere and bool(torch.stack([torch.isfinite(value).all() for value in elsewhere]).all()):
+        values = {what: value for what, value in values.items() if value.is_cpu}
+    for what, value in values.items():
+        require_finite(value, what)

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrl_gn.atomic import write_json
+from torchrl_gn.cache import read_cached, write_cached
 
 _ROWS, _SIZE = 1400, 128  # a layer of 200 Swimmer6 states
 _FLOP = 2 * _ROWS * _SIZE**2
@@ -90,18 +90,12 @@ class ProductSpeeds:
 def product_speeds() -> ProductSpeeds:
     """Measure products of 1,400 x 128 by 128 x 128 (0.1 s), or read an earlier result from ``~/.cache/torchrl_gn``."""
     key = "\n".join([processor_name(), instruction_sets(), torch.__version__, *restrictions()])
-    file = cache_folder() / f"products-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
-    with contextlib.suppress(OSError, ValueError, TypeError):  # missing, damaged, or of another version
-        return ProductSpeeds(**json.loads(file.read_text()))
+    name = f"products-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
+    with contextlib.suppress(ValueError, TypeError):  # missing, damaged, or of another version
+        return ProductSpeeds(**json.loads(read_cached(name) or b""))
     speeds = _measure()
-    with contextlib.suppress(OSError):
-        write_json(file, asdict(speeds))
+    write_cached(name, json.dumps(asdict(speeds), indent=2).encode())
     return speeds
-
-
-def cache_folder() -> Path:
-    """Return the folder of what is measured or built once for a processor; RuntimeError without a home."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
 
 
 def processor_name() -> str:

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from _common.actor_critic import ActorCriticOptimizer, TargetSquares, play, played_windows, windows
-from _common.tensor_files import load_tensors, save_tensors
+from _common.tensor_files import load_tensors
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
@@ -22,6 +22,7 @@ from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, St
 from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import fit, load_pretrained, plain_config, save_checkpoint
+from torchrl_gn.training.tensor_files import write_tensors
 
 
 class Round:
@@ -96,7 +97,9 @@ class Task:
         """Train the model on all data, and tell the normalisers of policy and value of the newest."""
         cfg, first = self.cfg, index == 0
         steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
-        fit(self.model, cast(TensorDict, torch.cat(cast(Any, self.data))), steps=steps, lr=lr, seed=cfg.seed + index)
+        data = cast(TensorDict, torch.cat(cast(Any, self.data)))
+        # All samples count alike, as when the results were measured.
+        fit(self.model, data, steps=steps, lr=lr, seed=cfg.seed + index, size_floor=None)
         if isinstance(snapshot := self.loss.env.world_model, SpecializedPredictor):
             snapshot.refresh(self.model)
         else:
@@ -137,7 +140,7 @@ class Task:
     def add(self, played: TensorDict, of: Round) -> None:
         """Keep a round's trajectories, also in its folder."""
         self.data.append(played)
-        save_tensors(of.of("played", self), dict(played.items()))
+        write_tensors(of.of("played", self), dict(played.items()))
 
 
 class ActorCritic:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
@@ -10,10 +11,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from _common.tensor_files import load_tensors, save_tensors
+from _common.tensor_files import load_tensors
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import rollout_video
 from torchrl_gn.scenes import Scene
+from torchrl_gn.training.tensor_files import write_tensors
 
 TIME_FIRST = ("seconds", "planned")  # records of all episodes together, or of the first alone
 
@@ -31,7 +33,7 @@ class Episodes:
         self.records: dict[str, list[Tensor]] = {name: [] for name in ("state", "action", "reward", *TIME_FIRST)}
         self.records["state"].append(start["state"])
         if path.exists():
-            saved = load_tensors(path)
+            saved = read_episodes(path, *self.records, "now.state")
             flat = {key.removeprefix("now."): value for key, value in saved.items() if key.startswith("now.")}
             batch = start.batch_size
             self.now = cast(TensorDictBase, TensorDict(flat, batch_size=batch).unflatten_keys("."))
@@ -54,12 +56,46 @@ class Episodes:
         """Episodes ``[B]`` that ended early because their simulation became unstable."""
         return self.records["state"][-1].isnan().flatten(1).any(1)
 
+    def record(self, now: TensorDictBase, step: Mapping[str, Tensor]) -> None:
+        """Take in a step: where the episodes are after it, and what is recorded of it."""
+        self.now = now
+        for name, value in step.items():
+            self.records[name].append(value)
+
     def save(self) -> None:
         """Write everything, atomically."""
         if not len(self):
             return
         now = {f"now.{key}": value for key, value in self.now.flatten_keys(".").items()}
-        save_tensors(self.path, now | {name: self[name] for name in self.records})
+        write_tensors(self.path, now | {name: self[name] for name in self.records})
+
+
+def read_episodes(path: str | Path, *needed: str) -> dict[str, Tensor]:
+    """Records of saved episodes by name, states and actions at least.
+
+    Raises:
+        ValueError: if the file is missing or damaged, lacks what is ``needed``, or a step of it is not whole.
+    """
+    kept = load_tensors(path)
+    if missing := [name for name in ("state", "action", *needed) if name not in kept]:
+        raise ValueError(f"{path} has no {', '.join(missing)}: it is no file of episodes of recipes/mpc.py; name one.")
+    episodes, steps = (*kept["action"].shape, 0, 0)[:2]
+    wanted = {"state": [episodes, steps + 1], "reward": [episodes, steps], "seconds": [steps], "planned": [steps]}
+    for name, size in wanted.items():
+        if name in kept and list(kept[name].shape[: len(size)]) not in (size, [0] if name == "planned" else size):
+            raise ValueError(
+                f"{path} is damaged: {name} of shape {list(kept[name].shape)} beside action of"
+                f" {list(kept['action'].shape)}, so that a step is not whole; delete it, or name another."
+            )
+    if (now := kept.get("now.state")) is not None:
+        last = kept["state"][:, -1]
+        going = ~last.isnan().flatten(1).any(1)  # episodes that did not become unstable
+        if now.shape != last.shape or not torch.equal(now[going], last[going]):
+            raise ValueError(
+                f"{path} is damaged: its last states are not those that it goes on from, so that a step is missing;"
+                " delete it, or name another."
+            )
+    return kept
 
 
 def transitions(path: Path) -> list[TensorDict]:
@@ -67,7 +103,7 @@ def transitions(path: Path) -> list[TensorDict]:
 
     An episode that became unstable ends before. ValueError if none has a stable step.
     """
-    kept = load_tensors(path)
+    kept = read_episodes(path, "reward")
     lengths = kept["state"].isfinite().flatten(2).all(-1).sum(1) - 1
     found = []
     for length in lengths[lengths > 0].unique().tolist():

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 from _common.options import check_options
+from _common.parent import end_with_parent
+from torchrl_gn.atomic import NO_SPACE
 from torchrl_gn.training import RunFolder
 
 P = ParamSpec("P")
@@ -21,7 +25,8 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
 
     Errors that a user can fix (a bad option, file or data set, an unstable simulation) print one line to standard error
     and exit with code 1. Ctrl-C exits with 130 and SIGTERM with 143, after the recipe has saved what it has and printed
-    where. Anything else is a bug and keeps its traceback, as do torch's RuntimeErrors.
+    where; so does the end of a recipe that started this one. Anything else is a bug and keeps its traceback, as do
+    torch's RuntimeErrors. Run folders are left to other processes.
     """
 
     @functools.wraps(main)
@@ -29,9 +34,10 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
         in_main = threading.current_thread() is threading.main_thread()
         before = signal.signal(signal.SIGTERM, _interrupt) if in_main else None
         try:
+            end_with_parent()
             for options in args:
                 if isinstance(options, Mapping):
-                    check_options(options)
+                    check_options(options, Path(inspect.getfile(inspect.unwrap(main))))
             return main(*args, **kwargs)
         except KeyboardInterrupt as interrupt:
             sys.stderr.write(f"Interrupted; {RunFolder.what_is_kept()}\n")
@@ -39,9 +45,12 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
         except (ValueError, OSError, RuntimeError, FloatingPointError, ImportError) as error:
             if type(error) in (RuntimeError, NotImplementedError, RecursionError):
                 raise
-            sys.stderr.write(f"{type(error).__name__}: {error}\n")
+            full = isinstance(error, OSError) and error.errno in NO_SPACE
+            kept = f"; {RunFolder.what_is_kept()}" if full else ""
+            sys.stderr.write(f"{type(error).__name__}: {error}{kept}\n")
             raise SystemExit(1) from error
         finally:
+            RunFolder.release()
             if in_main:
                 signal.signal(signal.SIGTERM, before)
 

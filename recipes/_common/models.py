@@ -6,16 +6,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchrl_gn.dynamics import (
+    Activations,
     Actuators,
     BodyState,
     Canonicalizer,
-    Contacts,
+    Constraints,
     Controls,
+    Couplings,
     ForwardModel,
     JointAxes,
     Joints,
+    MocapPoses,
     PairContacts,
+    Tendons,
     Wrenches,
+    contacts_of,
 )
 from torchrl_gn.scenes import KinematicTree, Scene
 from torchrl_gn.training import plain_config
@@ -34,15 +39,23 @@ def build_model(
     """
     given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
+    all_scenes = scenes if isinstance(scenes, Sequence) else [scenes]
     optional = {
         "joint_axes": JointAxes(),
         "joints": Joints(),
         "actuators": Actuators(),
-        "contacts": Contacts(),
+        "tendons": Tendons(),
+        "constraints": Constraints(),
+        "couplings": Couplings(),
+        "contacts": contacts_of(all_scenes),
         "contact_pairs": PairContacts(),
     }
-    chosen = [*(feature for name, feature in optional.items() if shown.pop(name)), Wrenches()]
-    all_scenes = scenes if isinstance(scenes, Sequence) else [scenes]
+    chosen = [
+        *(feature for name, feature in optional.items() if shown.pop(name)),
+        Activations(),
+        MocapPoses(),
+        Wrenches(),
+    ]
     features = (BodyState(**shown), Controls(), *(each for each in chosen if any(map(each.suits, all_scenes))))
     return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
 

@@ -11,19 +11,43 @@ from typing import Any, get_args
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_gn.data.random_controls import Pace
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import plain_config
 from torchrl_gn.training.optimizers import Preset
+from torchrl_gn.training.tracking import LoggerKind
 
-_PRESETS = list(get_args(Preset))
-# What options of these names must be, wherever they stand.
+_PRESETS, _LOGGERS, _PACES = (list(get_args(choices)) for choices in (Preset, LoggerKind, Pace))
+_CLOCKS = ["wall", "processor"]
+
+
+def _whole(value: Any, least: int) -> bool:
+    return value >= least and value == int(value)
+
+
+# What options of these names must be, wherever they stand; in a list, each of them.
 _RULES: list[tuple[str, Callable[[Any], bool], str]] = [
     (r"optimizer", lambda value: value in _PRESETS, f"one of {_PRESETS}"),
-    (r"(.*_)?lr", lambda value: 0 < value < math.inf, "a positive, finite number"),
-    (r"(.*_)?batch_size|unroll_steps|threads|patience", lambda value: value >= 1 and value == int(value), "1 or more"),
-    (r"unroll_fraction", lambda value: 0 <= value <= 1, "a share, 0 to 1"),
+    (r"logger", lambda value: value in _LOGGERS, f"one of {_LOGGERS}"),
+    (r"clock", lambda value: value in _CLOCKS, f"one of {_CLOCKS}"),
+    (r"data\.pace", lambda value: value in _PACES, f"one of {_PACES}"),
+    (r"(.*_)?lr|(.*_)?minutes|timestep", lambda value: 0 < value < math.inf, "a positive, finite number"),
+    (
+        r"(.*_)?batch_size|unroll_steps|threads|patience|steps|length|episodes|rollouts|trajectories|sequences|num_envs"
+        r"|collectors|jobs|repeats|candidates|top_k|members|(data|random|swimming|episodes)\.(train|validation|test)"
+        r"|data\.variants|(.*_)?hidden|latent|(.*_)?frames",
+        lambda value: _whole(value, 1),
+        "a whole number, 1 or more",
+    ),
+    (
+        r"(.*_)?seed|seeds|horizons?|rounds|updates|delay|history|burn_in|warm_up|physics_fit|model_steps",
+        lambda value: _whole(value, 0),
+        "a whole number, 0 or more",
+    ),
+    (r"unroll_fraction|wide_starts", lambda value: 0 <= value <= 1, "a share, 0 to 1"),
     (r"noise|checkpoint_seconds", lambda value: 0 <= value < math.inf, "0 or a positive, finite number"),
 ]
+_NULLABLE = ("minutes", "steps")  # in every recipe
 
 
 def as_list(value: Any) -> list[Any]:
@@ -34,18 +58,64 @@ def as_list(value: Any) -> list[Any]:
     return plain if isinstance(plain, list) else [plain]
 
 
-def check_options(cfg: Mapping[str, Any]) -> None:
-    """Raise ValueError, naming it, for an optimiser, rate, batch or the like that no recipe could use; null passes."""
-    for name, value in flat(plain_config(cfg)):
-        for pattern, fits, wanted in _RULES:
-            if value is None or isinstance(value, list) or not re.fullmatch(pattern, name.split(".")[-1]):
+def check_options(cfg: Mapping[str, Any], recipe: Path | None = None) -> None:
+    """Raise ValueError, naming it, for an option that no recipe could use, so that nothing is written before.
+
+    Options of known names have ranges; others must be of the kind of their default in the recipe's
+    ``config/<recipe>.yaml``. Null and words (``lag=auto``) pass where the option's comment says what they mean.
+    """
+    options, lists = dict(flat(plain_config(cfg))), set()
+    for name, default, words in _defaults(recipe):
+        if default == []:  # of what, its comment says
+            lists.add(name)
+        if name in options and (wanted := _wanted(options[name], default, words)):
+            raise ValueError(f"{name}={_shown(options[name])} must be {wanted}.")
+    for name, value in options.items():
+        for pattern, fits, wanted in _RULES if name not in lists else ():
+            if not re.fullmatch(rf"(.*\.)?({pattern})", name):
                 continue
-            try:
-                good = not isinstance(value, bool) and fits(value)
-            except (TypeError, ValueError, OverflowError):  # no number
-                good = False
-            if not good:
-                raise ValueError(f"{name}={value} must be {wanted}.")
+            for each in _leaves(value):
+                try:
+                    good = each is None or (not isinstance(each, bool) and fits(each))
+                except (TypeError, ValueError, OverflowError):  # no number
+                    good = False
+                if not good:
+                    raise ValueError(f"{name}={_shown(value)} must be {wanted}.")
+
+
+def _leaves(value: Any) -> list[Any]:
+    return [leaf for each in value for leaf in _leaves(each)] if isinstance(value, list) else [value]
+
+
+def _shown(value: Any) -> str:
+    return "null" if value is None else str(value)
+
+
+def _defaults(recipe: Path | None) -> Iterator[tuple[str, Any, set[str]]]:
+    """Names of a recipe's options, what they are by default, and the words of their comments."""
+    if recipe is None or not (file := recipe.parent / "config" / f"{recipe.stem}.yaml").exists():
+        return
+    text, loaded = file.read_text(), OmegaConf.to_container(OmegaConf.load(file))
+    for name, default in flat(loaded):
+        # The line of its name, and those of comments behind it.
+        own = re.search(rf"^[^#\n]*\b{re.escape(name.split('.')[-1])}:.*(\n\s*#.*)*", text, re.MULTILINE)
+        yield name, default, {*re.findall(r"[a-z]\w*", own[0] if own else ""), *(["null"] if name in _NULLABLE else [])}
+
+
+def _wanted(value: Any, default: Any, words: set[str]) -> str | None:
+    """What an option must be that is of another kind than its default; None if it may be what it is."""
+    if default is None or (isinstance(default, str) and "${" in default) or _shown(value) in words - {str(default)}:
+        return None
+    if value is None:
+        return None if isinstance(default, (list, Mapping)) else f"given, such as {default}"
+    if isinstance(default, bool):
+        return None if isinstance(value, bool) else "true or false"
+    kinds = {str(type(each).__name__) for each in _leaves(value)}
+    if isinstance(default, (int, float)):
+        return None if kinds <= {"int", "float"} else "a number"
+    if isinstance(default, str):
+        return "a name" if kinds & {"bool", "int", "float"} else None
+    return None
 
 
 def unknown_options(words: Sequence[str], recipe: Path) -> list[str]:
@@ -80,10 +150,13 @@ def flat(values: Any, prefix: str = "", *, groups: bool = False) -> Iterator[tup
             yield f"{prefix}{name}", value
 
 
+SCENE_OPTIONS = ("timestep", "action_bounds", "wide_starts", "mocap_actions", "motors")
+
+
 def scene_options(cfg: DictConfig) -> dict[str, Any]:
     """Options of ``load_scene`` that a recipe has."""
     plain = plain_config(cfg)
-    return {key: plain[key] for key in ("timestep", "action_bounds", "wide_starts")}
+    return {key: plain[key] for key in SCENE_OPTIONS}
 
 
 def load_system(cfg: DictConfig, system: str) -> Scene:

@@ -13,7 +13,9 @@ from tqdm import tqdm
 from torchrl_gn.atomic import write_json
 from torchrl_gn.data import TrajectoryDataset, create_dataset
 from torchrl_gn.evaluation import plot_learning_curves
+from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS
+from torchrl_gn.interrupts import held
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
 from torchrl_gn.training.off_policy import OffPolicyTrainer
@@ -21,6 +23,7 @@ from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.run_folder import RunFolder
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
+from torchrl_gn.training.workers import Workers
 
 _SHORT = 1000  # steps of a training of which every loss is recorded
 
@@ -40,21 +43,30 @@ def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
+def check_lengths(data: Mapping[str, Any], horizons: Sequence[int] = ()) -> None:
+    """Raise ValueError if trajectories are too short for errors that will be measured, over ``horizons`` too."""
+    if data["length"] < HORIZON:
+        raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
+    if horizons and not 1 <= min(horizons) <= max(horizons) <= data["length"]:
+        raise ValueError(
+            f"horizons={list(horizons)} must be from 1 to data.length={data['length']}, the steps of a trajectory."
+        )
+
+
 def dataset_with_progress(
     folder: Path, scene: Scene, data: Mapping[str, Any], *, variants: int | None = None
 ) -> TrajectoryDataset:
     """Create, complete or open the data set ``<name>`` (``<name>_variants``) in ``folder``, with a progress bar.
 
     ``data`` holds the numbers of ``train``, ``validation`` and ``test`` trajectories, ``length`` in control steps,
-    ``seed`` and optionally ``ray``, the address of a Ray cluster to simulate on, ``target_speed`` of position servos
-    and ``bounds`` of the bodies.
+    ``seed`` and optionally ``ray``, the address of a Ray cluster to simulate on, the ``pace`` of random controls and
+    ``bounds`` of the bodies.
     """
-    if data["length"] < HORIZON:
-        raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
+    check_lengths(data)
     name = scene.name if variants is None else f"{scene.name}_variants"
     options: dict[str, Any] = {split: data[split] for split in ("train", "validation", "test")}
     options |= {"steps": data["length"], "seed": data["seed"], "variants": variants, "bounds": data.get("bounds")}
-    options["target_speed"] = data.get("target_speed", 1.0)
+    options["pace"] = data.get("pace", "mixed")
     joined = RayCluster(data["ray"]) if data.get("ray") is not None else nullcontext()
     with collecting(f"data of {scene.name}") as show, joined as cluster:
         if cluster is not None:  # it simulates one chunk per core
@@ -73,6 +85,20 @@ def cut_short_note(trainer: Trainer, folder: Path) -> str | None:
     )
 
 
+def poor_note(tables: Mapping[str, ErrorTable], steps: int) -> str | None:
+    """Say what predicts no better than that nothing moves, and what helps; None for none. ``steps``: of training."""
+    poor = []
+    for name, table in tables.items():
+        bad = [error.name.replace("_", " ") for error in table.errors.values() if not error.total < 1]
+        poor += [f"{name} ({', '.join(bad)})"] if bad else []
+    if not poor:
+        return None
+    return (
+        f"Errors of 1 and more are no better than predicting that nothing moves: {'; '.join(poor)}. {steps:,} steps of"
+        " training or the data may be too few: raise steps=, minutes= or data.train="
+    )
+
+
 def say_finished(checkpoint: Path, amount: str, options: str) -> None:
     """Say that a run which is started again had finished its training."""
     folder = checkpoint.parent.parent
@@ -80,21 +106,31 @@ def say_finished(checkpoint: Path, amount: str, options: str) -> None:
 
 
 @contextmanager
-def saving(save: Callable[[], None], seconds: Callable[[], float], every: float) -> Iterator[Callable[[], None]]:
-    """Save on Ctrl-C; yield a function that saves if ``every`` seconds of ``seconds()`` passed since it last did."""
-    last = seconds()
+def saving(
+    save: Callable[[], None], seconds: Callable[[], float], every: float, *, workers: Workers | None = None
+) -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C back within the block, and save on it; yield what is called after each step and its records.
 
-    def save_when_due() -> None:
-        nonlocal last
-        if seconds() - last > every:
-            save()
-            last = seconds()
+    It lets in what waits, for this or another of the ``workers``; otherwise it saves if ``every`` seconds of
+    ``seconds()`` passed since it last did.
+    """
+    last, together = seconds(), workers or Workers()
+    with held() as interrupts:
 
-    try:
-        yield save_when_due
-    except KeyboardInterrupt:
-        save()
-        raise
+        def step_is_whole() -> None:
+            nonlocal last
+            if together.any(interrupts.waiting):
+                interrupts.let_in()
+                raise KeyboardInterrupt  # another process was interrupted
+            if seconds() - last > every:
+                save()
+                last = seconds()
+
+        try:
+            yield step_is_whole
+        except KeyboardInterrupt:
+            save()  # to its end, whatever else is pressed
+            raise
 
 
 def train_with_progress(
@@ -119,17 +155,18 @@ def train_with_progress(
         curves = resumed.training["curves"]
         if trainer.fraction >= 1 and trainer.workers.first:
             say_finished(path, f"{trainer.step:,} steps, {trainer.seconds / 60:.3g} minutes", "steps= or minutes=")
+    losses: list[float] = curves.pop("recent", [])  # since the last of the curves
     if not trainer.workers.first:
-        for _ in trainer.run():
-            pass
+        with saving(lambda: None, lambda: 0.0, math.inf, workers=trainer.workers) as step_is_whole:
+            for _ in trainer.run():
+                step_is_whole()
         return curves
 
     def save() -> None:
-        state = {**trainer.state_dict(), "curves": curves}
+        state = {**trainer.state_dict(), "curves": {**curves, "recent": losses}}
         save_checkpoint(path, trainer.model, scene=scene, config=config, training=state)
 
     every = 1 if (trainer.budget.steps or math.inf) <= _SHORT else 100
-    losses: list[float] = []
     options: dict[str, Any] = {
         "desc": f"training {name}".strip(),
         "initial": 100 * trainer.fraction,
@@ -139,7 +176,7 @@ def train_with_progress(
     }
     with (
         tqdm(total=100, leave=False, **options) as bar,
-        saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
+        saving(save, lambda: trainer.seconds, config["checkpoint_seconds"], workers=trainer.workers) as step_is_whole,
     ):
         for progress in trainer.run():
             losses.append(progress.loss)
@@ -153,9 +190,9 @@ def train_with_progress(
             bar.update(100 * progress.fraction - bar.n)
             if progress.validation is not None:
                 tracker.log({f"{prefix}validation/rollout_error": progress.validation}, progress.step)
-            save_when_due()
-    trainer.restore_best()
-    save()
+            step_is_whole()
+        trainer.restore_best()
+        save()
     return curves
 
 
@@ -173,7 +210,7 @@ def learn_with_progress(
 
     with (
         tqdm(total=trainer.total, initial=trainer.frames, unit=" frames", desc="learning", leave=False) as bar,
-        saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as save_when_due,
+        saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as step_is_whole,
     ):
         for progress in trainer.run():
             bar.update(progress.frames - bar.n)
@@ -182,8 +219,8 @@ def learn_with_progress(
                 bar.set_postfix({"return": f"{progress.evaluation:.4g}", "updates": progress.updates})
                 numbers = {"return": progress.evaluation, "updates": progress.updates, "seconds": progress.seconds}
                 tracker.log({f"evaluation/{name}": value for name, value in numbers.items()}, progress.frames)
-            save_when_due()
-    save()
+            step_is_whole()
+        save()
 
 
 def report_learning(

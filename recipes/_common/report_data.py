@@ -13,7 +13,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from _common.options import flat
-from torchrl_gn.atomic import write_json
+from torchrl_gn.atomic import read_json, write_json
 from torchrl_gn.training.run_folder import CONFIG_FILE, METRICS_FILE, plain_config
 
 INDEX, DROPPED = "index", "tried-and-dropped"
@@ -36,7 +36,7 @@ def read_claims(folder: Path) -> dict[str, dict[str, Any]]:
 
 def read(folder: Path, name: str) -> dict[str, Any]:
     """Read ``name.json``."""
-    return json.loads((folder / f"{name}.json").read_text())
+    return read_json(folder / f"{name}.json")
 
 
 def read_run(folder: Path, file: str) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def read_run(folder: Path, file: str) -> dict[str, Any]:
     """
     if not (folder / file).exists():
         raise ValueError(f"There is no {file} in {folder}; add it: report.py add=RUN_FOLDER to=CLAIM.")
-    return json.loads((folder / file).read_text())
+    return read_json(folder / file)
 
 
 def recipe_of(run: Path) -> str:
@@ -77,7 +77,7 @@ def add_run(folder: Path, run: Path, claim: str, defaults: Mapping[str, Any], na
     """
     if claim not in (claims := read_claims(folder)):
         raise ValueError(f"to={claim} is not a claim; use one of {sorted(claims)}.")
-    recipe, metrics = recipe_of(run), json.loads((run / METRICS_FILE).read_text())
+    recipe, metrics = recipe_of(run), read_json(run / METRICS_FILE)
     options = changed_options(plain_config(OmegaConf.load(run / CONFIG_FILE)), defaults)  # pyright: ignore
     versions = {key.removeprefix("version/"): metrics.pop(key) for key in list(metrics) if key.startswith("version/")}
     written = datetime.fromtimestamp((run / METRICS_FILE).stat().st_mtime)

@@ -15,7 +15,14 @@ from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.data import Simulator, collect_trajectories, sample_start_states, spline_controls, trajectory_buffer
+from torchrl_gn.data import (
+    Simulator,
+    UncontrolledSceneWarning,
+    collect_trajectories,
+    sample_start_states,
+    spline_controls,
+    trajectory_buffer,
+)
 from torchrl_gn.dynamics import (
     BoundPredictor,
     ForwardModel,
@@ -193,7 +200,9 @@ def small_scenes(s: Setting) -> float:
     worst = 0.0
     for source in SMALL_SCENES:
         scene = load_scene(source, timestep=0.02)
-        data = collect_trajectories(scene, 8, 20, s.cfg.seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UncontrolledSceneWarning)
+            data = collect_trajectories(scene, 8, 20, s.cfg.seed)
         for read in ("scene", "none"):  # with and without globals
             torch.manual_seed(s.cfg.seed)
             weights = ForwardModel.for_scene(scene, parameters=read, latent=32).to(s.model.dtype)

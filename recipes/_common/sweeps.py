@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import shlex
@@ -14,18 +13,21 @@ from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
-from typing import Any
+from typing import IO, Any, cast
 
 from tqdm import tqdm
 
-from torchrl_gn.atomic import atomic_path, write_json
+from _common.parent import start_child
+from torchrl_gn.atomic import atomic_path, read_json, write_json
 from torchrl_gn.evaluation import plot_bars
+from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.training import RayCluster, RunFolder, Tracker
-from torchrl_gn.training.run_folder import METRICS_FILE
+from torchrl_gn.training.run_folder import METRICS_FILE, lock_folder
 
 RECIPES = Path(__file__).parents[1]
 FORWARD_MODEL, MPC, VALUE = (RECIPES / f"{name}.py" for name in ("forward_model", "mpc", "value"))
 OPTIONS_FILE = "options.json"
+LAST_SAVE = 30.0  # seconds that runs have, whose sweep was killed, to save and end
 MAY_DIFFER = ("threads=", "executor=", "data.folder=")  # of a finished run
 
 
@@ -56,7 +58,7 @@ class Run:
     def metrics(self) -> dict[str, Any] | None:
         """Content of ``metrics.json``, if the run is done."""
         path = self.folder / METRICS_FILE
-        return json.loads(path.read_text()) if path.exists() else None
+        return read_json(path) if path.exists() else None
 
     def is_done(self) -> bool:
         """Whether the run has finished with these options.
@@ -68,7 +70,7 @@ class Run:
             return False
         if not (path := self.folder / OPTIONS_FILE).exists():
             return True
-        both = json.loads(path.read_text()), self.overrides
+        both = read_json(path), self.overrides
         before, now = ({option for option in options if not option.startswith(MAY_DIFFER)} for options in both)
         if before == now:
             return True
@@ -97,8 +99,8 @@ def override(value: Any) -> str:
 def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> list[Run]:
     """Run what is not done yet, several at a time, with a progress bar.
 
-    If a run fails, its name is printed and the others go on; the output is in ``log.txt`` of its folder. Ctrl-C ends
-    all runs, which save what they have.
+    If a run fails, its name is printed and the others go on; the output is in ``log.txt`` of its folder. Ctrl-C, and
+    whatever else ends this process, ends all runs, which save what they have.
 
     Args:
         runs: the runs; equal ones run once.
@@ -117,15 +119,17 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
     if not left:
         return []  # without starting a cluster
     pool = _Threads(jobs) if isinstance(jobs, int) else _OnRay(jobs)
-    with tqdm(total=len(runs), initial=len(runs) - len(left), desc=desc, unit="run", leave=False) as bar, pool:
+    progress = tqdm(total=len(runs), initial=len(runs) - len(left), desc=desc, unit="run", leave=False)
+    with held(), progress as bar, pool:  # a second Ctrl-C comes when all have saved
         futures = {pool.start(run): run for run in left}
         try:
-            for future in as_completed(futures):
-                run = futures[future]
-                if future.result():
-                    failed.append(run)
-                    tqdm.write(f"failed: {run.name}; see {run.folder / 'log.txt'}")
-                bar.update()
+            with let_in_at_once():
+                for future in as_completed(futures):
+                    run = futures[future]
+                    if future.result():
+                        failed.append(run)
+                        tqdm.write(f"failed: {run.name}; see {run.folder / 'log.txt'}")
+                    bar.update()
         except KeyboardInterrupt:
             pool.stop()
             raise
@@ -187,18 +191,25 @@ def report_sweep(
     refuse_failures(failed)
 
 
-def _start(run: Run, folder: Path) -> subprocess.Popen:
-    """Start a run's process in a working folder; its output goes to ``log.txt``."""
+def _start(run: Run, folder: Path) -> subprocess.Popen | None:
+    """Start a run's process in a working folder; its output goes to ``log.txt``. None if another process is there."""
     place = folder / run.folder
     place.mkdir(parents=True, exist_ok=True)
-    (place / METRICS_FILE).unlink(missing_ok=True)  # of the options before
-    write_json(place / OPTIONS_FILE, list(run.overrides))
     command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]
     with (place / "log.txt").open("a") as log:
         log.write(f"$ {shlex.join(command)}\n")
         log.flush()
+        try:
+            lock = lock_folder(place, seconds=LAST_SAVE)
+        except ValueError as error:
+            log.write(f"{error}\n")
+            return None
+        (place / METRICS_FILE).unlink(missing_ok=True)  # of the options before
+        write_json(place / OPTIONS_FILE, list(run.overrides))
+        if lock is not None:
+            lock.release()
         # In a session of its own, so that Ctrl-C reaches it once, from here.
-        return subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
+        return start_child(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
 
 
 class _Threads(ThreadPoolExecutor):
@@ -215,7 +226,8 @@ class _Threads(ThreadPoolExecutor):
     def _run(self, run: Run) -> int:
         if self.stopped:
             return 130
-        process = _start(run, Path.cwd())
+        if (process := _start(run, Path.cwd())) is None:
+            return 1
         self.running.add(process)
         if self.stopped:  # since the check above
             process.terminate()
@@ -223,6 +235,7 @@ class _Threads(ThreadPoolExecutor):
             return process.wait()
         finally:
             self.running.discard(process)
+            cast(IO, process.stdin).close()
 
     def stop(self) -> None:
         self.stopped = True
@@ -240,7 +253,8 @@ class _OnRay(RayCluster):
 
 
 def _run_and_wait(run: Run, folder: Path) -> int:
-    process = _start(run, folder)
+    if (process := _start(run, folder)) is None:
+        return 1
     try:
         while True:
             try:
@@ -250,6 +264,7 @@ def _run_and_wait(run: Run, folder: Path) -> int:
     finally:
         process.terminate()
         process.wait()
+        cast(IO, process.stdin).close()
 
 
 def mean_and_half_range(values: Sequence[float]) -> tuple[float, float]:

@@ -1,28 +1,16 @@
-"""Files of episodes and trajectories: tensors by name, written atomically, with a checksum that reading checks."""
+"""Read files of episodes and trajectories, and check what :func:`write_tensors` wrote into them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
-import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
-from torchrl_gn.atomic import atomic_path
-from torchrl_gn.training.checkpoint import DAMAGE, digest_of, read_tensors
-
-
-def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write tensors to a safetensors file."""
-    # Copies: safetensors refuses what shares memory.
-    apart = {name: value.detach().cpu().clone(memory_format=torch.contiguous_format) for name, value in tensors.items()}
-    with atomic_path(path) as temporary:
-        save_file(apart, temporary, metadata={"sha256": digest_of(apart)})
+from torchrl_gn.training.tensor_files import DAMAGE, digest_of, read_tensors
 
 
 def load_tensors(path: str | Path) -> dict[str, Tensor]:
-    """Read a safetensors file; of others than :func:`save_tensors` wrote, no checksum is checked.
+    """Read a safetensors file; of others than :func:`write_tensors` wrote, no checksum is checked.
 
     Raises:
         ValueError: if the file is missing or damaged.

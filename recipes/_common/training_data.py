@@ -12,12 +12,14 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
 
 from _common import as_list
+from _common.episodes import read_episodes
 from _common.progress import dataset_with_progress
-from _common.tensor_files import load_tensors
-from torchrl_gn.data import TrajectoryDataset, trajectory_buffer
+from torchrl_gn.data import TrajectoryDataset, open_tensors, trajectory_buffer
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel
 from torchrl_gn.scenes import Scene, has_variants
 from torchrl_gn.training import Workers
+
+_ROWS = 256  # trajectories that are looked at together
 
 
 @dataclass
@@ -79,27 +81,60 @@ def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
 
 
 def extra_trajectories(source: str, length: int) -> TensorDict:
-    """Trajectories ``[M]`` of a folder, or of a file of recipes/mpc.py's episodes, in pieces of `length` steps."""
+    """Trajectories ``[M]`` of a folder, or of a file of recipes/mpc.py's episodes, in pieces of `length` steps.
+
+    Raises:
+        ValueError: if it holds anything but finite states and actions.
+    """
     if not source.endswith(".safetensors"):
-        return cast(TensorDict, TensorDict.load_memmap(source)).select("state", "action")
-    kept = load_tensors(source)
+        return _whole_trajectories(source)
+    kept = read_episodes(source)
     episodes, steps = kept["action"].shape[:2]
     if steps < length:
         raise ValueError(f"data.extra={source} has episodes of {steps} steps, fewer than data.length={length}.")
     states, actions = (kept[name].unfold(1, length + more, length) for name, more in (("state", 1), ("action", 0)))
     pieces = {"state": states.movedim(-1, 2).flatten(0, 1), "action": actions.movedim(-1, 2).flatten(0, 1)}
     # An episode whose simulation became unstable is NaN from there on.
-    whole = pieces["state"].isfinite().flatten(1).all(1)
+    whole = torch.stack([piece.isfinite().flatten(1).all(1) for piece in pieces.values()]).all(0)
     if not bool(whole.any()):
         raise ValueError(f"data.extra={source} has no {length} steps of an episode that stayed stable.")
     return TensorDict({name: piece[whole] for name, piece in pieces.items()}, [int(whole.sum())])
 
 
-def make_buffer(tasks: list[Task], batch_size: int, window: int, seed: int, workers: Workers) -> ReplayBuffer:
-    """Replay buffer of windows of one system, or of equal shares of several."""
-    share = max(1, batch_size // len(tasks))
+def _whole_trajectories(folder: str) -> TensorDict:
+    try:
+        found = open_tensors(folder)
+    except ValueError as error:
+        raise ValueError(f"data.extra={folder} cannot be read: {error}") from error
+    if missing := {"state", "action"} - set(found.keys()):
+        raise ValueError(f"data.extra={folder} has no {sorted(missing)}, only {sorted(map(str, found.keys()))}.")
+    if found.batch_dims != 1 or not len(found):
+        raise ValueError(
+            f"data.extra={folder} holds trajectories {list(found.batch_size)}; it must be [M], at least one."
+        )
+    found = found.select("state", "action")
+    for first, rows in enumerate(found.split(_ROWS)):
+        for key, values in rows.items():
+            if not bool((finite := values.isfinite().flatten(1).all(1)).all()):
+                row = _ROWS * first + int(finite.logical_not().nonzero()[0])
+                raise ValueError(f"data.extra={folder}: {key} of trajectory {row} is not finite: leave that one out.")
+    return found
+
+
+def make_buffer(
+    tasks: list[Task], batch_size: int, window: int, seed: int, workers: Workers, device: torch.device
+) -> ReplayBuffer:
+    """Replay buffer of windows of one system, or of equal shares of several.
+
+    The data go to a GPU if they take less than a third of its free memory.
+    """
+    share, options = max(1, batch_size // len(tasks)), {"window": window, "shard": workers.shard}
+    size = sum(value.numel() * value.element_size() for task in tasks for value in task.train.values(True, True))
+    there = device.type == "cuda" and 3 * size < torch.cuda.mem_get_info(device)[0]
     buffers = [
-        trajectory_buffer(task.train, batch_size=share, window=window, seed=seed + 1000 * index, shard=workers.shard)
+        trajectory_buffer(
+            task.train.to(device) if there else task.train, batch_size=share, seed=seed + 1000 * index, **options
+        )
         for index, task in enumerate(tasks)
     ]
     if len(buffers) == 1:

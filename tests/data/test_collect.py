@@ -103,6 +103,19 @@ def test_variants_are_told_to_the_policy() -> None:
     assert data["parameters"].shape == (5,)
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_unstable_servos_are_told_of_the_integrator(integrator) -> None:
+    wheel = "<body><joint name='a'/><geom type='cylinder' size='.08 .02' mass='.3'/></body>"
+    motor = "<actuator><velocity joint='a' kv='5' ctrlrange='-10 10'/></actuator>"
+    option = f"<option integrator='{integrator}'/>"
+    scene = load_scene(f"<mujoco>{option}<worldbody>{wheel}</worldbody>{motor}</mujoco>")
+    if integrator == "implicitfast":  # the advice is right
+        assert collect_trajectories(scene, 30, 50)["state"].isfinite().all()
+        return
+    with pytest.raises(UnstableSimulationError, match='Use <option integrator="implicitfast"/>.* or a smaller physics'):
+        collect_trajectories(scene, 30, 50)
+
+
 def test_unstable_policies_are_drawn_again() -> None:
     scene = zoo.load("cart", ('gear="1"', 'gear="1e12"'))
 
@@ -141,5 +154,5 @@ def test_bounds_redraw_and_count(tmp_path: Path, pendulum: Scene) -> None:
 
 def test_data_of_models_say_how_they_were_drawn(tmp_path: Path, pendulum: Scene) -> None:
     sizes: Any = {"train": 2, "validation": 1, "test": 1, "steps": 2}
-    assert create_dataset(tmp_path / "a", zoo.load("pole"), **sizes).manifest["request"]["draws"] == 2
+    assert create_dataset(tmp_path / "a", zoo.load("pole"), **sizes).manifest["request"]["draws"] == 3
     assert "draws" not in create_dataset(tmp_path / "b", load_scene("pendulum"), **sizes).manifest["request"]

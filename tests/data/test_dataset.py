@@ -8,6 +8,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -257,6 +258,26 @@ def _drop_from_manifest(folder: Path) -> Path:
     return file
 
 
+def _empty_request(folder: Path) -> Path:
+    file = folder / "manifest.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "request": {"sizes": {}, "chunk": 0}}))
+    return file
+
+
+def _grow(folder: Path) -> Path:
+    """More sequences than the manifest lists, with a file and checksums that fit."""
+    file, manifest_file = folder / "test" / "meta.json", folder / "manifest.json"
+    for leaf in file.parent.glob("*.memmap"):
+        leaf.write_bytes(leaf.read_bytes() * 2)
+    file.write_text(file.read_text().replace("[4", "[8"))
+    manifest = json.loads(manifest_file.read_text())
+    chunk = manifest["chunks"]["test"][0]
+    chunk["crc32"]["meta.json"] = zlib.crc32(file.read_bytes())
+    manifest["chunks"]["test"].append(chunk)
+    manifest_file.write_text(json.dumps(manifest))
+    return folder / "test"
+
+
 def _newer(folder: Path) -> Path:
     file = folder / "manifest.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "format": 99}))
@@ -280,6 +301,8 @@ def _older(folder: Path) -> Path:
         _remove_shapes,
         _break_manifest,
         _drop_from_manifest,
+        _empty_request,
+        _grow,
         _newer,
         _older,
     ],

@@ -1,13 +1,15 @@
-"""Random controls by actuator kind: scaled, reversing, around the current pose."""
+"""Random controls by actuator kind and pace: scaled, reversing, around the current pose, against gravity."""
 
 from __future__ import annotations
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 
-from torchrl_gn.data import Simulator, actuator_kind, random_controls, sample_start_states, spline_controls
+from torchrl_gn.data import Simulator, actuator_kind, has_paces, random_controls, sample_start_states, spline_controls
+from torchrl_gn.data.holding import MotorLaws, pose_holding_controls
 from torchrl_gn.scenes import SceneError, load_scene
 
 ARM = """
@@ -46,7 +48,7 @@ def test_kinds() -> None:
 def drawn() -> tuple[Simulator, np.ndarray, np.ndarray]:
     simulator = Simulator(load_scene(ARM), 1)
     physics = sample_start_states(simulator.scene, 300, 0)
-    return simulator, physics, random_controls(simulator, physics, 200, 0)
+    return simulator, physics, random_controls(simulator, physics, 200, 0, pace="calm")
 
 
 def test_position_targets_hold_the_start_and_move_slowly(drawn) -> None:
@@ -66,27 +68,36 @@ def test_position_targets_hold_the_start_and_move_slowly(drawn) -> None:
     assert (reach.max(0) > 0.5 * np.array([5.8, 2])).all() and (reach.min(0) < 0.1 * np.array([5.8, 2])).all()
 
 
-def test_the_speed_of_position_targets_is_a_factor(drawn) -> None:
-    simulator, physics, controls = drawn
-    other = random_controls(simulator, physics, 200, 0, target_speed=0.5)
-    slow, full = (abs(np.diff(each[..., :2], axis=1)).max((0, 1)) for each in (other, controls))
-    assert (slow <= 0.5001 * full).all() and (slow > 0.3 * full).all()
-    np.testing.assert_array_equal(other[..., 2:], controls[..., 2:])
-    free = random_controls(simulator, physics, 200, 0, target_speed=None)
-    assert (abs(np.diff(free[..., :2], axis=1)).max((0, 1)) > 3 * full).all()
-    for bad in (0, -1, np.inf, np.nan):
-        with pytest.raises(ValueError, match="target_speed must be above 0 and finite"):
-            random_controls(simulator, physics, 2, 0, target_speed=bad)
+def test_a_quarter_of_the_calm_sequences_holds_its_state(drawn) -> None:
+    _, _, controls = drawn
+    still = (np.ptp(controls[..., :2], axis=1) <= 0.02 * np.array([5.8, 2]) + 1e-12).all(1)
+    assert 0.15 < still.mean() < 0.35
+
+
+def test_calm_fast_and_full_sequences_make_the_mixture(drawn) -> None:
+    simulator, physics, calm = drawn
+    drawings = {pace: random_controls(simulator, physics, 200, 0, pace=pace) for pace in ("fast", "mixed", "full")}
+    for other in drawings.values():
+        np.testing.assert_array_equal(other[..., 2:], calm[..., 2:])  # the others are sane at full bounds
+    speeds = {name: abs(np.diff(each[..., :2], axis=1)).max(1) for name, each in {**drawings, "calm": calm}.items()}
+    median = {name: np.median(each, axis=0) for name, each in speeds.items()}
+    assert (2.5 * median["calm"] < median["fast"]).all() and (1.5 * median["fast"] < median["full"]).all()
+    quick = (speeds["mixed"] > 1.0001 * speeds["calm"].max(0)).any(1)
+    assert 0.15 < quick.mean() < 0.35
+    with pytest.raises(ValueError, match=r"pace='slow' is not known; use one of \['mixed', 'calm', 'fast', 'full'\]"):
+        random_controls(simulator, physics, 2, 0, pace="slow")  # pyright: ignore[reportArgumentType]
 
 
 def test_servos_follow_without_flinging_the_arm(drawn) -> None:
-    simulator, physics, controls = drawn
-    physics, controls = physics[:40], controls[:40, :60]
-    moved = simulator.rollout(physics, controls)
-    assert moved["stable"].all()
-    flung = simulator.rollout(physics, spline_controls(simulator.scene, 40, 60, 0))
-    speed, before = (data["physics"][..., 5 + 1 : 5 + 2 + 1].abs() for data in (moved, flung))
-    assert speed.max() < 8 and speed.max() < 0.4 * before.max()
+    simulator, physics, _ = drawn
+    physics, speed = physics[:40], {}
+    for pace in ("calm", "fast", "full"):
+        moved = simulator.rollout(physics, random_controls(simulator, physics, 60, 0, pace=pace))
+        assert moved["stable"].all()
+        speed[pace] = moved["physics"][..., 5 + 1 : 5 + 2 + 1].abs()
+    assert max(speed["calm"].max(), speed["fast"].max()) < 8 and speed["full"].max() > 20
+    calm, fast, full = (float(each.flatten().quantile(0.95)) for each in speed.values())
+    assert 1.8 * calm < fast < 2 * np.pi and 1.5 * fast < full
 
 
 def test_velocity_targets_reverse(drawn) -> None:
@@ -146,3 +157,108 @@ def test_actions_without_bounds_are_named() -> None:
     ):
         with pytest.raises(SceneError, match=r"\['b'\] of scene 'arm' have no bounds .*action_bounds="):
             draw()
+
+
+TORQUES = """
+<mujoco model="torques">
+  <option integrator="implicitfast"/><compiler autolimits="true"/>
+  <default><joint damping=".5" armature=".05" range="-170 170"/><geom type="capsule" size=".04" mass="2"/></default>
+  <worldbody>
+    <body pos="0 0 1"><joint name="a" axis="0 0 1"/><geom fromto="0 0 0 0 0 .3"/>
+      <body pos="0 0 .3"><joint name="b" axis="0 1 0"/><geom fromto="0 0 0 .4 0 0"/>
+        <body pos=".4 0 0"><joint name="c" axis="0 1 0"/><geom fromto="0 0 0 .4 0 0"/>
+          <body pos=".4 0 0"><joint name="d" axis="1 0 0"/><geom type="sphere" size=".03" pos=".05 0 .05" mass=".3"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="a" ctrlrange="-{0} {0}"/><motor joint="b" gear="2" ctrlrange="-{0} {0}"/>
+    <motor joint="c" ctrlrange="-{0} {0}"/><motor joint="d" ctrlrange="-12 12"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def torques() -> tuple[Simulator, np.ndarray]:
+    scene = load_scene(TORQUES.format(80))
+    return Simulator(scene, 1), sample_start_states(scene, 40, 0)
+
+
+@pytest.mark.slow
+def test_motors_of_an_arm_that_full_torques_fling_follow_slow_paths_but_for_some(torques) -> None:
+    simulator, physics = torques
+    assert has_paces(simulator)
+    speed = {}
+    for pace in ("calm", "fast", "full", "mixed"):
+        moved = simulator.rollout(physics, random_controls(simulator, physics, 30, 0, pace=pace))["physics"]
+        speed[pace] = moved[..., 5:9].abs().amax((1, 2))
+        if pace == "calm":
+            assert (moved[..., 1:5].abs() > 2.96).double().mean() < 0.02
+    assert float(speed["full"].median()) > 12 and float(speed["calm"].max()) < 1.5 * np.pi
+    assert float(speed["calm"].median()) > 0.5
+    assert 2 * speed["calm"].median() < speed["fast"].median() < 0.7 * speed["full"].median()
+    assert 0.1 < float((speed["mixed"] > 1.5 * np.pi).double().mean()) < 0.45
+    assert 0.02 < float((speed["mixed"] > speed["full"].median()).double().mean()) < 0.2
+
+
+@pytest.mark.parametrize("through", ["joint", "tendon"])
+def test_motors_take_the_inverse_dynamics(torques, through) -> None:
+    simulator, physics = torques
+    if through == "tendon":  # of b alone, and of b and c
+        tendons = """<tendon><fixed name="own"><joint joint="b" coef="2"/></fixed>
+          <fixed name="both"><joint joint="b" coef="1"/><joint joint="c" coef="1"/></fixed></tendon><actuator>"""
+        text = TORQUES.format(80).replace("<actuator>", tendons)
+        text = text.replace('joint="b" gear="2"', 'tendon="own"').replace('motor joint="c"', 'motor tendon="both"')
+        simulator = Simulator(load_scene(text), 1)
+    model, rng = simulator.scene.model, np.random.default_rng(0)
+    data, laws = mujoco.MjData(model), MotorLaws(model)
+    np.testing.assert_array_equal(laws.driven_joints(physics[0]), range(4))
+    for state in physics[:10].copy():
+        state[5:9], acceleration = rng.normal(size=4), rng.normal(size=4)
+        data.qpos[:], data.qvel[:], data.qacc[:] = state[1:5], state[5:9], acceleration
+        mujoco.mj_inverse(model, data)
+        found = laws.controls(model, state, np.arange(4), acceleration)
+        forces = found * [1, 2, 1, 1] + (through == "tendon") * np.array([0, found[2], 0, 0])
+        np.testing.assert_allclose(forces, data.qfrc_inverse, atol=1e-9)
+    holding = pose_holding_controls(simulator, physics[:20], np.zeros(20, dtype=int), np.zeros(4))
+    moved = simulator.rollout(physics[:20], np.repeat(holding[:, None], 30, axis=1))
+    assert moved["physics"][..., 5:9].abs().max() < 1e-6
+
+
+def test_motors_that_cannot_move_each_joint_alone_get_bounded_splines() -> None:
+    text = """<mujoco><worldbody><body><joint name="cart" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
+      <geom size=".1" mass="1"/><body><joint axis="0 1 0" damping="1"/><geom size=".05" pos="0 0 -.5"/></body></body>
+      </worldbody><actuator><motor joint="cart" ctrlrange="-100 100"/></actuator></mujoco>"""
+    simulator = Simulator(load_scene(text), 1)
+    physics = sample_start_states(simulator.scene, 40, 0)
+    assert MotorLaws(simulator.scene.model).driven_joints(physics[0]) is None
+    calm, fast, full = (random_controls(simulator, physics, 40, 0, pace=pace) for pace in ("calm", "fast", "full"))
+    np.testing.assert_array_equal(calm, fast)
+    assert 1 < np.abs(calm).max() < 0.6 * np.abs(full).max()
+    speed = [simulator.rollout(physics, each)["physics"][..., 3].abs().quantile(0.9) for each in (calm, full)]
+    assert speed[0] < 2 and speed[1] > 3
+
+
+def test_motors_that_cannot_hold_a_robot_keep_their_rest() -> None:
+    """A cart that is pushed cannot hold its pole; the pole's own motor can."""
+    text = """<mujoco><worldbody><body><joint name="cart" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
+      <body><joint name="pole" axis="0 1 0"/><geom size=".1" mass="2" pos=".5 0 0"/></body></body></worldbody>
+      <actuator><motor joint="{}" ctrlrange="-30 30"/></actuator>
+      <keyframe><key name="home" ctrl="1"/></keyframe></mujoco>"""
+    for joint, expected in (("cart", 0.25), ("pole", -2 * 9.81 * 0.5)):
+        simulator = Simulator(load_scene(text.format(joint)), 1)
+        physics = np.tile(sample_start_states(simulator.scene, 1, 0) * 0, (2, 1))
+        holding = pose_holding_controls(simulator, physics, np.zeros(2, dtype=int), np.full(1, 0.25))
+        np.testing.assert_allclose(holding, expected, rtol=1e-9)
+
+
+def test_robots_that_move_sanely_at_full_bounds_have_one_pace() -> None:
+    scene = load_scene(TORQUES.format(0.5).replace("-12 12", "-.05 .05"))
+    simulator, physics = Simulator(scene, 1), sample_start_states(scene, 10, 0)
+    assert not has_paces(simulator) and not has_paces(Simulator(load_scene("cheetah"), 1))
+    drawn = [random_controls(simulator, physics, 20, 0, pace=pace) for pace in ("calm", "mixed", "full")]
+    np.testing.assert_array_equal(drawn[0], drawn[2])
+    np.testing.assert_array_equal(drawn[1], drawn[2])

@@ -154,6 +154,7 @@ def test_shards_are_the_parts_of_one_draw() -> None:
         trajectory_buffer(_counting(5, 8), batch_size=10, shard=(2, 2))
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_samples_lie_where_the_data_do() -> None:
     data = _counting(5, 7)

@@ -166,6 +166,7 @@ def test_what_touches_nothing_turns_in_place() -> None:
         assert qpos[:, 3].min() < 0.2
 
 
+@pytest.mark.filterwarnings("ignore::torchrl_gn.data.UncontrolledSceneWarning")
 def test_a_keyframe_places_mocap_bodies_in_the_simulation_too():
     """As in the bimanual tasks of mujoco_mpc: a weld holds to the keyframe's target, not to that of the file."""
     held = """<mujoco model="held"><option gravity="0 0 0"/><worldbody>
@@ -197,6 +198,7 @@ REACH = """<mujoco model="reach"><worldbody>
   <equality><weld body1="target" body2="hand" relpose="0 0 0 1 0 0 0"/></equality></mujoco>"""
 
 
+@pytest.mark.filterwarnings("ignore::torchrl_gn.data.UncontrolledSceneWarning")
 @pytest.mark.parametrize("distance", [0.6, 0.99, 1.5])
 def test_a_weld_to_a_far_target_winds_no_joint_up(distance):
     """As of Meta-World's Sawyer: a nearly straight arm whose hand must be elsewhere; 1.5 m are out of its reach."""

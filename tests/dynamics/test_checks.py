@@ -36,6 +36,18 @@ def inputs(scene, method: str, states, actions):
 
 
 @pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_states_in_16_bits_are_refused(scenes, predictors, random_states, random_actions, dtype, method):
+    state, action = inputs(scenes["pendulum"], method, random_states, random_actions)
+    for predictor in predictors:
+        with pytest.raises(
+            TypeError, match=f"The state must be float32 or float64, not {str(dtype)[6:]}: give its float"
+        ):
+            getattr(predictor, method)(state.to(dtype), action)
+        getattr(predictor, method)(state.float(), action.to(dtype))
+
+
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("wrong", WRONG)
 def test_inputs_that_are_no_tensors_of_numbers(scenes, predictors, random_states, random_actions, wrong, method):
     change, message = WRONG[wrong]

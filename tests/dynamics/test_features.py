@@ -132,7 +132,8 @@ def test_mistakes_of_a_core_are_named(scenes, fit, random_states, random_actions
 def test_unknown_names_are_refused():
     description = ForwardModel(ParameterNames()).description()
     with pytest.raises(
-        ValueError, match=r"feature='smell' is not known; use one of \['actuators', 'body_state'.*FEATURES"
+        ValueError,
+        match=r"feature='smell' is not known; use one of \['activations', 'actuators', .*FEATURES",
     ):
         ForwardModel.from_description({**description, "features": [{"feature": "smell"}]})
     with pytest.raises(ValueError, match="core='gone' is not known"):

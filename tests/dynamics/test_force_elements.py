@@ -9,6 +9,7 @@ import torch
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import Actuators, Canonicalizer, ForwardModel, Joints, specialize
+from torchrl_gn.dynamics.activation_laws import ActivationLaws
 from torchrl_gn.dynamics.features import StepInputs
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
@@ -16,7 +17,6 @@ from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes import PhysicalParameters, Scene, load_scene
-from torchrl_gn.scenes.force_elements import known_slots
 from torchrl_gn.training import fit
 
 from .. import zoo
@@ -46,20 +46,23 @@ def poses(scene: Scene, count: int, *, beyond: float = 0.0, speed: float = 1.0):
                 data.qpos[at] = rng.uniform(middle - half, middle + half)
             else:
                 data.qpos[at] = model.qpos0[at] + rng.uniform(-1.4, 1.4)
+        data.act[:] = rng.uniform(size=model.na)
         data.ctrl[:] = rng.uniform(scene.action_low.clip(-5), scene.action_high.clip(max=5))
         mujoco.mj_forward(model, data)
-        state = data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy()
-        yield data, torch.from_numpy(state)
+        physics = np.concatenate((np.zeros(1), data.qpos, data.qvel, data.act))
+        yield data, torch.from_numpy(scene.states(data.sensordata.copy(), physics))
 
 
 def inputs_of(scene: Scene, state, control) -> StepInputs:
     parameters = PhysicalParameters.of(scene)
-    canonical = Canonicalizer(recenter=False, yaw=False).bind(scene, BODY_STATE)(state, parameters)
+    canonical = Canonicalizer(recenter=False, yaw=False).bind(scene, scene.layout)(state, parameters)
+    if scene.model.na:
+        canonical = canonical._replace(activations=ActivationLaws(scene)(state, torch.as_tensor(control)))
     return StepInputs(canonical, ControlInputs(scene)(torch.as_tensor(control)), parameters)
 
 
 def bind(feature, scene: Scene):
-    return feature.resolved(scene).bind(scene, BODY_STATE, Canonicalizer().bind(scene, BODY_STATE))
+    return feature.resolved(scene).bind(scene, scene.layout, Canonicalizer().bind(scene, scene.layout))
 
 
 ANCHORED = """<mujoco><worldbody><body pos=".3 0 1" euler="10 20 30">
@@ -128,7 +131,7 @@ def test_the_step_on_and_the_friction():
     torch.testing.assert_close(features[3, 8], (features[3, 3] / 0.05).clamp(-1, 1))
 
 
-@pytest.mark.parametrize("name", ["servos", "jaco", "gripper", "arm"])
+@pytest.mark.parametrize("name", ["servos", "jaco", "gripper", "arm", "activated"])
 def test_forces_are_mujocos(name):
     """The sum over an edge's actuators is ``qfrc_actuator``."""
     scene = zoo.load(name)
@@ -141,12 +144,6 @@ def test_forces_are_mujocos(name):
         features = feature(inputs_of(scene, state, data.ctrl)).unflatten(-1, (slots, 4))
         force = features[: 2 * scene.model.njnt : 2, :, 0].sum(-1).numpy()
         np.testing.assert_allclose(force, data.qfrc_actuator[scene.model.jnt_dofadr], atol=1e-8)
-
-
-def test_forces_of_spatial_tendons_are_left_out():
-    scene = zoo.load("tendon_arm")
-    turn = scene.actuator_names.index("turn")
-    assert np.argwhere(known_slots(scene)).tolist() == np.argwhere(scene.edge_action[::2] == turn).tolist()
 
 
 def test_a_servos_error_and_its_force_a_step_on():

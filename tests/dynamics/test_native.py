@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import gc
 import multiprocessing
 import pickle
 import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -20,7 +22,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics import BodyState, BoundPredictor, Contacts, Controls, ForwardModel, JointAxes, specialize
+from torchrl_gn.dynamics.executors.native import executor as native_executor
 from torchrl_gn.dynamics.executors.native.operators import load_operators
+from torchrl_gn.dynamics.executors.native.preparation import around_preparation, preparation
 from torchrl_gn.dynamics.executors.native.tape import Tape, assemble
 from torchrl_gn.dynamics.features import Feature
 
@@ -32,6 +36,45 @@ pytestmark = with_compiler
 
 FEW = ("swimmer6", "joints")
 ZOO = sorted(path.stem for path in (ROOT / "tests/zoo").glob("*.xml"))
+
+
+# Preparation
+
+
+def test_whoever_budgets_time_hears_of_every_preparation_and_large_scenes_say_it(wide, capsys):
+    predictor, heard = wide("pendulum"), []
+
+    @contextmanager
+    def hear():
+        heard.append("begins")
+        yield
+        heard.append("ends")
+
+    with around_preparation(hear):
+        for _ in range(2):  # the second time it is there
+            predictor.prepared_for_training()
+            predictor.prepared(size=10_000)
+    predictor.model.bind(predictor.scene).prepared_for_training()
+    assert heard == ["begins", "ends"] * 2
+    with preparation(29):
+        pass
+    assert capsys.readouterr().err == ""
+    with preparation(70):
+        pass
+    assert "a step of 70 bodies for C++, once in this process: about 3 min" in capsys.readouterr().err
+
+
+def test_preparation_runs_without_collection():
+    with preparation(3):
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with preparation(3):
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
 
 
 # The same bits
@@ -100,6 +143,7 @@ import sys, numpy, torch
 from tests import zoo
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.executors.native.operators import load_operators
+from torchrl_gn.dynamics.executors.native.preparation import around_preparation, preparation
 torch.set_num_threads(1)
 found = []
 for name in ("swimmer6", "joints"):
@@ -616,7 +660,8 @@ def test_every_scene_is_traced(make_model, moved, random_states, random_actions,
         some = random_states(scene, 20)
         varies = (some != some[0]).any(0)
         expected, found = (pull(each, state, actions) for each in (eager, predictor))
-        assert predictor.reason is None
+        uneven = bool(axes) and not options and "heights" in scene.world_contacts.kinds
+        assert ("floor" in (predictor.reason or "")) == uneven  # height fields run by torch
         for index, (wanted, got) in enumerate(zip(expected, found, strict=True)):
             wanted, got = (each * varies if index == 1 else each for each in (wanted, got))
             assert (got - wanted).norm() <= 1e-10 * wanted.norm()
@@ -635,6 +680,37 @@ def test_scenes_of_the_suite_are_traced(make_model, moved, random_states, random
     found, expected = predictor.step(state, action)[0], eager.step(state, action)[0]
     assert predictor.reason is None
     assert (found - expected).norm() <= 1e-10 * (expected - state).norm()
+
+
+@pytest.mark.parametrize(("large", "maths"), [(1, 1), (10**9, 2)])
+def test_large_scenes_are_traced_once_for_all_states(
+    make_model, moved, random_states, random_actions, monkeypatch, large, maths
+):
+    """Of a free body in space only the world's pose is constant: one state maths is hardly longer than the other."""
+    from torchrl_gn.scenes import load_scene
+
+    monkeypatch.setattr(native_executor, "LARGE", large)
+    link = '<geom size=".1"/><body pos=".3 0 0"><joint name="j" axis="0 1 0"/><geom size=".1"/></body>'
+    tree, motor = f'<body pos="0 0 1"><freejoint/>{link}</body>', '<motor joint="j" ctrlrange="-1 1"/>'
+    scene = load_scene(f"<mujoco><worldbody>{tree}</worldbody><actuator>{motor}</actuator></mujoco>")
+    bound = make_model(scene).double().bind(scene)
+    predictor, eager = (specialize(bound, executor=executor) for executor in ("native", "eager"))
+    executor = native_executor.NativeExecutor(bound.program())
+    assert sum(place >= 0 for place in executor.structure[5:7].tolist()) == maths
+    state, action = torch.cat((moved(bound, 2), random_states(scene, 2))), random_actions(scene, 4, seed=3)
+    found, expected = predictor.step(state, action)[0], eager.step(state, action)[0]
+    assert predictor.reason is None
+    assert (found - expected).norm() <= 1e-10 * (expected - state).norm()
+
+
+@pytest.mark.parametrize("large", [1, 10**9])
+def test_planar_state_maths_is_traced_apart(make_model, monkeypatch, large):
+    from torchrl_gn.scenes import load_scene
+
+    monkeypatch.setattr(native_executor, "LARGE", large)
+    scene = load_scene("swimmer3")
+    executor = native_executor.NativeExecutor(make_model(scene).bind(scene).program())
+    assert (executor.structure[5:7] >= 0).all()
 
 
 @pytest.mark.parametrize("name", FEW)

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
 
+from torchrl_gn.cache import SharedCacheWarning
 from torchrl_gn.dynamics import specialize
-from torchrl_gn.dynamics.executors.native import build, operators
+from torchrl_gn.dynamics.executors.native import NoCompilerError, build, operators
 
+from ..sharing import SHARED, share
 from .native import ROOT, equal, pull, with_compiler
 
 pytestmark = with_compiler
@@ -23,8 +29,8 @@ CONTENT = b"a library" * 1000
 WHOLE = CONTENT + hashlib.sha256(CONTENT).digest()
 
 
-def load(opened=Path, **sources) -> Path:
-    """A library of one source, by its path."""
+def load(opened=Path.resolve, **sources):
+    """A library of one source, by default its path."""
     return build.load("name", "a thing", sources or {"engine.cpp": ["-O1"]}, [], [], opened)
 
 
@@ -40,12 +46,12 @@ def fresh(tmp_path, monkeypatch):
 
 @pytest.fixture
 def builds(monkeypatch):
-    """Files of libraries that are built: good ones, of no code."""
-    built: list[Path] = []
+    """Options of libraries that are built: good ones, of no code."""
+    built: list[dict] = []
 
-    def build_it(what, compiler, sources, link, file: Path) -> None:
-        built.append(file)
-        file.write_bytes(WHOLE)
+    def build_it(what, compiler, sources, link, deadline) -> bytes:
+        built.append(sources)
+        return WHOLE
 
     monkeypatch.setattr(build, "_build", build_it)
     return built
@@ -81,14 +87,14 @@ def test_without_a_compiler_it_runs_by_torch(fresh, wide, inputs, monkeypatch, v
 
 def test_a_library_is_built_once(fresh, builds):
     first = load()
-    assert load() == first == builds[0] and len(builds) == 1
-    assert fresh in builds[0].parents
+    assert load() == first and first.read_bytes() == WHOLE and len(builds) == 1
+    assert fresh in first.parents
     assert load(**{"engine.cpp": ["-O2"]}) != first and len(builds) == 2  # for each set of options
 
 
 @pytest.mark.parametrize("damage", ["empty", "short", "half", "zeros", "longer"])
 def test_a_damaged_library_is_built_again(fresh, builds, damage):
-    load()
+    file = load()
     damaged = {
         "empty": b"",
         "short": WHOLE[:20],
@@ -96,23 +102,23 @@ def test_a_damaged_library_is_built_again(fresh, builds, damage):
         "zeros": WHOLE[:-4096] + bytes(4096),
         "longer": WHOLE + b"x",
     }[damage]
-    builds[0].write_bytes(damaged)
-    assert load().read_bytes() == WHOLE
-    assert builds == [builds[0]] * 2
+    file.write_bytes(damaged)
+    assert load() == file and file.read_bytes() == WHOLE
+    assert len(builds) == 2
 
 
 def test_what_an_interrupted_build_leaves_is_neither_loaded_nor_kept(fresh, monkeypatch, builds):
-    def interrupted(what, compiler, sources, link, file: Path) -> None:
-        file.with_name(f".{file.stem}.0123abcd.so").write_bytes(b"half")
+    def killed(file: Path, content: bytes) -> None:
+        file.with_name(f".{file.stem}.0123abcd.so").write_bytes(content[:100])
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(build, "_build", interrupted)
+        patch.setattr(build, "write_private", killed)
         with pytest.raises(KeyboardInterrupt):
             load()
     assert len(list(fresh.glob("*.so"))) == 1
-    load()
-    assert len(builds) == 1 and list(fresh.glob("*.so")) == builds
+    found = load()
+    assert len(builds) == 2 and list(fresh.glob("*.so")) == [found]
 
 
 def test_a_folder_that_cannot_be_written_to(fresh, builds, monkeypatch):
@@ -120,7 +126,7 @@ def test_a_folder_that_cannot_be_written_to(fresh, builds, monkeypatch):
         for name, value in variables.items():
             monkeypatch.setenv(name, value)
         assert load(Path.read_bytes) == WHOLE
-        assert not builds.pop().exists()
+        assert not load().exists()
 
     def homeless() -> Path:
         raise RuntimeError("Could not determine home directory.")
@@ -130,12 +136,44 @@ def test_a_folder_that_cannot_be_written_to(fresh, builds, monkeypatch):
 
 
 def test_a_folder_whose_code_may_not_be_run(fresh, builds):
-    def opened(file: Path) -> Path:
-        if fresh in file.parents:
-            raise OSError("failed to map segment from shared object")
-        return file
+    tried = []
 
-    assert load(opened) == builds[1] and fresh in builds[0].parents
+    def opened(file: Path) -> bytes:
+        tried.append(file.resolve())
+        if fresh in tried[-1].parents:
+            raise OSError("failed to map segment from shared object")
+        return file.read_bytes()
+
+    assert load(opened) == WHOLE
+    assert [fresh in file.parents for file in tried] == [True, False] and len(builds) == 1
+
+
+@pytest.mark.parametrize("how", SHARED)
+def test_a_library_that_others_may_have_written_is_not_loaded(fresh, builds, monkeypatch, how):
+    load()
+    share(fresh, how, monkeypatch)
+    with pytest.warns(SharedCacheWarning, match="torchrl_gn is another user's"):
+        place, mode = load(lambda file: (file.resolve(), file.resolve().parent.stat().st_mode))
+    assert len(builds) == 2 and fresh not in place.parents and mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("how", SHARED)
+def test_a_file_that_others_may_have_written_is_replaced(fresh, builds, monkeypatch, how):
+    file = load()
+    share(file, how, monkeypatch)
+    assert load() == file and len(builds) == 2
+    assert load() == file and len(builds) == 2
+
+
+def test_what_is_loaded_is_what_was_checked(fresh, builds):
+    """Although another could come to its path in between."""
+
+    def opened(file: Path) -> bytes:
+        (fresh / "theirs").write_bytes(b"planted")
+        (fresh / "theirs").rename(file.resolve())
+        return file.read_bytes()
+
+    assert load(opened) == WHOLE
 
 
 def test_a_library_in_a_folder_that_is_read_only_is_used(fresh, builds, monkeypatch):
@@ -148,14 +186,14 @@ def test_a_library_in_a_folder_that_is_read_only_is_used(fresh, builds, monkeypa
 def test_a_compiler_with_arguments(fresh, monkeypatch):
     commands = []
 
-    def run_it(command) -> str:
-        commands.append(list(command))
-        if "-shared" in command:
-            Path(command[-1]).write_bytes(b"linked")
-        return "a version"
+    def run_it(some, deadline) -> list[str]:
+        commands.extend(map(list, some))
+        if "-shared" in some[0]:
+            Path(some[0][-1]).write_bytes(b"linked")
+        return ["a version"] * len(some)
 
     monkeypatch.setattr(build, "_run", run_it)
-    monkeypatch.setattr(torch.ops, "load_library", lambda path: None)
+    monkeypatch.setattr(operators, "CDLL", lambda path: None)
     monkeypatch.setenv("CXX", "env 'A B=c d' g++ -DX")
     monkeypatch.setenv("TORCHRL_GN_CXXFLAGS", "-DNAME='a b' -O0")
     operators.load_operators()
@@ -169,6 +207,92 @@ def test_a_compiler_with_arguments(fresh, monkeypatch):
         assert each.index("-O0") == max(others)
     (file,) = fresh.glob("*.so")
     assert file.read_bytes() == b"linked" + hashlib.sha256(b"linked").digest()
+
+
+@pytest.fixture
+def hangs(tmp_path, monkeypatch):
+    """Let the compiler hang: once it does, what waits for it gets an exception."""
+    compiler, place, waits = tmp_path / "compiler", tmp_path / "process", []
+    # As g++ does, it starts a process that holds its output.
+    compiler.write_text(f'#!/bin/sh\nsleep 100 & echo $! > "{place}"; wait\n')
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setattr(build, "compiler_version", lambda _: "1.0")
+    wait = subprocess.Popen.wait
+
+    def until_it_hangs(process, timeout=None):
+        if timeout is None:
+            return wait(process)
+        while not (place.exists() and place.read_text().endswith("\n")):
+            time.sleep(0.01)
+        waits.append(timeout)
+        raise error(process.args, timeout)
+
+    def run(error_: type[BaseException]) -> tuple[BaseException, int, float]:
+        """What loading raises, the number of the process that hung, and the seconds that it would have had."""
+        nonlocal error
+        error = error_
+        with pytest.raises(error if error is KeyboardInterrupt else NoCompilerError) as caught:
+            load()
+        return caught.value, int(place.read_text()), waits[0]
+
+    error = BaseException
+    monkeypatch.setattr(subprocess.Popen, "wait", until_it_hangs)
+    return run
+
+
+def is_running(process: int) -> bool:
+    state = Path(f"/proc/{process}/stat")
+    return state.exists() and state.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_a_compiler_that_hangs_is_stopped(fresh, hangs, capsys):
+    error, process, seconds = hangs(subprocess.TimeoutExpired)
+    assert build._LIMIT - 60 < seconds < build._LIMIT
+    assert not is_running(process)
+    assert re.fullmatch(r"The C\+\+ compiler \S+ was stopped after \d+ s: choose another by CXX\.", str(error))
+    assert capsys.readouterr().err.splitlines()[1:] == [f"{error} PyTorch runs instead."]
+
+
+def test_an_interrupt_stops_the_compiler(fresh, hangs):
+    assert not is_running(hangs(KeyboardInterrupt)[1])
+
+
+def test_a_compiler_that_hangs_at_its_version(monkeypatch):
+    monkeypatch.setattr(build, "_ANSWER", 0.2)
+    with pytest.raises(NoCompilerError, match="compiler sh was stopped after 0 s"):
+        build.compiler_version(["sh", "-c", "sleep 100"])
+
+
+def test_a_process_that_builds_for_ever_is_not_waited_for(fresh, builds, monkeypatch, capsys):
+    lock = lock_of(load())
+    monkeypatch.setattr(build, "_LIMIT", 0.2)
+    with lock, pytest.raises(NoCompilerError, match="Another process has been building a thing for 0 s: stop it"):
+        load()
+    assert len(builds) == 1 and "PyTorch runs instead." in capsys.readouterr().err
+
+
+def test_waiting_and_building_share_the_time(fresh, builds, monkeypatch):
+    """Whoever waited for a build that failed has the rest for his own."""
+    lock, deadlines, released = lock_of(load()), [], []
+
+    def release() -> None:
+        released.append(time.monotonic())
+        lock.release()
+
+    lock.acquire()
+    timer = threading.Timer(0.2, release)
+    monkeypatch.setattr(build, "_build", lambda *given: deadlines.append(given[-1]) or WHOLE)
+    timer.start()
+    load()
+    timer.join()
+    assert deadlines[0] - build._LIMIT < released[0]
+
+
+def lock_of(library: Path) -> FileLock:
+    """The lock with which a library is built, which is no longer there."""
+    library.unlink()
+    return FileLock(library.with_name(f".{library.name}.lock"), thread_local=False)
 
 
 @pytest.mark.slow

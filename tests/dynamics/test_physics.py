@@ -26,6 +26,8 @@ from torchrl_gn.training import Budget, Trainer, fit_physics, load_pretrained, m
 from .. import zoo
 from ..sizes import SMALL
 
+pytestmark = pytest.mark.filterwarnings("ignore::torchrl_gn.data.UncontrolledSceneWarning")  # a creature has no motors
+
 TREE: Any = KinematicTree(
     "pendulum", ("hinge",), 0.02, ((0,),), action_low=np.array([-2.0]), action_high=np.array([2.0])
 )

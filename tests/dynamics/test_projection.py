@@ -15,6 +15,8 @@ from torchrl_gn.scenes.physical_parameters import joint_axes
 
 from .. import zoo
 
+pytestmark = pytest.mark.filterwarnings("ignore::torchrl_gn.data.UncontrolledSceneWarning")  # a creature has no motors
+
 SYSTEMS = ["cartpole", "acrobot", "swimmer6", "cheetah", "walker2d", "jaco"]
 CONSTRAINED = [*SYSTEMS, "creature", "crawler"]
 
@@ -241,3 +243,24 @@ def test_what_bodies_disagree_on_is_settled_by_least_squares(make_model):
             torch.randn(2, 7, 12, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * bound.movable
         )
         assert distance(project(bound, state, projected + 1e-6 * other)) > nearest * (1 - 1e-6)
+
+
+def test_what_damping_locks_stays_in_rollouts(make_model):
+    """A base on locked slides and a wrist that is locked, under predictions of random weights."""
+    text = """<mujoco><worldbody><body name="base"><joint type="slide" axis="1 0 0" damping="1e11"/>
+      <joint type="slide" axis="0 1 0" damping="1e11"/><geom size=".1" mass="80"/>
+      <body name="upper" pos="0 0 .2"><joint axis="0 1 0" damping="1"/><geom size=".1" pos=".3 0 0"/>
+      <body name="lower" pos=".6 0 0"><joint axis="0 0 1" damping="1"/><geom size=".1" pos=".3 0 0"/>
+      <body name="hand" pos=".6 0 0"><joint axis="1 1 0" damping="{}"/><geom size=".1" pos=".3 .1 0"/>
+      </body></body></body></body></worldbody></mujoco>"""
+    turned = {}
+    for damping in ("1e11", "1"):
+        scene = load_scene(text.format(damping))
+        bound = make_model(scene).bind(scene)
+        states = bound.rollout(bound.reference_state, torch.zeros(20, 0, dtype=torch.float64))[0].detach()
+        torch.testing.assert_close(states[:, 1], states[:1, 1].expand(21, -1), rtol=0, atol=0)
+        lower, hand = (states[:, node, 3:7] for node in (3, 4))
+        wrist = quaternion.product(quaternion.conjugate(lower), hand)
+        turned[damping] = float(wrist.diff(dim=0).abs().max())
+        assert float(lower.diff(dim=0).abs().max()) > 1e-3
+    assert turned["1e11"] < 1e-9 < 1e-4 < turned["1"]

@@ -248,6 +248,7 @@ def test_fresh_trajectories_too_short_are_refused_before_they_are_made(swimmer):
         fresh_errors(swimmer.model, swimmer.scene, sequences=1, length=99, seed=0)
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_model_on_a_gpu_is_measured_there(swimmer, simulated):
     here = evaluate_errors(swimmer, simulated, horizons=(5,))

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from torchrl_gn.data import collect_trajectories
+from torchrl_gn.data import collect_trajectories, open_tensors
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers
 from torchrl_gn.envs import ModelEnv
@@ -130,7 +130,7 @@ def test_an_inferred_graph_is_kept_and_used_again(make_identifying, tmp_path):
     data = collect_trajectories(scene, 3, 6, seed=1)
     parameters = inference.infer(data["state"][:, :5], data["action"][:, :5], data["state"][:, 1:6]).parameters.detach()
     parameters.memmap(str(tmp_path))
-    again = TensorDict.load_memmap(tmp_path)
+    again = open_tensors(tmp_path)
     start, actions = data["state"][:, 2], data["action"][:, 2:]
     expected, _ = bound.rollout(start, actions, parameters)
     assert torch.equal(bound.rollout(start, actions, again)[0], expected)

@@ -235,3 +235,18 @@ def test_statistics_stay_the_tensors_that_they_were():
     normalizer.load_state_dict(other.state_dict())
     for name, buffer in normalizer.named_buffers():
         assert buffer is held[name] and torch.equal(buffer, getattr(other, name))
+
+
+def test_a_least_deviation_holds_for_what_varies_less():
+    normalizer = Normalizer(3, floor=1e-9, least=[0.5, 0.5, 0.5])
+    data = torch.randn(1000, 3, dtype=torch.float64) * torch.tensor([1e-4, 2.0, 0.0]) + 1.0
+    normalizer.update(data)
+    assert normalizer.std[0] == 0.5 and normalizer.std[2] == 0  # a constant one stays constant
+    torch.testing.assert_close(normalizer.std[1], data[:, 1].std(correction=0))
+    torch.testing.assert_close(normalizer(data + 1e-3)[:, 0], (data[:, 0] + 1e-3 - data[:, 0].mean()) / 0.5)
+    torch.testing.assert_close(normalizer.inverse(normalizer(data))[:, :2], data[:, :2])
+    again = Normalizer(3, floor=1e-9, least=[0.5, 0.5, 0.5])
+    again.load_state_dict(normalizer.state_dict())
+    assert torch.equal(again.std, normalizer.std) and "least" not in normalizer.state_dict()
+    with pytest.raises(ValueError, match="least must have 3 numbers, one a feature, not 1"):
+        Normalizer(3, least=[1.0])

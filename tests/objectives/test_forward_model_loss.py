@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -443,3 +444,32 @@ def test_channels_weigh_as_told(make_loss, windows):
     assert weighted.state_dict().keys() == plain.state_dict().keys()
     with pytest.raises(ValueError, match="channel_weights must be above 0"):
         make_loss("falling", channel_weights=0 * weights)
+
+
+def test_calm_samples_weigh_more_down_to_the_floor(make_loss, windows):
+    plain, weighted = make_loss("falling"), make_loss("falling", size_floor=0.1)
+    batch = windows["falling"].reshape(-1)[:3]
+    target = BODY_STATE.delta(batch["state"], batch["next", "state"])
+    delta = plain.model.delta(batch["state"], batch["action"]).detach()
+    # Three predicted sizes; the errors of each sample alone say what it weighs.
+    for factor in (0.0, 1.0, 30.0):
+        predicted = (factor * delta).requires_grad_()
+        for row in range(3):
+            own, true = predicted[row : row + 1], target[row : row + 1]
+            scale = plain._scale(own)
+            size = (own * scale).square().sum() / (scale > 0).sum()
+            ratio = weighted.component_errors(own, true) / plain.component_errors(own, true)
+            moves = plain.component_errors(own, true) > 0
+            expected = (1.1 / (0.1 + size)).expand(4)
+            torch.testing.assert_close(ratio[moves], expected[moves], rtol=1e-5, atol=0)
+        # The weight itself has no gradient.
+        (found,) = torch.autograd.grad(weighted.component_errors(predicted[:1], target[:1]).sum(), predicted)
+        (usual,) = torch.autograd.grad(plain.component_errors(predicted[:1], target[:1]).sum(), predicted)
+        size = (predicted[:1] * plain._scale(predicted)).square().sum() / (plain._scale(predicted) > 0).sum()
+        torch.testing.assert_close(found, usual * 1.1 / (0.1 + size), rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("floor", [0.0, -1.0, math.nan, math.inf])
+def test_a_bad_size_floor_is_refused(make_loss, floor):
+    with pytest.raises(ValueError, match=f"size_floor={floor} must be above 0"):
+        make_loss(size_floor=floor)

@@ -98,6 +98,7 @@ def test_what_an_inference_model_wrote_is_planned_with(folds):
     assert len(folds) <= 2  # of the candidates' values, not of every iteration's
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_model_on_a_gpu_plans_for_states_elsewhere():
     scene = load_scene("pendulum")

@@ -71,8 +71,8 @@ def test_names_of_one_number_of_threads_do_not_have_it(call, model, tmp_path, th
     ("option", "said"),
     [
         ("threads=[]", "threads=[] must be one number or several."),
-        ("threads=[1,0]", "threads=0 must be 1 or more."),
-        ("threads=[1.5]", "threads=1.5 must be 1 or more."),
+        ("threads=[1,0]", "threads=[1, 0] must be a whole number, 1 or more."),
+        ("threads=[1.5]", "threads=[1.5] must be a whole number, 1 or more."),
         ("ways=[compiled]", "ways=['compiled'] are not known; use any of"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import time
@@ -35,6 +36,16 @@ def test_what_a_user_can_mend_is_one_line(error, capsys):
         ending(error)()
     assert caught.value.code == 1
     assert capsys.readouterr().err == f"{type(error).__name__}: bad lr\n"
+
+
+def test_a_full_disk_says_what_is_kept_and_where(tmp_path, capsys):
+    run = RunFolder(tmp_path / "here", "train")
+    run.data.mkdir()
+    with pytest.raises(SystemExit) as caught:
+        ending(OSError(errno.ENOSPC, "the disk is full"))()
+    assert caught.value.code == 1
+    said = capsys.readouterr().err
+    assert said.startswith("OSError: [Errno 28] the disk is full; progress is saved in ") and said.count("\n") == 1
 
 
 @pytest.mark.parametrize("saved", [False, True])

@@ -58,6 +58,12 @@ def test_bad_options_end_in_one_line_and_touch_nothing(interrupted, call):
     for options, message in (
         (("noise=0.5", "minutes=9"), "other options: noise=0.5"),
         (("steps=null", "minutes=null"), "needs a limit: give steps, minutes or both"),
+        (("horizons=[200]", "minutes=9"), "horizons=[200] must be from 1 to data.length=100"),
+        (("steps=abc",), "steps=abc must be a number"),
+        (("data.train=1.5",), "data.train=1.5 must be a whole number, 1 or more"),
+        (("model.hidden=0",), "model.hidden=0 must be a whole number, 1 or more"),
+        (("system=null",), "system=null must be given, such as swimmer6"),
+        (("data.bounds={fast: 3}",), "bounds have no 'fast'"),
     ):
         code, _, errors = call(*SMALL, *options, f"run_dir={interrupted}", recipe="forward_model")
         assert code == 1
@@ -87,6 +93,16 @@ def test_a_short_run_keeps_every_loss_and_says_when_it_is_finished(tmp_path, cal
     code, output, errors = call(*options, recipe="forward_model")
     assert code == 0, errors
     assert f"The training in {tmp_path} is finished (5 steps" in output + errors
+    code, output, errors = call(*options, "horizons=5", recipe="forward_model")
+    assert code == 0, errors
+    assert "rollout_error_5" in json.loads((tmp_path / "metrics.json").read_text())
+
+
+def test_bad_options_make_no_folder(tmp_path, call):
+    for bad in ("horizons=[200]", "steps=abc", "data.train=1.5", "model.hidden=0", "data.length=50", "data.pace=slow"):
+        code, _, errors = call(*SMALL, bad, f"run_dir={tmp_path / 'run'}", recipe="forward_model")
+        assert code == 1 and errors.startswith(f"ValueError: {bad.split('=')[0]}"), errors
+    assert not (tmp_path / "run").exists()
 
 
 def test_variants_are_trained_on_and_the_standard_system_is_evaluated_too(tmp_path, call):

@@ -60,7 +60,8 @@ def test_variants_start_alike_whoever_plans(tmp_path, call):
     states = [load_file(tmp_path / f"{name}.safetensors")["state"][:, 0] for name in ("gn", "random")]
     assert torch.equal(*states)
     saved = load_file(tmp_path / "random.safetensors")
-    save_file(saved | {"state": saved["state"] + 0.1}, tmp_path / "random.safetensors")
+    moved = {name: saved[name] + 0.1 for name in ("state", "now.state")}
+    save_file(saved | moved, tmp_path / "random.safetensors")
     code, _, errors = call(*options, "planner=random", recipe="mpc")
     assert code == 1 and "random.safetensors began in other states" in errors and "Traceback" not in errors
 
@@ -168,10 +169,10 @@ def test_bad_options_are_named(tmp_path, call):
         ("system=my.xml", "'Plan for your own robot'"),
         ("system=my.xml reward=[{type:Effort}] horizon=3", "is no system of the paper"),
         ("planner=policy", "planner=policy acts by a learned policy: give policy=PATH"),
-        ("steps=0", "steps must be at least 1, got 0"),
-        ("steps=2.5", "steps must be a whole number, got 2.5"),
+        ("steps=0", "steps=0 must be a whole number, 1 or more"),
+        ("steps=2.5", "steps=2.5 must be a whole number, 1 or more"),
         ("horizon=0", "horizon must be at least 1"),
-        ("episodes=-1", "episodes must be at least 1"),
+        ("episodes=-1", "episodes=-1 must be a whole number, 1 or more"),
         ("cem.top_k=1 planner=cem_true", "cem.top_k must be at least 2, got 1"),
         ("mppi.candidates=4 planner=mppi_true", "mppi.candidates must be at least 32, got 4"),
     ):

@@ -26,7 +26,28 @@ def test_every_default_passes(file):
 
 @pytest.mark.parametrize(
     "word",
-    ["optimizer=sgd", "lr=-1", "lr=abc", "gn.lr=.nan", "batch_size=0", "unroll_batch_size=1.5", "noise=-1", "lr=true"],
+    [
+        *(
+            "optimizer=sgd",
+            "lr=-1",
+            "lr=abc",
+            "gn.lr=.nan",
+            "batch_size=0",
+            "unroll_batch_size=1.5",
+            "noise=-1",
+            "lr=true",
+        ),
+        *(
+            "steps=abc",
+            "data.train=1.5",
+            "model.hidden=0",
+            "data.validation=0",
+            "minutes=-1",
+            "minutes=.inf",
+            "seed=-1",
+        ),
+        *("logger=paper", "clock=sun", "data.pace=slow", "episodes=true", "timestep=0", "mpc.horizon=0.5"),
+    ],
 )
 def test_bad_values_are_refused_by_name(word):
     name, value = word.split("=")
@@ -35,8 +56,47 @@ def test_bad_values_are_refused_by_name(word):
         check_options(options)
 
 
-def test_lists_and_null_are_left_to_the_recipe():
-    check_options({"lr": None, "batch_size": [1, 20], "data": {"train": 0}})
+def test_lists_hold_what_one_may_be_and_null_is_left_to_the_recipe():
+    check_options({"lr": None, "batch_size": [1, 20], "model": {"hidden": [[3, 4], 5]}, "share": {"test": 0.1}})
+    for bad in ({"model": {"hidden": [3, 0]}}, {"horizons": [20, 1.5]}, {"batch_size": [1, "b"]}):
+        with pytest.raises(ValueError, match="must be a whole number"):
+            check_options(bad)
+
+
+@pytest.mark.parametrize(
+    ("word", "wanted"),
+    [
+        ("system=null", "given, such as swimmer6"),
+        ("system=5", "a name"),
+        ("device=true", "a name"),
+        ("data.train=null", "given, such as 10000"),
+        ("unroll_fraction=half", "a number"),
+        ("model.project=1", "true or false"),
+        ("model.features.contacts=null", "given, such as True"),
+        ("data.length=[1,a]", "a number"),
+    ],
+)
+def test_options_are_of_their_defaults_kind(compose, word, wanted):
+    name, value = word.split("=")
+    with pytest.raises(ValueError, match=rf"^{name}=.* must be {wanted}\.$"):
+        check_options(compose("forward_model", word), RECIPES / "forward_model.py")
+
+
+@pytest.mark.parametrize("recipe", sorted(path.stem for path in RECIPES.glob("*.py")))
+def test_options_of_every_recipe_pass_as_they_are_and_null_where_the_comments_say_so(compose, recipe):
+    check_options(compose(recipe), RECIPES / f"{recipe}.py")
+    if recipe == "forward_model":
+        words = (
+            "steps=null",
+            "minutes=0.5",
+            "model.hidden=[8,8]",
+            "system=[pendulum,cartpole]",
+            "patience=3",
+            "lr=1e-2",
+        )
+        check_options(compose(recipe, *words), RECIPES / f"{recipe}.py")
+    if recipe == "real_robot":
+        check_options(compose(recipe, "log=robot.csv", "lag=auto", "filter=auto"), RECIPES / f"{recipe}.py")
 
 
 def test_mistyped_options_suggest_the_nearest():
@@ -55,6 +115,8 @@ def test_mistyped_options_suggest_the_nearest():
 
 @pytest.mark.parametrize("recipe", ["forward_model", "mpc", "plan_and_learn"])
 def test_options_of_a_scene(compose, recipe):
-    assert scene_options(compose(recipe)) == {"timestep": None, "action_bounds": None, "wide_starts": 0.5}
-    given = compose(recipe, "action_bounds={free: [-1, 2]}", "wide_starts=0", "timestep=0.02")
-    assert scene_options(given) == {"timestep": 0.02, "action_bounds": {"free": [-1, 2]}, "wide_starts": 0}
+    usual = {"timestep": None, "action_bounds": None, "wide_starts": 0.5, "mocap_actions": False, "motors": False}
+    assert scene_options(compose(recipe)) == usual
+    given = compose(recipe, "action_bounds={free: [-1, 2]}", "wide_starts=0", "timestep=0.02", "motors=true")
+    chosen = {"timestep": 0.02, "action_bounds": {"free": [-1, 2]}, "wide_starts": 0, "motors": True}
+    assert scene_options(given) == usual | chosen

@@ -36,7 +36,7 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     assert metrics[0]["frames"] == 2 * (4 * 50 + 3 * 2 * 50)
     assert metrics[0]["round 2/return"] == metrics[0]["return"]
     first, second = (load_file(folder / "policy.safetensors") for folder in (whole, resumed))
-    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert all(torch.equal(first[name], second[name]) for name in first if name != "description")  # it has run_dir
     one = load_file(whole / "rounds/000/policy.safetensors")
     assert any(not torch.equal(one[name], first[name]) for name in first if name.startswith("model.network"))
 
@@ -112,6 +112,33 @@ def test_a_round_that_was_cut_short_is_done_again(tmp_path, call):
     code, _, errors = call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0, errors
     assert json.loads((tmp_path / "metrics.json").read_text())["reward"] == before["reward"]
+
+
+def test_what_is_derived_of_the_last_round_is_made_again(tmp_path, call):
+    """As a run that was killed right after the last round's numbers needs."""
+    call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
+    names = (
+        "policy.safetensors",
+        "value.safetensors",
+        "checkpoint/checkpoint.safetensors",
+        "curve.json",
+        "episode.gif",
+    )
+
+    def contents() -> dict[str, bytes]:
+        """Of files but for the description, whose order safetensors leaves open."""
+        kept = {name: load_file(tmp_path / name) for name in names[:3]}
+        tensors = {name: b"".join(of[key].numpy().tobytes() for key in sorted(of)) for name, of in kept.items()}
+        return tensors | {name: (tmp_path / name).read_bytes() for name in names[3:]}
+
+    whole = contents()
+    for name, stale in zip(names, ("policy", "value", "model"), strict=False):
+        (tmp_path / name).write_bytes((tmp_path / f"rounds/000/{stale}.safetensors").read_bytes())
+    (tmp_path / "curve.json").write_text("{}")
+    (tmp_path / "episode.gif").unlink()
+    code, _, errors = call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
+    assert code == 0, errors
+    assert [name for name, content in contents().items() if content != whole[name]] == []
 
 
 def test_refuses_other_options_and_targets(tmp_path, call):

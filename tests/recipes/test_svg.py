@@ -72,7 +72,7 @@ def test_what_cannot_be_is_one_line(tmp_path, call):
         (
             ("task.name=crawler", "Only swimmers have a mapping built in"),
             ("task.timestep=0.003", "timestep=0.003 must be a positive multiple"),
-            ("horizon=-1", "steps=-1 must be 0 or more"),
+            ("horizon=-1", "horizon=-1 must be a whole number, 0 or more"),
             ("agent.policy=tree", "policy='tree' is not known"),
             ("trainer.frames_per_batch=5", "frames_per_batch=5 must be a multiple of 2: num_envs times collectors"),
         )

@@ -6,6 +6,8 @@ import json
 import math
 import os
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,9 @@ from threading import Thread
 
 import pytest
 
-from _common.sweeps import Run, best, folder_name, refuse_changes, run_all
+from _common import sweeps
+from _common.sweeps import RECIPES, Run, best, folder_name, refuse_changes, run_all
+from torchrl_gn.training.run_folder import lock_folder
 
 RECIPE = """
 import json, pathlib, sys
@@ -104,6 +108,64 @@ def test_an_interrupt_ends_the_runs(tmp_path, jobs):
     finally:
         signal.signal(signal.SIGINT, before)
     assert (run.folder / "ended").exists()
+
+
+SAVER = """
+import pathlib, sys, time
+sys.path.append({recipes!r})
+from _common import clean_exit
+from torchrl_gn.training import RunFolder
+@clean_exit
+def main():
+    run = RunFolder(pathlib.Path(sys.argv[1].split("=", 1)[1]), "saver")
+    try:
+        run.file("begun").write_text(run.file("begun").read_text() + "x" if run.file("begun").exists() else "x")
+        while not run.file("saved").exists():
+            time.sleep(0.1)
+        run.write_metrics({{}}, seed=0)
+    except KeyboardInterrupt:
+        time.sleep(2)
+        run.file("saved").touch()
+        raise
+main()
+"""
+SWEEP = """
+import sys
+sys.path.append({recipes!r})
+from pathlib import Path
+from _common.sweeps import Run, run_all
+print(len(run_all([Run(Path(sys.argv[1]), Path(sys.argv[2]), (), "saving")], 1)))
+"""
+
+
+@pytest.mark.slow
+def test_runs_end_with_a_sweep_that_is_killed_and_the_next_waits_for_their_end(tmp_path):
+    (tmp_path / "saver.py").write_text(SAVER.format(recipes=str(RECIPES)))
+    (tmp_path / "sweep.py").write_text(SWEEP.format(recipes=str(RECIPES)))
+    folder = tmp_path / "run"
+    command = [sys.executable, *(str(tmp_path / name) for name in ("sweep.py", "saver.py", "run"))]
+    with subprocess.Popen(command) as killed:
+        while not (folder / "begun").exists():
+            time.sleep(0.1)
+            assert killed.poll() is None
+        killed.kill()
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.stdout == "0\n", done.stderr
+    assert "Interrupted; progress is saved in" in (folder / "log.txt").read_text()
+    assert (folder / "begun").read_text() == "xx" and (folder / "metrics.json").exists()
+
+
+def test_a_run_that_another_process_is_at_fails(make_run, monkeypatch):
+    run = make_run("1")
+    run.folder.mkdir()
+    monkeypatch.setattr(sweeps, "LAST_SAVE", 0.1)
+    lock = lock_folder(run.folder)
+    assert lock is not None and run_all([run], 1) == [run]
+    assert (
+        "is in use by another process" in (run.folder / "log.txt").read_text() and not (run.folder / "times").exists()
+    )
+    lock.release()
+    assert run_all([run], 1) == []
 
 
 def test_numbers_of_a_run_say_what_diverged(make_run):

@@ -6,14 +6,15 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from _common.tensor_files import load_tensors, save_tensors
+from _common.tensor_files import load_tensors
+from torchrl_gn.training.tensor_files import write_tensors
 
 
 @pytest.fixture
 def kept(tmp_path):
     path = tmp_path / "folder" / "played.safetensors"
     whole = torch.arange(24.0).reshape(2, 3, 4)
-    save_tensors(path, {"state": whole.transpose(0, 1), "same": whole, "none": whole[:0]})
+    write_tensors(path, {"state": whole.transpose(0, 1), "same": whole, "none": whole[:0]})
     return path, whole
 
 

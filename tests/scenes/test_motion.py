@@ -187,3 +187,16 @@ def test_shift_along_another_axis_changes_the_trajectory(case):
 
 def test_cartpole_is_tied_to_its_rail():
     assert not load_scene("cartpole").translation_invariant.any()
+
+
+def test_joints_that_damping_or_armature_locks_do_not_move():
+    """As the base of Gymnasium's Fetch: three slides with a damping of 1e11, which only rounding moves."""
+    arm = """<mujoco><worldbody><body><joint type="slide" axis="1 0 0" {0}/><joint type="slide" axis="0 0 1" {0}/>
+      <geom size=".1" mass="80"/><body pos="0 0 .2"><joint axis="0 1 0" pos=".1 0 0" damping="{1}"/>
+      <geom size=".1" pos=".3 0 0"/></body></body></worldbody></mujoco>"""
+    for lock in ('damping="1e11"', 'armature="1e11"'):
+        scene = load_scene(arm.format(lock, 500))
+        states = _simulate(scene, np.zeros(3), 40, seed=1)
+        assert np.abs(np.diff(states[:, 1, :3], axis=0)).max() < 1e-9 and not scene.predicted[1]
+        np.testing.assert_array_equal(scene.movable[2], [1, 0, 1, 0, 1, 0] * 2)
+    assert load_scene(arm.format('damping="1e5"', 500)).predicted[1]

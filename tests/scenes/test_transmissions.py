@@ -61,18 +61,16 @@ def test_actuators_act_at_the_edges_of_what_they_move():
     }
     assert _actions(zoo.load("tendon_arm")) == {
         ("rail", "slide"): ["pull"],
-        ("shoulder", "hinge"): ["turn"],
-        ("elbow", "hinge"): ["pull"],
-        ("flex", "tendon"): ["flex"],
+        ("shoulder", "hinge"): ["flex", "turn"],
+        ("elbow", "hinge"): ["pull", "flex"],
     }
     assert _actions(zoo.load("machine")) == {
-        ("crank", "hinge"): ["turn", "brake"],
+        ("crank", "hinge"): ["turn", "brake", "drive"],
         ("rod", "hinge"): ["free"],
         ("rocker", "ball"): ["swing"],
-        ("piston", "slide"): ["servo"],
+        ("piston", "slide"): ["drive", "servo"],
         ("joint4", "slide"): ["stick"],
         ("joint5", "slide"): [],
-        ("drive", "slidercrank"): ["drive"],
         ("aim", "site"): ["aim"],
         ("loop", "connect"): [],
     }
@@ -124,7 +122,7 @@ def test_gears_at_scalar_joints_are_moments(name):
     for pair, actions in enumerate(scene.edge_action[::2]):
         if scene.pairs[pair].kind in ("hinge", "slide"):
             for slot, action in enumerate(actions):
-                if action >= 0 and scene.actuator_names[action] != "stick":
+                if action >= 0 and scene.actuator_names[action] not in ("stick", "drive"):
                     dof = scene.model.jnt_dofadr[pair]
                     assert _gear(scene, pair, slot)[0] == pytest.approx(_moment(scene, data, action)[dof])
 
@@ -138,10 +136,10 @@ def test_static_features_of_slots_transmissions_and_constraints():
     np.testing.assert_array_equal(column["motorized"], scene.edge_action[:, 0] >= 0)
     np.testing.assert_array_equal(column["motorized/1"], scene.edge_action[:, 1] >= 0)
     assert column["actuator_gainprm[0]/1"][0] == 0.3 and column["actuator_ctrlrange[1]/1"][0] == 2
-    kind = {"JOINT": 5, "SITE": 1, "SLIDERCRANK": 1, "BODY": 1}
+    kind = {"JOINT": 5, "SITE": 1, "SLIDERCRANK": 2, "BODY": 1}
     for name in mujoco.mjtTrn.__members__:
         name = name.removeprefix("mjTRN_")
-        total = column[f"actuator_trntype[{name}]"].sum() + column[f"actuator_trntype[{name}]/1"].sum()
+        total = sum(column[f"actuator_trntype[{name}]{slot}"].sum() for slot in ("", "/1", "/2"))
         assert total == 2 * kind.get(name, 0), name
     loop = 2 * [pair.name for pair in scene.pairs].index("loop")
     assert np.flatnonzero(column["eq_type[CONNECT]"]).tolist() == [loop, loop + 1]
@@ -269,8 +267,8 @@ def test_idle_actuators_and_mocap_bodies_are_printed():
     scene = zoo.load("machine")
     assert "target" not in scene.node_names and scene.attachments["target"].node == 0
     assert "mocap bodies, fixed at the pose of the model: target" in str(scene)
-    assert "passive tendons, without edges: rope" in str(zoo.load("everything"))
-    assert "constraints without edges: equality0" in str(zoo.load("soft"))
+    assert "tendons that pull at joints: rope (hinge)" in str(zoo.load("everything"))
+    assert "constraints without features: equality0" in str(zoo.load("soft"))
 
 
 def test_invariance_of_sites_and_tendons():
@@ -289,10 +287,17 @@ def test_suite_domains_with_tendons_load(domain, controls):
     require_bounds(scene)
 
 
-@pytest.mark.parametrize(("domain", "element"), [("quadruped", "yaw_front_left"), ("dog", "lumbar_extend")])
-def test_suite_domains_with_activation_are_refused_by_name(domain, element):
-    with pytest.raises(UnsupportedSceneError, match=f"{element}.*activation"):
-        load_scene(model_file(f"suite/{domain}.xml"))
+@pytest.mark.parametrize(("domain", "count"), [("quadruped", 12), ("dog", 38)])
+def test_suite_domains_with_activations_load(domain, count):
+    scene = load_scene(model_file(f"suite/{domain}.xml"))
+    held = scene.activations
+    assert len(held.actuator) == scene.model.na == count and held.known.all()
+    places = set(zip(held.node.tolist(), held.slot.tolist(), strict=True))
+    assert len(places) == count and not {0} & set(held.node.tolist())
+    assert scene.layout.names[-1] == "activation" and scene.state_size == 13 + held.size
+    # Each is held by a node that its actuator moves.
+    for actuator, node in zip(held.actuator.tolist(), held.node.tolist(), strict=True):
+        assert node in scene.receivers[(scene.edge_action == actuator).any(1)]
 
 
 def test_adhesion_of_fixed_bodies_is_refused():

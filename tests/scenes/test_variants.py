@@ -59,7 +59,7 @@ VARYING = {
         {"mass", *INERTIA, "pos[0]", "pos[2]", "quat[0]", "quat[2]", "ipos[0]", "ipos[2]"}
         | {f"iquat[{i}]" for i in range(4)},
         {"actuator_acc0"},
-        {"parent_anchor", "contact_offset", "contact_radius", "joint_pose"},
+        {"parent_anchor", "contact_offset", "contact_radius", "contact_point", "joint_pose"},
     ),
     "jaco": ({"mass", *INERTIA}, {"actuator_gear[0]", "actuator_acc0"}, {"actuator"}),
 }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 import torch
@@ -19,6 +21,22 @@ from torchrl_gn.training.trainer import Trainer
 from ..learner import make_learner as make_learner
 from ..learner import point_env as point_env
 from ..sizes import SMALL
+
+
+@pytest.fixture
+def files_end_at() -> Callable[[int], AbstractContextManager]:
+    """``with files_end_at(1000):`` files of this process take 1000 bytes, as if the disk were full then."""
+
+    @contextmanager
+    def limited(size: int) -> Iterator[None]:
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    return limited
 
 
 @pytest.fixture(scope="session")

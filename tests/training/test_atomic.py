@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
-from torchrl_gn.atomic import atomic_path, write_json
+from torchrl_gn.atomic import atomic_path, read_json, remove_leftovers, write_json
 
 
 def test_the_file_appears_once_the_block_succeeds(tmp_path):
@@ -45,11 +50,15 @@ def test_json_round_trips_and_refuses_what_json_cannot_hold(tmp_path):
     path = tmp_path / "metrics.json"
     values = {"loss": 0.1, "steps": 3, "names": ["a", None, True]}
     write_json(path, values)
-    assert json.loads(path.read_text()) == values
+    assert json.loads(path.read_text()) == read_json(path) == values
     for bad in (float("nan"), float("inf")):
         with pytest.raises(ValueError, match="metrics.json: .* finite numbers only"):
             write_json(path, {"loss": bad})
-    assert json.loads(path.read_text()) == values
+    assert read_json(path) == values
+    for damaged in (b'{"loss": 0.', b"", b"\0\0", b"\xff{}"):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"metrics\.json is damaged .*; delete it"):
+            read_json(path)
 
 
 def test_the_file_is_as_readable_as_any(tmp_path):
@@ -57,3 +66,59 @@ def test_the_file_is_as_readable_as_any(tmp_path):
     with atomic_path(tmp_path / "file") as temporary:
         temporary.touch(mode=0o600)
     assert (tmp_path / "file").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+def test_a_file_is_on_disk_before_it_takes_the_name_and_its_folders_after(tmp_path, monkeypatch):
+    calls, inode = [], {}
+    replace, sync = os.replace, os.fsync
+
+    def synced(descriptor):
+        calls.append(("sync", os.fstat(descriptor).st_ino))
+        sync(descriptor)
+
+    def replaced(source, target):
+        inode["file"] = source.stat().st_ino
+        calls.append(("replace", inode["file"]))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    with atomic_path(tmp_path / "new" / "folder" / "file") as temporary:
+        temporary.write_text("text")
+    folder = tmp_path / "new" / "folder"
+    above = [("sync", place.stat().st_ino) for place in (tmp_path, tmp_path / "new")]
+    written = [("sync", inode["file"]), ("replace", inode["file"]), ("sync", folder.stat().st_ino)]
+    assert calls == above + written
+
+
+def test_a_full_disk_is_named_and_leaves_the_old_file(tmp_path, files_end_at):
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    with files_end_at(1000):
+        with pytest.raises(
+            OSError, match=r"file\.txt cannot be written: .* was there is as it was; make room"
+        ) as caught:
+            with atomic_path(path) as temporary:
+                temporary.write_text("long" * 1000)
+    assert caught.value.errno == errno.EFBIG
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path):
+    script = """
+import os, sys
+from pathlib import Path
+from torchrl_gn.atomic import atomic_path
+names = ("rollout.gif", "checkpoint/checkpoint.safetensors", "table")
+writers = [atomic_path(Path(sys.argv[1]) / name) for name in names]
+for writer in writers:
+    writer.__enter__().write_text("half")
+os._exit(9)
+"""
+    assert subprocess.run([sys.executable, "-c", script, str(tmp_path)]).returncode == 9
+    others = [tmp_path / name for name in (".hidden.txt", ".data.lock", "rollout.0123abcd.gif", ".rollout.0123abc.gif")]
+    for other in others:
+        other.touch()
+    left = remove_leftovers(tmp_path)
+    assert sorted(path.name.split(".")[1] for path in left) == ["checkpoint", "rollout", "table"]
+    assert sorted(path for path in Path(tmp_path).rglob("*") if path.is_file()) == sorted(others)

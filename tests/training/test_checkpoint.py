@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import json
 import math
+import struct
 
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
@@ -17,6 +19,7 @@ from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import Budget, CheckpointError, load_pretrained, package_versions, save_checkpoint
 from torchrl_gn.training import checkpoint as module
+from torchrl_gn.training.tensor_files import digest_of
 
 
 @pytest.fixture
@@ -130,7 +133,7 @@ def test_nested_training_state_comes_back(tmp_path, make_model, scene):
 def test_the_file_is_safetensors_and_holds_no_pickle(saved):
     with safe_open(saved, framework="pt") as file:
         metadata = file.metadata()
-        description = json.loads(metadata["description"])
+        description = json.loads(file.get_tensor("description").numpy().tobytes())
         assert any(name.startswith("model.core.") for name in file.keys())
     assert metadata["format"] == str(module.FORMAT)
     assert {"torch", "mujoco", "torchrl_gn"} <= set(description["versions"])
@@ -226,11 +229,13 @@ def test_a_newer_format_or_older_format_says_what_to_do(tmp_path, make_model, sc
     with monkeypatch.context() as patch:
         patch.setattr(module, "FORMAT", module.FORMAT + 1)
         save_checkpoint(path, make_model(), scene=scene)
-    refused(path, rf"has format {module.FORMAT + 1}, this version reads format {module.FORMAT}; update torchrl_gn")
+    refused(
+        path, rf"has format {module.FORMAT + 1}, this version reads formats 4 and {module.FORMAT}; update torchrl_gn"
+    )
     with monkeypatch.context() as patch:
-        patch.setattr(module, "FORMAT", module.FORMAT - 1)
+        patch.setattr(module, "FORMAT", 3)
         save_checkpoint(path, make_model(), scene=scene)
-    refused(path, rf"has format {module.FORMAT - 1}, .* train again")
+    refused(path, r"has format 3, .* train again")
 
 
 def test_a_model_of_several_scenes_names_them(tmp_path, make_model, scene):
@@ -252,18 +257,44 @@ def test_what_cannot_be_stored_is_named_and_leaves_the_old_file(saved, make_mode
     assert list(saved.parent.iterdir()) == [saved]
 
 
-def test_a_failing_write_leaves_the_old_file(saved, make_model, scene, monkeypatch):
+def test_a_full_disk_is_named_and_leaves_the_old_file(saved, make_model, scene, files_end_at):
     content = saved.read_bytes()
 
-    def full_disk(tensors, path, metadata):
-        path.write_bytes(b"half")
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(module, "save_file", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        save_checkpoint(saved, make_model(1), scene=scene)
+    with files_end_at(1000):
+        with pytest.raises(OSError, match=r"checkpoint\.safetensors cannot be written: File too large.*make room"):
+            save_checkpoint(saved, make_model(1), scene=scene)
     assert saved.read_bytes() == content
     assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_meshes_are_beside_the_header(tmp_path):
+    triangles = np.zeros(6000, dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("flags", "<u2")])
+    triangles["corners"] = np.random.default_rng(0).normal(size=(6000, 3, 3))
+    (tmp_path / "m.stl").write_bytes(b"\0" * 80 + struct.pack("<I", 6000) + triangles.tobytes())
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><asset><mesh name="m" file="m.stl" inertia="shell"/></asset><worldbody><body><joint/>'
+        '<geom size="0.1"/><geom type="mesh" mesh="m" contype="0" conaffinity="0" mass="0"/></body></worldbody>'
+        "</mujoco>"
+    )
+    scene = load_scene(tmp_path / "robot.xml")
+    save_checkpoint(tmp_path / "c.safetensors", ForwardModel.for_scene(scene, hidden=8), scene=scene)
+    content = (tmp_path / "c.safetensors").read_bytes()
+    assert struct.unpack("<Q", content[:8])[0] < 10_000 and len(content) > 200_000
+    (tmp_path / "m.stl").unlink()
+    assert load_pretrained(tmp_path / "c.safetensors").scene().fingerprint() == scene.fingerprint()
+
+
+def test_a_description_in_the_header_is_read_as_before(tmp_path, saved, trained):
+    with safe_open(saved, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}
+    text = tensors.pop("description").numpy().tobytes().decode()
+    old = tmp_path / "old.safetensors"
+    save_file(tensors, old, {"format": "4", "description": text, "sha256": digest_of(tensors, text)})
+    assert same(load_pretrained(old).training, trained.state_dict())
+    save_file(
+        tensors, old, {"format": "4", "description": text.replace("0.1", "0.2"), "sha256": digest_of(tensors, text)}
+    )
+    refused(old, "damaged")
 
 
 def test_a_predictor_is_saved_with_its_scene(tmp_path, trained, scene):

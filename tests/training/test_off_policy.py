@@ -13,6 +13,7 @@ import torch
 import torchrl
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -263,6 +264,23 @@ def test_an_interrupt_costs_no_update_and_no_point_of_the_curve(make_learner, at
     assert again.curve.updates == whole.curve.updates
 
 
+@pytest.mark.parametrize(("owner", "name"), [(torch.optim.Adam, "step"), (TensorDictReplayBuffer, "extend")])
+def test_an_interrupt_comes_between_changes(make_learner, ctrl_c, monkeypatch, owner, name):
+    whole, trainer = (make_learner(frames=100, random_frames=20) for _ in range(2))
+    spend(whole)
+    monkeypatch.setattr(owner, name, ctrl_c(getattr(owner, name), 3))
+    with pytest.raises(KeyboardInterrupt):
+        spend(trainer)
+    assert trainer.frames == len(trainer.buffer)
+    assert trainer.updates + trainer.owed == pytest.approx(0.1 * (trainer.frames - 20))
+    assert trainer.updates == 3 if name == "step" else trainer.frames == 60
+    assert trainer.target.counter == trainer.updates % 4
+    again = make_learner(trainer.agent, frames=100, random_frames=20)
+    again.load_state_dict(trainer.state_dict())
+    spend(again)
+    assert (again.frames, again.updates, again.owed) == (whole.frames, whole.updates, whole.owed)
+
+
 @pytest.mark.parametrize(
     "option",
     ["frames", "batch_size", "updates_per_frame", "evaluate_frames", "capacity", "target_interval", "max_norm"],
@@ -284,6 +302,7 @@ def test_experience_that_is_not_finite_is_refused_before_it_is_remembered(make_l
     assert len(trainer.buffer) == trainer.frames == 0
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_weights_on_a_gpu_learn_from_experience_elsewhere(make_learner, point_env):
     trainer = make_learner(make_learner().agent.cuda())

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from torchrl_gn.training import RunFolder, package_versions
+
+
+@pytest.fixture(autouse=True)
+def left_to_others() -> Iterator[None]:
+    yield
+    RunFolder.release()
 
 
 def test_metrics_are_flat_plain_numbers(tmp_path):
@@ -35,6 +45,17 @@ def test_a_run_is_continued_in_its_folder(tmp_path):
     RunFolder(tmp_path, "train").write_config("a: 1\n")
     again = RunFolder(tmp_path, "train")
     assert (again.path / "config.yaml").read_text() == "# A run of train\na: 1\n"
+
+
+def test_leftovers_of_a_killed_run_are_gone_once_it_is_continued(tmp_path):
+    left = [tmp_path / ".rollout.0a1b2c3d.gif", tmp_path / "checkpoint" / ".checkpoint.0a1b2c3d.safetensors"]
+    left[1].parent.mkdir()
+    for file in left:
+        file.write_text("half")
+    RunFolder(tmp_path, "train").write_config("a: 1\n")
+    assert all(file.exists() for file in left)  # of whoever had a folder that was no run
+    RunFolder(tmp_path, "train")
+    assert not any(file.exists() for file in left)
 
 
 def test_the_default_folder_is_named_after_recipe_and_time(tmp_path, monkeypatch):
@@ -81,3 +102,42 @@ def test_a_run_of_another_recipe_is_not_written_over(tmp_path):
         RunFolder(tmp_path, "evaluate")
     (tmp_path / "config.yaml").write_text("seed: 0\n")  # of whoever wrote it
     RunFolder(tmp_path, "evaluate")
+
+
+def test_metrics_of_before_go_when_a_run_goes_on(tmp_path):
+    RunFolder(tmp_path, "train").write_metrics({"error": 0.1}, seed=0)
+    run = RunFolder(tmp_path, "train")
+    assert (tmp_path / "metrics.json").exists()  # it may still be refused
+    run.write_config("steps: 9")
+    assert not (tmp_path / "metrics.json").exists() and run.written == [tmp_path / "config.yaml"]
+
+
+def another(folder: Path, then: str) -> subprocess.Popen:
+    """A process that takes the folder."""
+    program = f"from torchrl_gn.training import RunFolder; RunFolder({str(folder)!r}, 'train'); {then}"
+    return subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        stdin=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.slow
+def test_a_second_process_is_refused_until_the_first_ended(tmp_path):
+    run = RunFolder(tmp_path, "train")
+    assert RunFolder(tmp_path, "train").path == run.path  # this process may
+    second = another(tmp_path, "")
+    _, errors = second.communicate()
+    assert second.returncode == 1 and "is in use by another process; wait for its end, or name a new run_dir" in errors
+    assert RunFolder.what_is_kept() == "nothing was kept."
+    RunFolder.release()
+    first = another(tmp_path, "print('there', flush=True); input()")
+    with first:
+        assert first.stdout is not None and first.stdout.readline() == "there\n"
+        with pytest.raises(ValueError, match="in use by another process"):
+            RunFolder(tmp_path, "train")
+        first.kill()
+        first.wait()
+        RunFolder(tmp_path, "train")

@@ -8,8 +8,10 @@ import time
 
 import pytest
 import torch
+from torchrl.data import ReplayBuffer
 
 from torchrl_gn.dynamics.executors.native.build import find_compiler
+from torchrl_gn.dynamics.executors.native.preparation import preparation
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import native_threads, onednn_precision
 from torchrl_gn.training import Budget, Trainer, Workers, load_pretrained, save_checkpoint
@@ -34,6 +36,7 @@ def test_the_loss_falls(make_trainer, preset):
     assert sum(losses[-20:]) < (0.3 if preset == "muon" else 0.7) * sum(losses[:20])
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_gpu_trains_the_same_and_its_checkpoint_goes_on_anywhere(make_trainer, tmp_path):
     losses = {}
@@ -92,6 +95,24 @@ def test_the_callers_time_counts(make_trainer):
     assert make_trainer(Budget(steps=3)).outside_share() == 0
 
 
+def test_preparing_steps_for_c_plus_plus_takes_nothing_of_the_budget(make_trainer):
+    clock = [0.0]
+
+    def validate() -> float:
+        with preparation(3):
+            clock[0] += 1000.0
+        clock[0] += 2.0
+        return 1.0
+
+    trainer = make_trainer(Budget(minutes=0.1), validate=validate, validations=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Budget, "now", lambda self: clock[0])
+        for _ in trainer.run():
+            clock[0] += 1.0
+    assert trainer.spent == {"sampling": 0, "model": 0, "optimizer": 0, "validation": 2 * 2, "caller": trainer.step}
+    assert trainer.step == 5 and trainer.seconds == 9.0
+
+
 class Errors:
     """Validation errors given in advance, counting how often it was asked."""
 
@@ -128,6 +149,24 @@ def test_patience_stops_after_validations_without_a_new_best(make_trainer):
     assert [p.validation for p in trainer.run() if p.validation is not None] == [5.0, 3.0, 4.0, 3.5]
     assert trainer.step == 8
     assert list(trainer.run()) == []
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"), [(ReplayBuffer, "sample"), (torch.optim.Adam, "step"), (Errors, "__call__")]
+)
+def test_an_interrupt_waits_until_the_step_is_whole(make_trainer, ctrl_c, monkeypatch, owner, name):
+    def trainer():
+        return make_trainer(Budget(steps=8), preset="muon", validate=Errors(*range(8)), validations=8)
+
+    whole, interrupted = trainer(), trainer()
+    list(whole.run())
+    monkeypatch.setattr(owner, name, ctrl_c(getattr(owner, name), 3))
+    with pytest.raises(KeyboardInterrupt):
+        list(interrupted.run())
+    assert interrupted.step == interrupted.validated == 3
+    list(interrupted.run())
+    assert interrupted.step == 8
+    assert_same(weights(interrupted), weights(whole))
 
 
 @pytest.mark.parametrize("stop", [1, 4, 7])

@@ -52,6 +52,7 @@ def test_a_process_alone_needs_no_others():
     with join_workers() as workers:
         assert workers == Workers(rank=0, size=1)
         assert workers.agree(lambda: "mine") == "mine" and workers.mean(2.0) == 2.0
+        assert workers.any(True) and not workers.any(False)
         module = torch.nn.Linear(1, 1)
         assert workers.wrap(module) is module
         with workers.first_goes_first():

@@ -13,9 +13,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_gn.data.policy_rollout import Policy, policy_rollout
-from torchrl_gn.data.random_controls import random_controls
-from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
+from torchrl_gn.data.random_controls import Pace, random_controls
+from torchrl_gn.data.simulate import Simulator, UnstableSimulationError, steadier_physics
 from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.data.uncontrolled import warn_if_uncontrolled
 from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Scene
@@ -40,7 +41,7 @@ def collect_trajectories(
     *,
     split: int = 0,
     knot_interval: float = 10.0,
-    target_speed: float | None = 1.0,
+    pace: Pace = "mixed",
     policy: Policy | None = None,
     bounds: Mapping[str, float] | None = None,
     redrawn: dict[str, int] | None = None,
@@ -49,12 +50,13 @@ def collect_trajectories(
 ) -> TensorDict:
     """Simulate a scene from :func:`~torchrl_gn.data.sample_start_states` under random control or a policy.
 
-    Paper: SM "Datasets". Sequences that become unstable or leave the bounds are drawn again.
+    Paper: SM "Datasets". Sequences that become unstable or leave the bounds are drawn again. Warns
+    (``UncontrolledSceneWarning``) if no action moves the scene.
 
     Args:
         scene: the scene, its name or path, or variants of one, which the sequences take in turn.
         split: index of an independent split; data sets use 0, 1, 2.
-        knot_interval, target_speed: as of :func:`~torchrl_gn.data.random_controls`, which acts without a policy.
+        knot_interval, pace: as of :func:`~torchrl_gn.data.random_controls`, which acts without a policy.
         policy: TorchRL policy, or a function of a TensorDict ``[n]`` of ``state``, ``physics``, ``is_init`` and, of
             variants, ``variant`` that writes ``action`` ``[n, A]`` or returns it; ``n`` is at most 250. States have the
             dtype and device of its parameters. It explores (``ExplorationType.RANDOM``) and is seeded by ``seed``.
@@ -79,7 +81,8 @@ def collect_trajectories(
     simulator = simulator or Simulator(given)
     if simulator.scenes != ((given,) if isinstance(given, Scene) else tuple(given)):
         raise ValueError(f"simulator is of another {simulator.scene.name!r} than the scene; give both the same.")
-    chunks, controls = [], {"knot_interval": knot_interval, "target_speed": target_speed}
+    warn_if_uncontrolled(simulator, stacklevel=2)
+    chunks, controls = [], {"knot_interval": knot_interval, "pace": pace}
     options = {**controls, "policy": policy, "bounds": bounds}
     redrawn = {} if redrawn is None else redrawn
     redrawn.update(unstable=0, outside=0)
@@ -112,7 +115,7 @@ def collect_chunk(
     key: tuple[int, ...],
     *,
     knot_interval: float,
-    target_speed: float | None,
+    pace: Pace,
     policy: Policy | None = None,
     bounds: Mapping[str, float] | None = None,
 ) -> tuple[TensorDict, dict[str, int]]:
@@ -124,7 +127,7 @@ def collect_chunk(
         own = variant[pending.numpy()]
         start, bad_starts = draw_start_states(simulator, own, rng)
         if policy is None:
-            controls = {"knot_interval": knot_interval, "target_speed": target_speed}
+            controls = {"knot_interval": knot_interval, "pace": pace}
             action = random_controls(simulator, start, steps, rng, variant=own, **controls)
             drawn = simulator.rollout(start, action, own)
             drawn["action"] = torch.from_numpy(action)
@@ -142,7 +145,7 @@ def collect_chunk(
         if rejected["unstable"] > max(_MAX_REJECTED * count, 10):
             raise UnstableSimulationError(
                 f"{rejected['unstable']} simulations of {scene.name!r} became unstable while drawing {count} sequences"
-                f" of {steps} steps. Use a smaller physics step in the model, smaller action bounds, or"
+                f" of {steps} steps. Use {steadier_physics(scene.model)}, smaller action bounds, or"
                 f" {'a larger knot_interval' if policy is None else 'another policy'}."
             )
         if not len(pending):

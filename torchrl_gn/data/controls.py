@@ -19,7 +19,8 @@ def spline_controls(
     """Draw smooth action sequences ``[num, T, A]``, float64, in the actuators' units (paper, SM "Random control").
 
     Cubic splines through knots that are uniform within each action's bounds, from a random phase on, clipped to the
-    bounds. ``knot_interval`` is in control steps; the paper does not give it. ``rng`` is a generator or a seed.
+    bounds; quaternions of mocap poses are near the model's. ``knot_interval`` is in control steps; the paper does not
+    give it. ``rng`` is a generator or a seed.
     SceneError if an action has no bounds.
     """
     if num < 0 or steps < 0:
@@ -33,7 +34,7 @@ def spline_controls(
     from scipy.interpolate import CubicSpline  # here, as importing it takes a second
 
     knots = math.ceil((steps - 1) / knot_interval) + 2 + 2 * _MARGIN
-    values = rng.uniform(scene.action_low, scene.action_high, (knots, num, scene.num_actions))
+    values = rng.uniform(*scene.sane_bounds, (knots, num, scene.num_actions))
     phase = rng.uniform(0.0, 1.0, (num, 1))  # each sequence has its own, so none calls the spline
     spline = CubicSpline(np.arange(knots), values, bc_type="natural")
     time = _MARGIN + phase + np.arange(steps) / knot_interval  # [num, T], in knots

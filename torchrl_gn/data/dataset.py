@@ -16,14 +16,15 @@ from tensordict import TensorDict
 from torchrl_gn.data.collect import CHUNK, check_bounds, collect_chunk, variant_parameters
 from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
-from torchrl_gn.data.random_controls import check_target_speed
+from torchrl_gn.data.random_controls import Pace, check_pace
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.uncontrolled import warn_if_uncontrolled
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.physical_parameters import ParameterNames, take_columns
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters
 
-_DRAWS = 2  # version of the start states and controls of models from MJCF
+_DRAWS = 3  # version of the start states and controls of models from MJCF
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def create_dataset(
     *,
     variants: int | None = None,
     knot_interval: float = 10.0,
-    target_speed: float | None = 1.0,
+    pace: Pace = "mixed",
     bounds: Mapping[str, float] | None = None,
     num_threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -75,7 +76,7 @@ def create_dataset(
     Args:
         variants: number of random variants that the sequences of each split take in turn, no split another's.
             Default: all are of the scene itself. The paper does not give it.
-        knot_interval, target_speed, bounds: as of :func:`~torchrl_gn.data.collect_trajectories`.
+        knot_interval, pace, bounds: as of :func:`~torchrl_gn.data.collect_trajectories`.
         progress: called with sequences done and wanted, after every chunk.
         map_chunks: works like ``map``, such as ``imap`` of a pool or of a :class:`~torchrl_gn.training.RayCluster`.
 
@@ -91,7 +92,7 @@ def create_dataset(
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     check_knot_interval(knot_interval)
-    check_target_speed(target_speed)
+    check_pace(pace)
     check_bounds(bounds)
     ranges = {} if variants is None else parameter_ranges(_system(scene))
     files = DatasetFiles(Path(path))
@@ -110,8 +111,8 @@ def create_dataset(
         request["draws"] = _DRAWS
     if scene.wide_starts != 0.5:
         request["wide_starts"] = scene.wide_starts
-    if target_speed != 1:
-        request["target_speed"] = target_speed
+    if pace != "mixed":
+        request["pace"] = pace
     if bounds:
         request["bounds"] = {name: float(value) for name, value in bounds.items()}
     with files.lock():
@@ -120,6 +121,7 @@ def create_dataset(
             described = scene.description() if scene.origin else None  # made from an MjSpec
             files.create(request=request, description=described, features=features, versions=simulation_versions())
         if not files.is_complete():
+            warn_if_uncontrolled(Simulator(scene, 1), stacklevel=2)
             _collect_missing(files, scene, num_threads, progress, map_chunks)
     return _open(files, scene, checksums=False)
 
@@ -204,7 +206,7 @@ def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple)
         distinct, variant = np.unique(parameters, axis=0, return_inverse=True)
         scenes, variant = _variants(scene, distinct), variant.reshape(-1)  # some versions of NumPy keep the axis
     options = {name: request[name] for name in ("steps", "seed", "knot_interval")}
-    options |= {"bounds": request.get("bounds"), "target_speed": request.get("target_speed", 1.0)}
+    options |= {"bounds": request.get("bounds"), "pace": request.get("pace", "mixed")}
     rows, rejected = collect_chunk(Simulator(scenes, num_threads), variant, key=key, **options)
     if parameters is not None:
         rows["parameters"] = variant_parameters(scenes, variant)

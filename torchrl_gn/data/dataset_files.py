@@ -14,7 +14,10 @@ import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
-FORMAT = 5
+from torchrl_gn.atomic import atomic_path, remove_leftovers, sync_folder
+from torchrl_gn.data.tensor_folder import open_tensors
+
+FORMAT = 6
 SPLITS = ("train", "validation", "test")
 _KEYS = {"format", "request", "description", "features", "versions", "chunks"}
 _REMEDY = "Restore it from a copy, or delete the data set's folder and create it again."
@@ -34,7 +37,6 @@ class DatasetFiles:
 
     def __init__(self, root: Path):
         self.root, self.manifest_path = root, root / "manifest.json"
-        self._temporary = root / "manifest.json.tmp"
         self.manifest: dict = {}
 
     def error(self, message: str) -> DatasetError:
@@ -50,10 +52,12 @@ class DatasetFiles:
 
     def find(self, request: dict) -> bool:
         """Whether the data set of a request is there; checks all its files; DatasetError for anything else."""
+        if os.access(self.root, os.W_OK):
+            remove_leftovers(self.root, of=self.manifest_path)
         if not self.manifest_path.is_file():
             if self.root.exists() and not self.root.is_dir():
                 raise DatasetError(f"{self.root}: not a folder. Use another path.")
-            if self.root.is_dir() and any(file != self._temporary for file in self.root.iterdir()):
+            if self.root.is_dir() and any(self.root.iterdir()):
                 raise DatasetError(f"{self.root}: not empty and has no manifest.json. Use another folder.")
             return False
         self.read()
@@ -80,6 +84,8 @@ class DatasetFiles:
             raise self.error(f"format {manifest['format']}, but this version reads only {FORMAT}. {remedy}")
         if missing := _KEYS - manifest.keys():
             raise self.error(f"damaged (no {sorted(missing)}). {_REMEDY}")
+        if wrong := _wrong(manifest):
+            raise self.error(f"damaged ({wrong}). {_REMEDY}")
         self.manifest = manifest
 
     def create(self, **entries: object) -> None:
@@ -89,11 +95,8 @@ class DatasetFiles:
         self._write()
 
     def _write(self) -> None:
-        with open(self._temporary, "w", encoding="utf-8") as file:
-            json.dump(self.manifest, file, indent=1)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(self._temporary, self.manifest_path)
+        with atomic_path(self.manifest_path) as temporary:
+            temporary.write_text(json.dumps(self.manifest, indent=1), encoding="utf-8")
 
     def rows_done(self, split: str) -> int:
         """Number of rows in a split's finished chunks."""
@@ -107,6 +110,9 @@ class DatasetFiles:
     def append(self, split: str, rows: TensorDict, rejected: int) -> None:
         """Write the next chunk of a split, then the manifest with its checksums and number of redrawn simulations."""
         folder, chunks, first = self.root / split, self.manifest["chunks"][split], self.rows_done(split)
+        for place in (folder, *folder.rglob("*")):
+            if place.is_symlink():
+                raise DatasetError(f"{place}: a link, through which nothing is written. {_REMEDY}")
         if not chunks:
             size = self.manifest["request"]["sizes"][split]
             cast(TensorDict, rows[:1]).expand(size).memmap_like(str(folder))
@@ -117,6 +123,8 @@ class DatasetFiles:
         for file in folder.rglob("*.*"):
             with open(file, "r+b") as stream:
                 os.fsync(stream.fileno())
+        for each in {file.parent for file in folder.rglob("*.*")} if not chunks else ():
+            sync_folder(each)
         layout = {file.relative_to(folder).as_posix(): file for file in sorted(folder.rglob("meta.json"))}
         sums = {name: zlib.crc32(file.read_bytes()) for name, file in layout.items()}
         chunks.append({"rejected": rejected, "crc32": {**sums, **_checksums(rows)}})
@@ -131,10 +139,18 @@ class DatasetFiles:
                 raise DatasetError(f"{file}: missing. {_REMEDY}")
             if file.suffix == ".json" and zlib.crc32(file.read_bytes()) != expected:
                 raise DatasetError(f"{file}: does not have its checksum: damaged. {_REMEDY}")
-        # Shapes only: load_memmap maps files to write to them, and enlarges those that are too short.
-        shapes = TensorDict.load_memmap(folder, device=torch.device("meta"), allow_pickle=False).flatten_keys("/")
-        entries = {tuple(name.split("/")): _map(folder / f"{name}.memmap", like) for name, like in shapes.items()}
-        data = TensorDict(entries, batch_size=shapes.batch_size)
+        try:
+            data = open_tensors(folder)
+        except ValueError as error:
+            raise DatasetError(f"{error} {_REMEDY}") from error
+        wanted = {("state",): None, ("action",): None, ("physics",): None}
+        wanted |= {("parameters", part): len(names) for part, names in (self.manifest["features"] or {}).items()}
+        found = {key: value for key in wanted if isinstance(value := data.get(key, None), torch.Tensor)}
+        if list(data.batch_size) != [self.manifest["request"]["sizes"][split]] or found.keys() != wanted.keys():
+            raise DatasetError(f"{folder}: not the trajectories that {self.manifest_path.name} lists. {_REMEDY}")
+        for key, width in wanted.items():
+            if width not in (None, found[key].shape[-1]):
+                raise DatasetError(f"{folder}: {key} has not {width} columns. {_REMEDY}")
         for first, chunk in zip(range(0, len(data), count), chunks if checksums else (), strict=False):
             rows = cast(TensorDict, data[first : first + count])
             for name, found in _checksums(rows).items():
@@ -144,15 +160,35 @@ class DatasetFiles:
         return data
 
 
+def _wrong(manifest: dict) -> str | None:
+    """What of a manifest's structure is not as it is written."""
+
+    def are(kind: type, *values: object) -> bool:
+        return all(type(value) is kind for value in values)
+
+    request, chunks, features = manifest["request"], manifest["chunks"], manifest["features"]
+    if not are(dict, request, chunks) or not {"scene", "fingerprint", "sizes", "chunk", "variants"} <= request.keys():
+        return "request or chunks are incomplete"
+    sizes = request["sizes"]
+    if not are(dict, sizes) or {*sizes} != {*SPLITS} or not are(int, request["chunk"], *sizes.values()):
+        return "sizes of splits and chunks are no whole numbers"
+    if min(request["chunk"], *sizes.values()) < 1:
+        return "sizes of splits and chunks must be positive"
+    if {*chunks} != {*SPLITS} or not are(list, *chunks.values()):
+        return f"chunks of {[*SPLITS]} are missing"
+    for chunk in (chunk for each in chunks.values() for chunk in each):
+        if not are(dict, chunk) or not are(int, chunk.get("rejected")) or not are(dict, chunk.get("crc32")):
+            return "a chunk lacks its checksums"
+    if features is not None and not (
+        are(dict, features)
+        and {*features} == {"nodes", "edges", "globals_"}
+        and are(list, *features.values())
+        and are(str, *(name for names in features.values() for name in names))
+    ):
+        return "features have no names"
+    return None
+
+
 def _checksums(rows: TensorDict) -> dict[str, int]:
     leaves = rows.flatten_keys("/").items()
     return {f"{name}.memmap": zlib.crc32(leaf.contiguous().numpy().data) for name, leaf in leaves if leaf.numel()}
-
-
-def _map(file: Path, like: torch.Tensor) -> torch.Tensor:
-    if not like.numel():  # a scene without actuators
-        return torch.empty(like.shape, dtype=like.dtype)
-    size, wanted = file.stat().st_size, like.numel() * like.element_size()
-    if size != wanted:
-        raise DatasetError(f"{file}: {size} bytes, should be {wanted}: truncated or changed. {_REMEDY}")
-    return torch.from_file(str(file), shared=False, size=like.numel(), dtype=like.dtype).view(like.shape)

@@ -34,7 +34,7 @@ def policy_rollout(
     low, high = torch.from_numpy(scene.action_low), torch.from_numpy(scene.action_high)
     parameter = next(policy.parameters(), None) if isinstance(policy, nn.Module) else None
     device, dtype = ("cpu", torch.float64) if parameter is None else (parameter.device, parameter.dtype)
-    state = torch.empty(n, steps + 1, scene.num_nodes, 13, dtype=torch.float64)
+    state = torch.empty(n, steps + 1, scene.num_nodes, scene.state_size, dtype=torch.float64)
     recorded = torch.empty(n, steps + 1, scene.physics_size, dtype=torch.float64)
     actions = torch.empty(n, steps, scene.num_actions, dtype=torch.float64)
     stable = torch.ones(n, dtype=torch.bool)

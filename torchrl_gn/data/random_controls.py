@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-import math
+from typing import Literal, get_args
 
-import mujoco
 import numpy as np
 
-from torchrl_gn.data.controls import check_knot_interval, evaluate_cubics, spline_controls
+from torchrl_gn.data.control_limits import ControlLimits, find_control_limits, slow_targets
+from torchrl_gn.data.controls import check_knot_interval, spline_controls
+from torchrl_gn.data.holding import pose_holding_controls
+from torchrl_gn.data.mocap_paths import mocap_paths
+from torchrl_gn.data.servo_targets import position_targets, velocity_targets
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints, holding_controls
+from torchrl_gn.data.tracking import tracking_controls
+from torchrl_gn.scenes.actuator_kinds import actuator_kind
 from torchrl_gn.scenes.control_bounds import require_bounds
 from torchrl_gn.scenes.keyframes import reference_keyframe
 
-_SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # of targets, rad/s or m/s
+Pace = Literal["mixed", "calm", "fast", "full"]
+"""How fast random controls are: see :func:`random_controls`."""
+
 _SCALES = (0.2, 1.0)  # of motors, velocity targets and the speed of position targets, by sequence
-_LEAST_WIDTH = 0.05  # of the interval of position targets, as a share of the bounds
-_LATEST_REVERSAL = 4.0  # time between reversals of velocity targets, in knot intervals
+_FAST, _FULL = 0.3, 1 / 3  # share of the sequences of the mixture, and of these of motors at full amplitude
+_HELD = 0.25  # share of the calm sequences
+_LEAST_WIDTH, _HELD_WIDTH = 0.05, 0.02  # of the interval of position targets, as a share of the bounds
+_LEAST_SIZE = 0.1  # of calm motors, as a share of their limits
+_DISTURBANCE = 0.3  # of motors that follow a path, as a share of that
 
 
 def random_controls(
@@ -26,125 +35,115 @@ def random_controls(
     rng: int | np.random.Generator,
     *,
     knot_interval: float = 10.0,
-    target_speed: float | None = 1.0,
+    pace: Pace = "mixed",
     variant: np.ndarray | None = None,
 ) -> np.ndarray:
     """Draw smooth action sequences ``[n, T, A]`` from states ``[n, S]``, float64, in the actuators' units.
 
-    Systems of the paper get :func:`~torchrl_gn.data.spline_controls`. Actuators of other models, by kind:
+    Systems of the paper get :func:`~torchrl_gn.data.spline_controls`. Actuators of other models, by kind and pace:
 
-    - motors, and all that is neither of the following: these splines, scaled in each sequence by a factor in [0.2, 1]
-      towards the controls of the reference keyframe, or towards 0;
-    - position servos: targets from the one that holds the given state, on splines within a random part of the bounds
-      around it; in a second they move at most 0.2 to 1 times the bounds' width, pi rad or 1 m of their joint,
-      times ``target_speed``; with None as motors, as a planner may choose them;
     - velocity servos: splines whose knots alternate in sign, 1 to 4 ``knot_interval`` apart, scaled in each sequence
       by a factor in [0.2, 1]; as motors if the bounds do not include both directions.
+    - ``"full"``, all others: the paper's splines, scaled in each sequence by a factor in [0.2, 1] towards the controls
+      of the reference keyframe, or towards 0. A planner may choose such controls.
+    - ``"fast"``: position targets are as fast as their joints follow at sane speeds
+      (:class:`~torchrl_gn.data.control_limits.ControlLimits`); at any speed if that is sane. Motors have full splines
+      if these are sane, else splines of a tenth to all of the amplitude that is, around what balances gravity in the
+      given state, if they can.
+    - ``"calm"``: position targets from the one that holds the given state, on splines within a random part of the
+      bounds around it; in a second they move at most 0.2 to 1 times the bounds' width, pi rad or 1 m of their joint. A
+      quarter of the sequences holds the state, within 2 % of the bounds. Motors whose full splines are not sane follow
+      such paths of their joints by inverse dynamics, disturbed by splines; where they cannot alone, as of legs, they
+      are as fast ones.
+    - ``"mixed"``: three tenths of the sequences are fast, of motors a third of these full; the others are calm.
+
+    Poses of mocap bodies follow smooth paths from that of the model, slow ones in calm sequences.
 
     Args:
         knot_interval: least time between knots, in control steps.
         variant: ``[n]``, scene of each sequence; default: the scenes in turn.
 
     Raises:
-        ValueError: ``knot_interval`` or ``target_speed`` is not above 0 and finite.
+        ValueError: ``knot_interval`` is not above 0 and finite, or ``pace`` is unknown.
         SceneError: an action has no bounds.
     """
     scene, n = simulator.scene, len(physics)
     rng = np.random.default_rng(rng)
-    check_target_speed(target_speed)
+    check_pace(pace)
+    if len(scene.mocaps):
+        given = {"knot_interval": knot_interval, "pace": pace}
+        controls = random_controls(simulator.without_mocap_actions, physics, steps, rng, **given, variant=variant)
+        calm = rng.random(n) >= {"mixed": _FAST, "calm": 0.0}.get(pace, 1.0)
+        paths = mocap_paths(scene, n, steps, rng, knot_interval=knot_interval, calm=calm)
+        return np.concatenate((controls, paths), axis=-1)
     if "system" in scene.origin or not (n and steps and scene.num_actions):
         return spline_controls(scene, n, steps, rng, knot_interval=knot_interval)
     check_knot_interval(knot_interval)
     require_bounds(scene)
-    model, low, high = scene.model, scene.action_low, scene.action_high
+    model, low, high, rest = scene.model, scene.action_low, scene.action_high, _rest(simulator)
     kinds = np.array([actuator_kind(model, actuator) for actuator in range(model.nu)])
-    key = reference_keyframe(model)
-    rest = np.clip(np.zeros(model.nu) if key is None else model.key_ctrl[key], low, high)
     scale = rng.uniform(*_SCALES, (n, 1, 1))
-    controls = rest + scale * (spline_controls(scene, n, steps, rng, knot_interval=knot_interval) - rest)
+    splines = spline_controls(scene, n, steps, rng, knot_interval=knot_interval)
+    controls = rest + scale * (splines - rest)
     reversing = (kinds == "velocity") & (low < 0) & (high > 0)
     if reversing.any():
         ends = low[reversing], high[reversing]
-        controls[..., reversing] = scale * _velocity_targets(*ends, n, steps, knot_interval, rng)
-    if target_speed is not None and (servos := kinds == "position").any():
-        variant = np.arange(n) % len(simulator.scenes) if variant is None else variant
-        start = _holding_targets(simulator, physics, variant, np.flatnonzero(servos))
-        fastest = (target_speed * scale[:, 0] * _fastest_targets(model) * scene.timestep)[:, servos]
-        controls[..., servos] = _position_targets(start, low[servos], high[servos], fastest, steps, knot_interval, rng)
+        controls[..., reversing] = scale * velocity_targets(*ends, n, steps, knot_interval, rng)
+    if pace == "full" or not (limits := _limits(simulator, knot_interval)):
+        return controls
+    variant = np.arange(n) % len(simulator.scenes) if variant is None else variant
+    holding = np.clip(pose_holding_controls(simulator, physics, variant, rest), low, high)
+    fast = rng.random(n) < {"mixed": _FAST, "calm": 0.0, "fast": 1.0}[pace]
+    held = ~fast & (rng.random(n) < _HELD)
+    servos, motors = kinds == "position", ~reversing & (kinds != "position")
+    if (limits.amplitude < 1).any():
+        full = fast & (rng.random(n) < (_FULL if pace == "mixed" else 0.0))
+        size = limits.amplitude * _LEAST_SIZE ** rng.uniform(0.0, 1.0, (n, 1, 1))
+        noise, rows = size * (splines - rest), np.flatnonzero(~fast)
+        bounded = np.clip(holding[:, None] + noise, low, high)
+        share = np.where(held, _HELD_WIDTH, _LEAST_WIDTH ** rng.uniform(0.0, 1.0, n))[:, None]
+        paths = {"width": share[rows], "speed": scale[rows, 0], "knot_interval": knot_interval}
+        states, drawn = (physics[rows], variant[rows]), (controls[rows], _DISTURBANCE * noise[rows])
+        if (tracking := tracking_controls(simulator, *states, *drawn, rng, **paths)) is not None:
+            bounded[rows] = tracking
+        controls = np.where(~full[:, None, None] & motors, bounded, controls)
+    if servos.any():
+        slow = scale[:, 0] * slow_targets(model)
+        speed = (np.where(fast[:, None], np.fmax(limits.target_speed, slow), slow) * scene.timestep)[:, servos]
+        width = _LEAST_WIDTH ** rng.uniform(0.0, 1.0, speed.shape)
+        width[held] = _HELD_WIDTH * rng.uniform(0.0, 1.0, (int(held.sum()), width.shape[1]))
+        given = holding[:, servos], low[servos], high[servos]
+        targets = position_targets(*given, width, speed, steps, knot_interval, rng)
+        free = (fast[:, None] & np.isinf(limits.target_speed[servos]))[:, None]
+        controls[..., servos] = np.where(free, controls[..., servos], targets)
     return controls
 
 
-def check_target_speed(target_speed: float | None) -> None:
-    """Raise ValueError if the factor is not above 0 and finite."""
-    if target_speed is not None and not 0 < target_speed < math.inf:
-        raise ValueError(f"target_speed must be above 0 and finite, got {target_speed}")
+def has_paces(simulator: Simulator, knot_interval: float = 10.0) -> bool:
+    """Whether calm and fast random controls of a scene differ."""
+    simulator = simulator.without_mocap_actions
+    limits = _limits(simulator, knot_interval)
+    kinds = {actuator_kind(simulator.scene.model, actuator) for actuator in range(simulator.scene.model.nu)}
+    return limits is not None and ("position" in kinds or bool((limits.amplitude < 1).any()))
 
 
-def _velocity_targets(
-    low: np.ndarray, high: np.ndarray, n: int, steps: int, knot_interval: float, rng: np.random.Generator
-) -> np.ndarray:
-    from scipy.interpolate import CubicSpline  # here, as importing it takes a second
-
-    knots, size = math.ceil((steps - 1) / knot_interval) + 3, (n, len(low))
-    sign = (-1.0) ** (np.arange(knots)[:, None, None] + rng.integers(2, size=size))
-    values = rng.uniform(0.0, 1.0, (knots, *size)) * np.where(sign > 0, high, low)
-    spline = CubicSpline(np.arange(knots), values, bc_type="natural")
-    interval = knot_interval * _LATEST_REVERSAL ** rng.uniform(0.0, 1.0, size)[:, None]
-    time = rng.uniform(0.0, 1.0, size)[:, None] + np.arange(steps)[:, None] / interval
-    return np.clip(evaluate_cubics(spline.c, time), low, high)
+def check_pace(pace: str) -> None:
+    """Raise ValueError for an unknown pace."""
+    if pace not in get_args(Pace):
+        raise ValueError(f"pace={pace!r} is not known; use one of {list(get_args(Pace))}.")
 
 
-def _position_targets(
-    start: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    fastest: np.ndarray,
-    steps: int,
-    knot_interval: float,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Targets ``[n, T, A]`` from ``start`` ``[n, A]`` on that change by at most ``fastest`` ``[n, A]`` a step."""
-    from scipy.interpolate import CubicSpline  # here, as importing it takes a second
-
-    start = np.clip(start, low, high)
-    width = (high - low) * _LEAST_WIDTH ** rng.uniform(0.0, 1.0, start.shape)
-    first = np.clip(start - rng.uniform(0.0, 1.0, start.shape) * width, low, high - width)
-    knots = math.ceil((steps - 1) / knot_interval) + 2
-    values = first + width * rng.uniform(0.0, 1.0, (knots, *start.shape))
-    values[0] = start
-    spline = CubicSpline(np.arange(knots), values, bc_type="clamped")  # at rest at both ends
-    interval = np.maximum(knot_interval, _peak_slope(spline.c) / fastest)
-    time = np.arange(steps)[:, None] / interval[:, None]
-    return np.clip(evaluate_cubics(spline.c, time), low, high)
+def _rest(simulator: Simulator) -> np.ndarray:
+    """Controls ``[A]`` of the reference keyframe, or the nearest to 0 within the bounds."""
+    scene, key = simulator.scene, reference_keyframe(simulator.scene.model)
+    controls = np.zeros(scene.num_actions) if key is None else scene.model.key_ctrl[key]
+    return np.clip(controls, scene.action_low, scene.action_high)
 
 
-def _peak_slope(coefficients: np.ndarray) -> np.ndarray:
-    """Largest slope ``[n, A]`` of cubics ``[4, K - 1, n, A]`` on their unit intervals."""
-    a, b, c, _ = coefficients
-    with np.errstate(divide="ignore", invalid="ignore"):
-        turn = np.clip(np.nan_to_num(-b / (3 * a)), 0.0, 1.0)
-    slopes = [(3 * a * x + 2 * b) * x + c for x in (0.0, 1.0, turn)]
-    return np.abs(slopes).max(axis=(0, 1))
-
-
-def _fastest_targets(model: mujoco.MjModel) -> np.ndarray:
-    """Fastest change ``[A]`` of position targets, in the controls' units a second."""
-    fastest, at_joints = np.ptp(model.actuator_ctrlrange, axis=1), drive_joints(model)
-    for actuator in range(model.nu):
-        joint, slope = model.actuator_trnid[actuator, 0], model.actuator_biasprm[actuator, 1]
-        if slope and at_joints[actuator] and (speed := _SPEEDS.get(int(model.jnt_type[joint]))):
-            a_unit = abs(model.actuator_gear[actuator, 0] * slope / model.actuator_gainprm[actuator, 0])
-            fastest[actuator] = min(fastest[actuator], speed * a_unit)
-    return fastest
-
-
-def _holding_targets(simulator: Simulator, physics: np.ndarray, variant: np.ndarray, servos: np.ndarray) -> np.ndarray:
-    """Controls ``[n, servos]`` at which position servos exert no force on states ``[n, S]`` at rest."""
-    data, targets = mujoco.MjData(simulator.scene.model), np.zeros((len(physics), len(servos)))
-    for row, state in enumerate(physics):
-        model = simulator.scenes[variant[row]].model
-        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        for stage in ("kinematics", "comPos", "tendon", "transmission"):
-            getattr(mujoco, f"mj_{stage}")(model, data)
-        targets[row] = holding_controls(model, servos, data.actuator_length[servos])
-    return targets
+def _limits(simulator: Simulator, knot_interval: float) -> ControlLimits | None:
+    """Limits of the controls, found once for a simulator; None of the paper's systems and without actions."""
+    if "system" in simulator.scene.origin or not simulator.scene.num_actions:
+        return None
+    if knot_interval not in simulator.control_limits:
+        simulator.control_limits[knot_interval] = find_control_limits(simulator, _rest(simulator), knot_interval)
+    return simulator.control_limits[knot_interval]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -23,6 +24,15 @@ _HUGE = float(mujoco.mjMAXVAL)  # MuJoCo resets a simulation with larger numbers
 
 class UnstableSimulationError(RuntimeError):
     """Too many simulations of a scene become unstable."""
+
+
+def steadier_physics(model: mujoco.MjModel) -> str:
+    """What makes the simulation of a model more stable, to go behind "use"."""
+    smaller = "a smaller physics step in the model"
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+        return smaller
+    # Euler's method steps the velocity gains of servos explicitly.
+    return f'<option integrator="implicitfast"/> (stiff servos need it) or {smaller}'
 
 
 class Simulator:
@@ -51,6 +61,15 @@ class Simulator:
         self._pool = Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.scene.model) for _ in range(num_threads)]
         self.start_poses: dict[int, Any] = {}  # of each variant from MJCF, once states of it were drawn
+        self.control_limits: dict[float, Any] = {}  # of a scene from MJCF by knot interval, once controls were drawn
+
+    @cached_property
+    def without_mocap_actions(self) -> Simulator:
+        """A simulator of the actuators' actions alone; itself if there are no others."""
+        if not len(self.scene.mocaps):
+            return self
+        scenes = [scene.without_mocap_actions for scene in self.scenes]
+        return Simulator(scenes, self.num_threads, memory=self.memory)
 
     def rollout(
         self, physics: Tensor | np.ndarray, actions: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None
@@ -63,7 +82,7 @@ class Simulator:
             variant: ``[*B]`` integers, scene of each sequence; default: the scenes in turn.
 
         Returns:
-            TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, 13]`` and ``physics`` ``[*B, T+1, S]``, float64, given
+            TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, C]`` and ``physics`` ``[*B, T+1, S]``, float64, given
             states first, and ``stable`` ``[*B]`` bool. Quaternion signs are MuJoCo's.
         """
         scene = self.scene
@@ -81,36 +100,36 @@ class Simulator:
         start = start.reshape(count, scene.physics_size)
         controls = controls.reshape(count, steps, scene.num_actions).astype(np.float64, copy=False)
 
-        state = np.empty((count, steps + 1, scene.num_nodes, 13))
+        state = np.empty((count, steps + 1, scene.num_nodes, scene.state_size))
         recorded = np.empty((count, steps + 1, scene.physics_size))
         stable = np.empty(count, dtype=bool)
         held = scene.substeps
         for rows in self._chunks(count, steps * held + 1):
             # Sensors show the state before a physics step: one more step shows the last state.
             repeated = np.repeat(controls[rows], held, axis=1)
-            last = controls[rows, -1:] if steps else np.zeros((len(repeated), 1, scene.num_actions))
+            last = controls[rows, -1:] if steps else np.tile(self.scene.rest_action, (len(repeated), 1, 1))
             held_controls = np.concatenate([repeated, last], axis=1)
             after, sensors, stable[rows] = self._advance(start[rows], held_controls, which[rows])
-            state[rows] = sensors[:, ::held, scene.sensor_slice].reshape(state[rows].shape)
             recorded[rows, 0] = start[rows]
             recorded[rows, 1:] = after[:, held - 1 :: held][:, :steps]
+            state[rows] = scene.states(sensors[:, ::held], recorded[rows])
         arrays = {"state": state, "physics": recorded, "stable": stable}
         result = {name: torch.from_numpy(array.reshape((*batch, *array.shape[1:]))) for name, array in arrays.items()}
         return TensorDict(result, batch_size=batch)
 
     def observe(self, physics: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None) -> Tensor:
-        """Body states ``[*B, N, 13]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`."""
+        """Body states ``[*B, N, C]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`."""
         start = self._checked_physics(physics)
         batch = start.shape[:-1]
         which = self._variants(variant, batch)
-        state = np.empty((len(which), self.scene.num_nodes, 13))
-        data, where = self._data[0], self.scene.sensor_slice
+        state = np.empty((len(which), self.scene.num_nodes, self.scene.state_size))
+        data = self._data[0]
         for row, values in enumerate(start.reshape(len(which), self.scene.physics_size)):
             model = self.scenes[which[row]].model
             mujoco.mj_setState(model, data, values, _PHYSICS)
             for stage in ("kinematics", "comPos", "comVel", "sensorPos", "sensorVel"):
                 getattr(mujoco, f"mj_{stage}")(model, data)
-            state[row] = data.sensordata[where].reshape(state.shape[1:])
+            state[row] = self.scene.states(data.sensordata, values)
         return torch.from_numpy(state.reshape(*batch, *state.shape[1:]))
 
     def step(
@@ -118,7 +137,7 @@ class Simulator:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advance states ``[n, S]``, float64, by one control step with actions ``[n, A]``, float64.
 
-        Returns next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, 13]``, float64.
+        Returns next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, C]``, float64.
         Saves the physics step that :meth:`rollout` adds to see the last state, whose stability is not checked.
         """
         scene = self.scene
@@ -126,12 +145,12 @@ class Simulator:
         which = self._variants(variant, start.shape[:-1])
         if actions.shape != (wanted := (*start.shape[:-1], scene.num_actions)):
             raise ValueError(f"actions of {scene.name!r} must be {list(wanted)}, got {list(actions.shape)}")
-        after, state = np.empty_like(start), np.empty((len(start), scene.num_nodes, 13))
+        after, state = np.empty_like(start), np.empty((len(start), scene.num_nodes, scene.state_size))
         for rows in self._chunks(len(start), scene.substeps):
             held = np.repeat(actions[rows, None], scene.substeps, axis=1)
             path, sensors, stable = self._advance(start[rows], held, which[rows])
             after[rows] = np.where(stable[:, None], path[:, -1], np.nan)
-            state[rows] = sensors[:, 0, scene.sensor_slice].reshape(state[rows].shape)
+            state[rows] = scene.states(sensors[:, 0], start[rows])
         return after, state
 
     def settle(
@@ -142,7 +161,7 @@ class Simulator:
         which = self._variants(variant, start.shape[:-1])
         settled, stable = np.empty_like(start), np.empty(len(start), dtype=bool)
         for rows in self._chunks(len(start), steps + 1):
-            controls = np.zeros((len(start[rows]), steps + 1, self.scene.num_actions))
+            controls = np.tile(self.scene.rest_action, (len(start[rows]), steps + 1, 1))
             after, _, stable[rows] = self._advance(start[rows], controls, which[rows])
             settled[rows] = after[:, -2]
         settled[:, 0] = start[:, 0]
@@ -162,8 +181,9 @@ class Simulator:
                 [self.scenes[i].model for i in which] if len(self.scenes) > 1 else self.scene.model,
                 self._data,
                 start,
-                controls if self.scene.num_actions else None,
+                self.scene.mocaps.inputs(self.scene.model, controls) if self.scene.num_actions else None,
                 nstep=controls.shape[1],
+                control_spec=self.scene.mocaps.control_spec,
             )
         timestep = self.scene.model.opt.timestep
         time = np.concatenate([start[:, :1], after[:, :, 0]], axis=1)
@@ -218,11 +238,12 @@ def _check_topology(scenes: tuple[Scene, ...]) -> None:
         for what in (
             "node_names",
             "joint_names",
-            "actuator_names",
+            "action_names",
             "substeps",
             "physics_size",
             "senders",
             "sensor_slice",
+            "mocap_poses",
         ):
             ours, theirs = getattr(first, what), getattr(scene, what)
             if not np.array_equal(ours, theirs):

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.data.clearance import clearance, find_bases
+from torchrl_gn.scenes.actuator_kinds import activated_servos, holding_controls
 from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.scene import Scene
@@ -59,6 +60,8 @@ class StartPoses:
         self._allowed: dict[tuple[int, int], float] = {}
         if depths := self._depths():
             self._avoid(depths)
+        self._integrates = self.model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+        self._servos = activated_servos(self.model)
         self._rest = np.empty(scene.physics_size)
         mujoco.mj_getState(self.model, self._data, self._rest, _PHYSICS)
 
@@ -77,10 +80,27 @@ class StartPoses:
             for row, change in zip(pending, changes, strict=True):
                 if self._place(change):
                     states[row, 1 : 1 + self.model.nq] = self._data.qpos
+                    self._hold(states[row])
                 else:
                     collided.append(row)
             pending = np.array(collided, dtype=np.int64)
         return states  # what still collides stays in the reference pose
+
+    def _hold(self, state: np.ndarray) -> None:
+        """Give filtered and integrating position servos the activations at which they hold the pose."""
+        model, data = self.model, self._data
+        servos = self._servos
+        if not len(servos):
+            return
+        for stage in ("kinematics", "comPos", "tendon", "transmission"):
+            getattr(mujoco, f"mj_{stage}")(model, data)
+        held = holding_controls(model, servos, data.actuator_length[servos])
+        for limited, bounds in (
+            (model.actuator_actlimited[servos], model.actuator_actrange[servos]),
+            (model.actuator_ctrllimited[servos] & ~self._integrates[servos], model.actuator_ctrlrange[servos]),
+        ):
+            held = np.where(limited, np.clip(held, *bounds.T), held)
+        state[1 + model.nq + model.nv + model.actuator_actadr[servos]] = held
 
     def _load_reference(self) -> None:
         model, data = self.model, self._data

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
+from torchrl_gn.data.simulate import Simulator, UnstableSimulationError, steadier_physics
 from torchrl_gn.data.start_poses import StartPoses
 from torchrl_gn.scenes.scene import Scene
 
@@ -48,7 +48,7 @@ def draw_start_states(
         states[pending] = _draw_apart(simulator, variant[pending], rng)
     raise UnstableSimulationError(
         f"{len(pending)} of {n} start states of {scene.name!r} became unstable within {scene.settle_steps} physics "
-        f"steps, {_ATTEMPTS} times in a row. Use a smaller physics step or softer contacts in the model."
+        f"steps, {_ATTEMPTS} times in a row. Use {steadier_physics(scene.model)}, or softer contacts."
     )
 
 

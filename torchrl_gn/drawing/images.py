@@ -31,7 +31,7 @@ def draw_states(scene: Scene, states: Tensor, *, size: int = 360) -> np.ndarray:
         ValueError: of states of another shape, or not finite.
     """
     flat = states.detach().double().cpu().numpy().reshape(-1, *states.shape[-2:])
-    if flat.shape[1:] != (scene.num_nodes, 13) or not len(flat) or not np.isfinite(flat).all():
+    if flat.shape[1:] != (scene.num_nodes, scene.state_size) or not len(flat) or not np.isfinite(flat).all():
         raise ValueError(f"states must be [*B, {scene.num_nodes}, 13] and finite, got {list(states.shape)}.")
     drawing = scene_drawing(scene, flat, size)
     panels = (drawing.panel(step, drawing.truth, TRUTH) for step in range(len(flat)))

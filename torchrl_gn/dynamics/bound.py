@@ -6,7 +6,6 @@ import itertools
 import warnings
 from typing import TYPE_CHECKING, cast
 
-import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -14,8 +13,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import hardshrink, pad
 
+from torchrl_gn.dynamics.activation_laws import ActivationLaws
 from torchrl_gn.dynamics.constraints import make_projection, position_weight
-from torchrl_gn.dynamics.executors import EagerExecutor, NativeExecutor, eager
+from torchrl_gn.dynamics.executors import CudaExecutor, EagerExecutor, NativeExecutor, eager, native_executor
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.features.feature import graph_edges
 from torchrl_gn.dynamics.parameters import ParameterReader
@@ -24,6 +24,7 @@ from torchrl_gn.dynamics.program import InputScaling, OutputScaling, PreparedSte
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.precision import without_autocast
+from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.networks.core import Core, FoldedCore, ReducibleCore, UnfoldedCore, dtype_of
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
@@ -79,9 +80,11 @@ class BoundPredictor(Predictor):
         super().__init__(scene, model.layout, recurrent=model.core.recurrent, **keys)
         _check_scene(model, scene, varies=parameters_key is not None)
         self.model, self.strict, self.reference = model, strict, reference
-        self._executors: dict[tuple, NativeExecutor] = {}  # by the structures they run
+        self._executors: dict[tuple, NativeExecutor | CudaExecutor] = {}  # by the structures they run
 
-        self.register_buffer("movable", torch.as_tensor(scene.movable, dtype=torch.bool), persistent=False)
+        has_activations = isinstance(scene, Scene) and scene.activations.size > 0
+        self.activations = ActivationLaws(scene) if has_activations else None
+        self.register_buffer("movable", torch.as_tensor(_learned(scene)), persistent=False)
         self.register_buffer("reference_state", reference_state(scene, model.layout), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
         self.incidence = Incidence(graph_edges(scene, model.features), scene.num_nodes, predicted)
@@ -196,6 +199,7 @@ class BoundPredictor(Predictor):
             parameters=values,
             canonicalizer=self.canonicalizer,
             controls=self.controls,
+            activations=self.activations,
             node_features=cast(nn.ModuleList, self.features["nodes"]),
             edge_features=cast(nn.ModuleList, self.features["edges"]),
             projection=self.projection,
@@ -224,32 +228,39 @@ class BoundPredictor(Predictor):
         return self._prepared_natively(parameters, change=True)
 
     def _may_run_natively(self, parameters: TensorDictBase | None) -> bool:
-        # What is traced cannot ask which features vary; C++ has no gradient in parameters of physics or samples.
+        # What is traced cannot ask which features vary; kernels have no gradient in parameters of physics or samples.
         if (
             needs_plain_operations()
             or self.reference
             or (self.model.physics is not None and self.model.physics.trained)
         ):
             return False
-        return self.movable.is_cpu and (parameters is None or not torch.is_grad_enabled())
+        known = self.movable.is_cpu or self.movable.is_cuda
+        return known and (parameters is None or not torch.is_grad_enabled())
 
     @without_autocast
     def _prepared_natively(self, parameters: TensorDictBase | None, *, change: bool) -> PreparedStep:
-        program = self.program(parameters, reduced=True)
-        key = (change, *structure_key(program))
+        # On a GPU, asking which features vary would wait for it.
+        program = self.program(parameters, reduced=not self.movable.is_cuda)
+        key = (change, program.movable.device, *structure_key(program))
         if (executor := self._executors.get(key)) is None:
-            executor = self._executors[key] = NativeExecutor(program, change=change)
+            executor = self._executors[key] = native_executor(program, change=change, live=True)
         return PreparedStep(executor, executor.pack(program))
+
+
+def _learned(scene: Scene) -> np.ndarray:
+    """``[N, 12 + K]`` bool, components that the network predicts: all that move, but activations with known laws."""
+    learned = scene.movable.copy()
+    if isinstance(scene, Scene) and scene.activations.size:
+        learned[:, BODY_STATE.delta_size :] &= ~scene.activations.mask(len(learned), scene.activations.known)
+    return learned
 
 
 def reference_state(scene: Scene, layout: StateLayout) -> Tensor:
     """A scene's reference pose at rest, ``[N, C]`` float64; of a robot known by its joints, all angles zero."""
     if not isinstance(scene, Scene):
         return torch.eye(layout.size, dtype=torch.float64)[0].repeat(scene.num_nodes, 1)
-    data = mujoco.MjData(scene.model)
-    for stage in ("kinematics", "comPos", "comVel", "sensorPos", "sensorVel"):
-        getattr(mujoco, f"mj_{stage}")(scene.model, data)
-    return torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, scene.state_size).copy())
+    return torch.from_numpy(scene.reference_state)
 
 
 def static_graph(predictor: BoundPredictor, parameters: PhysicalParameters, dtype: torch.dtype | None = None) -> Graph:
@@ -373,6 +384,11 @@ def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
         raise ValueError(
             f"The model reads graphs of {counts[0]} nodes and {counts[1]} edges alone; scene {scene.name!r} has"
             f" {size[0]} and {size[1]}. Train another, or a graph network."
+        )
+    if isinstance(scene, Scene) and "position" in model.layout.names and model.layout != scene.layout:
+        raise ValueError(
+            f"The model's states have {model.layout.size} numbers a node, those of scene {scene.name!r} with its"
+            f" actuators' activations {scene.layout.size}: build the model with ForwardModel.for_scene."
         )
     if varies and model.marks_edges:
         raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import os
 import re
@@ -81,6 +82,8 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
     folder = Path(folder).absolute()
     if not re.fullmatch(r"[A-Za-z_]\w*", folder.name, re.ASCII):
         raise ValueError(f"The folder's name begins all C names: {folder.name!r} is no C identifier.")
+    if not next(predictor.buffers()).is_cpu:
+        predictor = copy.deepcopy(predictor).cpu()
     model = _specialized(predictor, "native")
     program, scene, executor, reason = model.program(), model.scene, model.executor, model.reason
     if program.dtype not in (torch.float32, torch.float64):
@@ -89,7 +92,7 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
     if reason is not None or not isinstance(executor, NativeExecutor) or not isinstance(core, PackedLayers):
         raise TypeError(f"This model cannot be exported as C++: {reason or 'it is specialised for another executor'}.")
     rest = program.reference.numpy()
-    names = getattr(scene, "actuator_names", [f"command {index}" for index in range(scene.num_actions)])
+    names = getattr(scene, "action_names", [f"command {index}" for index in range(scene.num_actions)])
     about = source.Description(
         name=folder.name,
         scene=scene.name,

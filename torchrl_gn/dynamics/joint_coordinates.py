@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.quaternion import turned_by
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes.force_elements import JOINT_GROUPS, joint_constants, joint_groups, joint_poses
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
@@ -122,21 +123,21 @@ class JointCoordinates(Float64Buffers):
         frame = above @ quaternion.to_matrix(pose[..., 3:]).unflatten(-1, (3, 3))
         relative = frame.mT @ matrices
         turning = angular - angular[..., self.parent, :]
-        spin = _turned(matrices.mT, turning)
+        spin = turned_by(matrices.mT, turning)
         parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
 
         if "slide" in self.groups:
             at, which = self._of("slide")
             axis, anchor = (joint[..., which[:, 0], part] for part in (slice(3), slice(3, 6)))
-            arm = _turned(matrices[..., at, :, :], anchor)
+            arm = turned_by(matrices[..., at, :, :], anchor)
             up = self.parent[at]
-            moved = position[..., at, :] - position[..., up, :] - _turned(above[..., at, :, :], pose[..., at, :3])
+            moved = position[..., at, :] - position[..., up, :] - turned_by(above[..., at, :, :], pose[..., at, :3])
             to_frame = frame[..., at, :, :].mT
-            place = _turned(to_frame, moved + arm) - anchor
+            place = turned_by(to_frame, moved + arm) - anchor
             # The parent's frame carries the body along, the body's own turn its anchor.
             carried = torch.linalg.cross(angular[..., up, :], position[..., at, :] - position[..., up, :])
             rate = linear[..., at, :] - linear[..., up, :] - carried
-            rate = _turned(to_frame, rate + torch.linalg.cross(turning[..., at, :], arm))
+            rate = turned_by(to_frame, rate + torch.linalg.cross(turning[..., at, :], arm))
             coordinate = (place * axis).sum(-1) + self.start[which[:, 0]].to(state.dtype)
             parts.append(
                 (torch.zeros_like(coordinate), torch.zeros_like(coordinate), coordinate, (rate * axis).sum(-1))
@@ -188,12 +189,12 @@ class JointCoordinates(Float64Buffers):
             up = self.parent[ball]
             frame = quaternion.product(orientation[..., up, :], self.pose[ball, 3:].expand_as(orientation[..., up, :]))
             turn = quaternion.product(quaternion.conjugate(frame), orientation[..., ball, :])
-            spin = _turned(matrices.mT, angular - angular[..., self.parent, :])[..., ball, :]
+            spin = turned_by(matrices.mT, angular - angular[..., self.parent, :])[..., ball, :]
             positions.append(turn.flatten(-2))
             velocities.append(spin.flatten(-2))
         if "free" in self.groups:
             free = self._of("free")[0]
-            local = _turned(matrices.mT, angular)[..., free, :]
+            local = turned_by(matrices.mT, angular)[..., free, :]
             positions.append(torch.cat((position[..., free, :], orientation[..., free, :]), dim=-1).flatten(-2))
             velocities.append(torch.cat((linear[..., free, :], local), dim=-1).flatten(-2))
         qpos, qvel = (torch.cat(each, dim=-1) for each in (positions, velocities))
@@ -205,10 +206,6 @@ def _branch(model: mujoco.MjModel, joints: list[int], middle: np.ndarray) -> flo
     first, second, third = model.jnt_axis[joints]
     zero = math.atan2(first @ np.cross(second, third), first @ third - (first @ second) * (second @ third))
     return 1.0 if math.sin(middle[joints[1]] - zero) >= 0 else -1.0
-
-
-def _turned(matrices: Tensor, vectors: Tensor) -> Tensor:
-    return (matrices @ vectors.unsqueeze(-1)).squeeze(-1)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -252,8 +249,8 @@ def _one_hinge(relative: Tensor, spin: Tensor, axis: Tensor) -> tuple[_Hinge]:
 
 def _two_hinges(relative: Tensor, spin: Tensor, first: Tensor, second: Tensor) -> tuple[_Hinge, _Hinge]:
     """Those of two hinges: what the first does to the second's axis, and the inverse of the second to the first's."""
-    before = _turned(relative.mT, first.expand(relative.shape[:-1]))
-    one = _about(first, second, _turned(relative, second.expand(relative.shape[:-1])))
+    before = turned_by(relative.mT, first.expand(relative.shape[:-1]))
+    one = _about(first, second, turned_by(relative, second.expand(relative.shape[:-1])))
     sine, cosine = _about(second, first, before)
     between = _dot(first, second)
     left, right = _dot(before, spin), _dot(second, spin)
@@ -266,7 +263,7 @@ def _three_hinges(
 ) -> tuple[_Hinge, _Hinge, _Hinge]:
     """Those of three hinges (Davenport's angles): the middle one is the angle between the outer two's axes."""
     shape = relative.shape[:-1]
-    after, before = _turned(relative, third.expand(shape)), _turned(relative.mT, first.expand(shape))
+    after, before = turned_by(relative, third.expand(shape)), turned_by(relative.mT, first.expand(shape))
     # first . after = k + a cos + b sin of the middle angle.
     k = _dot(first, second) * _dot(second, third)
     a, b = _dot(first, third) - k, _dot(first, _cross(second, third))

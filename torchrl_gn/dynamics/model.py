@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics.bound import DYNAMIC_FLOOR, BoundPredictor
 from torchrl_gn.dynamics.features import (
     FEATURES,
+    Activations,
     Actuators,
     BodyState,
     Canonicalizer,
@@ -22,8 +23,11 @@ from torchrl_gn.dynamics.features import (
     Feature,
     JointAxes,
     Joints,
+    MocapPoses,
     PhysicsChange,
+    Tendons,
     Wrenches,
+    contacts_of,
     graph_edges,
 )
 from torchrl_gn.dynamics.physics import as_physics, physics_from_description
@@ -110,8 +114,12 @@ class ForwardModel(nn.Module):
         if parameters == "inferred":
             # The anchor offsets say how long bodies are.
             static = self.inferred_size + GraphSize(6 if project else 0, 0, 0)
-        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=DYNAMIC_FLOOR)
-        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=DYNAMIC_FLOOR)
+        of_nodes, of_edges = (
+            [scale for feature in self.features if feature.part == part for scale in feature.least_scales(layout)]
+            for part in ("nodes", "edges")
+        )
+        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=DYNAMIC_FLOOR, least=of_nodes)
+        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=DYNAMIC_FLOOR, least=of_edges)
         self.parameter_node_normalizer = Normalizer(static.nodes, limit=_PARAMETER_LIMIT)
         self.parameter_edge_normalizer = Normalizer(static.edges, limit=_PARAMETER_LIMIT)
         static += GraphSize(0, int(self.marks_edges), 0)
@@ -144,8 +152,9 @@ class ForwardModel(nn.Module):
         layout = layout_of(first)
         if features is None:
             spatial = "orientation" in layout.names
-            features = (BodyState(), Controls(), *((JointAxes(), Joints(), Contacts()) if spatial else ()))
-            features += tuple(kind() for kind in (Actuators, Wrenches) if any(map(kind.suits, scenes)))
+            features = (BodyState(), Controls(), *((JointAxes(), Joints(), contacts_of(scenes)) if spatial else ()))
+            optional = Actuators, Activations, Tendons, MocapPoses, Wrenches
+            features += tuple(kind() for kind in optional if any(map(kind.suits, scenes)))
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)
@@ -172,7 +181,7 @@ class ForwardModel(nn.Module):
         start = 0
         for feature in self.features:
             if isinstance(feature, BodyState):
-                where = self.layout.encoded_slices(feature.encoding)
+                where = self.layout.spatial.encoded_slices(feature.encoding)
                 return {name: slice(start + part.start, start + part.stop) for name, part in where.items()}
             start += feature.size(self.layout) if feature.part == "nodes" else 0
         return {}
@@ -269,4 +278,4 @@ class ForwardModel(nn.Module):
 
 def layout_of(scene: Scene | KinematicTree) -> StateLayout:
     """Layout of a scene's body states, or of the states of a robot known by its joints."""
-    return joint_layout(scene.extras) if isinstance(scene, KinematicTree) else BODY_STATE
+    return joint_layout(scene.extras) if isinstance(scene, KinematicTree) else scene.layout

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.physics import Physics
+from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.processor import usable_cores
 from torchrl_gn.scenes import KinematicTree, Scene, UnsupportedSceneError, load_scene, scene_from_description
 from torchrl_gn.scenes.messages import quiet_mujoco
@@ -68,8 +69,8 @@ class MujocoPhysics(Physics):
         self._pool: Rollout | None = None
         self._data: list[mujoco.MjData] = []
         model = scene.model
-        if model.nv != scene.physics_size - 1 - model.nq:
-            raise UnsupportedSceneError(f"Scene {scene.name!r} has a state beside positions and velocities.")
+        if scene.physics_size != 1 + model.nq + model.nv + model.na or (model.na and tree is not None):
+            raise UnsupportedSceneError(f"Scene {scene.name!r} has a state that the states given do not show.")
         if tree is None:
             self.joints, self.coordinates = None, JointCoordinates(scene)
             return
@@ -106,37 +107,47 @@ class MujocoPhysics(Physics):
         given = state.double()
         if self.tree is None:
             position, velocity = self.coordinates(given)
-            after = _Advance.apply(self, position, velocity, action.double())
-            return cast(Tensor, after).unflatten(-1, (-1, 13)).to(state.dtype)
+            held = self.scene.activations
+            activation = given[..., held.node, BODY_STATE.size + held.slot]
+            after = _Advance.apply(self, position, velocity, activation, action.double())
+            return cast(Tensor, after).unflatten(-1, (-1, self.scene.state_size)).to(state.dtype)
         joints = given[..., 1:, :]
         position = torch.atan2(joints[..., 1], joints[..., 0])[..., self.back]
         velocity = joints[..., 2][..., self.back]
-        after = cast(Tensor, _Advance.apply(self, position, velocity, action.double()[..., self.command]))
+        none = position[..., :0]
+        after = cast(Tensor, _Advance.apply(self, position, velocity, none, action.double()[..., self.command]))
         angle, rate = (each[..., self.order] for each in after.chunk(2, dim=-1))
         moved = torch.stack((angle.cos(), angle.sin(), rate), dim=-1)
         moved = torch.cat((moved, joints[..., 3:]), dim=-1)  # of further channels it knows nothing
         return torch.cat((given[..., :1, :], moved), dim=-2).to(state.dtype)
 
-    def advance(self, position: np.ndarray, velocity: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """Coordinates and rates ``[n, nq + nv]``, or body states ``[n, N * 13]``, a control step later."""
+    def advance(
+        self, position: np.ndarray, velocity: np.ndarray, activation: np.ndarray, action: np.ndarray
+    ) -> np.ndarray:
+        """Coordinates and rates ``[n, nq + nv]``, or body states ``[n, N * C]``, a control step later."""
         model, timestep = self.simulated.model, self.simulated.model.opt.timestep
         # Sensors show the state before a physics step: one more step shows the last.
         steps = self.scene.substeps + (self.tree is None)
-        start = np.concatenate((np.ones((len(position), 1)), position, velocity), axis=1)
+        start = np.concatenate((np.ones((len(position), 1)), position, velocity, activation), axis=1)
         finite = np.all(np.isfinite(np.concatenate((start, action), axis=1)), axis=1)
-        rest = np.concatenate((np.ones(1), model.qpos0, np.zeros(model.nv)))
+        rest = np.concatenate((np.ones(1), model.qpos0, np.zeros(model.nv + model.na)))
         start, action = np.where(finite[:, None], start, rest), np.where(finite[:, None], action, 0.0)
         rows, parts = max(1, _MEMORY // (steps * (model.nsensordata + start.shape[1] + model.nu))), []
         for first in range(0, len(start), rows):
             part = slice(first, first + rows)
-            held = np.repeat(action[part, None], steps, axis=1) if model.nu else None
+            held = self.scene.mocaps.inputs(model, np.repeat(action[part, None], steps, axis=1))
+            held = held if held.shape[-1] else None
             pool = self._simulation()
             with quiet_mujoco():
-                after, sensors = pool.rollout(model, self._data, start[part], held, nstep=steps)
+                spec = self.scene.mocaps.control_spec
+                after, sensors = pool.rollout(model, self._data, start[part], held, nstep=steps, control_spec=spec)
             # MuJoCo resets an unstable simulation, and its time.
             finite[part] &= after[:, -1, 0] > 1 + (steps - 0.5) * timestep
-            parts.append(sensors[:, -1, self.scene.sensor_slice] if self.tree is None else after[:, -1, 1:])
-        after = np.concatenate(parts) if parts else np.empty((0, 13 * self.scene.num_nodes))
+            bodies = self.tree is None
+            # A step before the last, that is, where the control step ends.
+            parts.append(self.scene.states(sensors[:, -1], after[:, -2]) if bodies else after[:, -1, 1:])
+        after = np.concatenate(parts) if parts else np.empty((0, self.scene.state_size, self.scene.num_nodes))
+        after = after.reshape(len(after), -1)
         return np.where(finite[:, None], after, np.nan)
 
     def _simulation(self) -> Rollout:

@@ -221,9 +221,9 @@ def require_bound(model: object) -> None:
 def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> None:
     """ValueError unless states are ``[*B, N, C]``, actions ``[*B, A]``, and parameters have that batch or none.
 
-    TypeError unless both are tensors of real numbers, those of states not whole.
+    TypeError unless both are tensors of real numbers, those of states in single or double precision.
     """
-    require_real(state, "The state", whole=False)
+    _require_precise(state)
     require_real(action, "The action")
     batch, nodes, size = state.shape[:-2], scene.num_nodes, scene.state_size
     if state.shape[-2:] != (nodes, size):
@@ -243,7 +243,7 @@ def check_steps(
     scene: Scene, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None, *, each: bool = False
 ) -> None:
     """As :func:`check_shapes`, of start states and actions ``[*B, T, A]``; for ``each``, states ``[*B, T, N, C]``."""
-    require_real(states, "The state", whole=False)
+    _require_precise(states)
     require_real(actions, "The action")
     count, first = actions.shape[-2:-1].numel(), states
     if each:
@@ -252,6 +252,14 @@ def check_steps(
         first = states[..., 0, :, :] if states.ndim > 2 else states
     if count:
         check_shapes(scene, first, actions[..., 0, :] if actions.ndim > 1 else actions, parameters)
+
+
+def _require_precise(state: Tensor) -> None:
+    """TypeError for states of whole numbers, or in 16 bits: too few for positions and the projection onto joints."""
+    require_real(state, "The state", whole=False)
+    if state.dtype.itemsize < 4:
+        kind = str(state.dtype).removeprefix("torch.")
+        raise TypeError(f"The state must be float32 or float64, not {kind}: give its float().")
 
 
 def _past_commands(scene: Scene, action: Tensor) -> str:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol, cast
 import torch
 from torch import Tensor, nn
 
+from torchrl_gn.dynamics.activation_laws import ActivationLaws
 from torchrl_gn.dynamics.constraints import MaximalProjection
 from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 from torchrl_gn.dynamics.features.controls import ControlInputs
@@ -88,13 +89,14 @@ class StepProgram:
 
     layout: StateLayout  # channels of the state
     timestep: float | None  # control step, seconds, to integrate the rates; None: they are not
-    movable: Tensor  # [N, 12] movable-component mask
+    movable: Tensor  # [N, 12 + K] components that the network predicts
     edge_index: Tensor  # [2, E]
     reference: Tensor  # [N, C] float64, the scene's reference pose, at rest
     standard: PhysicalParameters  # physical parameters of the scene
     parameters: PhysicalParameters  # the same, or of each sample
     canonicalizer: BoundCanonicalizer  # to the canonical state and back
     controls: ControlInputs  # actions to edges
+    activations: ActivationLaws | None  # of actuators that have some; None without
     node_features: nn.ModuleList  # modules from StepInputs to node features
     edge_features: nn.ModuleList  # modules to edge features
     nodes: InputScaling  # scaling of the node features
@@ -144,7 +146,8 @@ def structure_key(program: StepProgram) -> tuple:
     if program.physics is not None:
         tensors += [*program.physics.parameters(), *program.physics.buffers()]
     numbers = tuple(None if each is None else each.detach().cpu().numpy().tobytes() for each in tensors)
-    masks = tuple(each.cpu().numpy().tobytes() for each in parameter_inputs(program))
+    brings = any(given is not own for given, own in zip(program.parameters, program.standard, strict=True))
+    masks = tuple(each.cpu().numpy().tobytes() for each in parameter_inputs(program)) if brings else ()
     pairs = zip(program.parameters, program.standard, strict=True)
     many = any(given.shape[: given.ndim - own.ndim].numel() > 1 for given, own in pairs)
     return repr(program.output.runs), program.dtype, numbers, masks, many

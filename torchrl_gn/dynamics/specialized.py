@@ -81,7 +81,10 @@ class SpecializedPredictor(Predictor):
     @property
     def reason(self) -> str | None:
         """Why torch operations run it although it is native; None if they do not."""
-        return self.executor.reason
+        moved = self.executor_name == "native" and not self.squares.is_cpu
+        return self.executor.reason or (
+            f"on {self.squares.device.type}, it runs by torch operations" if moved else None
+        )
 
     @without_autocast
     @torch.no_grad()

@@ -147,7 +147,7 @@ class SceneEnv(EnvBase):
 
     def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:
         """Pictures ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``; needs Pillow, and no display."""
-        state = read(tensordict, "state", (self.scene.num_nodes, 13), self)
+        state = read(tensordict, "state", (self.scene.num_nodes, self.scene.state_size), self)
         if (variant := self.variant_of(tensordict)) is None:
             return draw_states(self.scene, state, size=size)
         pictures = np.empty((*tensordict.shape, size, size, 3), dtype=np.uint8)

@@ -14,9 +14,12 @@ from torchrl_gn.evaluation.figures import plot_loglog as plot_loglog
 from torchrl_gn.evaluation.figures import plot_planning_curves as plot_planning_curves
 from torchrl_gn.evaluation.figures import plot_rewards as plot_rewards
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve
+from torchrl_gn.evaluation.half_step import half_step_errors as half_step_errors
 from torchrl_gn.evaluation.motion_figures import plot_body_trajectory as plot_body_trajectory
 from torchrl_gn.evaluation.motion_figures import plot_joints as plot_joints
 from torchrl_gn.evaluation.motion_figures import plot_motions as plot_motions
+from torchrl_gn.evaluation.pose_errors import PoseErrors as PoseErrors
+from torchrl_gn.evaluation.pose_errors import pose_errors as pose_errors
 from torchrl_gn.evaluation.report import fresh_errors as fresh_errors
 from torchrl_gn.evaluation.report import identification_errors as identification_errors
 from torchrl_gn.evaluation.report import linear_probe as linear_probe

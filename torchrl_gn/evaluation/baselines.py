@@ -38,6 +38,7 @@ def baseline_errors(
     for name, function in known.items():
         module: Any = TensorDictModule(partial(_step, function, present), ["state", "action"], [("next", "state")])
         module.layout, module.scene = layout, scene
+        module.function = function  # whose tensors say where to evaluate
         tables[name] = evaluate_errors(module, trajectories, **options)
     return tables
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import cast
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -35,7 +36,7 @@ def squared_errors(prediction: Tensor, truth: Tensor, layout: StateLayout = BODY
     for component in layout.components:
         where = layout.slices[component.name]
         a, b = prediction[..., where], truth[..., where]
-        if component.kind == "add":
+        if component.adds:
             errors.append((a - b).square().sum(-1))
         elif component.kind == "rotation":
             errors.append(quaternion.angle(a, b).square())
@@ -81,8 +82,8 @@ def evaluate_errors(
     _check(states, actions, [burn_in + horizon for horizon in horizons], batch_size, scene, layout)
     steps, horizon = actions.shape[1] - burn_in, max(horizons, default=0)
     device = device or next(itertools.chain(model.parameters(), model.buffers()), states).device
-    predicted = torch.as_tensor(scene.predicted, device=device)
-    single, rollouts = _Sums(1, layout, predicted), _Sums(horizon, layout, predicted)
+    predicted = torch.as_tensor(np.flatnonzero(scene.predicted), device=device)
+    single, rollouts = ErrorSums(1, layout, predicted), ErrorSums(horizon, layout, predicted)
     predictor = as_predictor(model)
     if (parameters := predictor.parameters_in(trajectories)) is not None:
         require_finite(parameters, "parameters of the trajectories")
@@ -94,7 +95,7 @@ def evaluate_errors(
             prediction = predictor.teacher_forced(state[:, :-1], action, own)[0][:, burn_in:].flatten(0, 1)
             flat, truth = state[:, burn_in:-1].flatten(0, 1), state[:, burn_in + 1 :].flatten(0, 1)
             valid = single.add(0, prediction, truth, flat)
-            single.diverged[0] += int((~valid.reshape(len(state), steps).all(-1)).sum())
+            single.diverged[0] += (~valid.reshape(len(state), steps).all(-1)).sum()
         for state, action, own in _batches(states, actions, parameters, batch_size, device, layout) if horizons else ():
             wanted, hidden_state = max(0, min(keep - sum(map(len, kept)), len(state))), None
             if burn_in and predictor.recurrent:  # others have nothing to warm up
@@ -103,22 +104,29 @@ def evaluate_errors(
             guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own, hidden_state=hidden_state)
             kept.append(_add_rollouts(guarded, state, rollouts, wanted))
 
-    movable = scene.movable[scene.predicted]
-    fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
+    fixed = fixed_components(scene, layout)
     errors = [single.error("one_step_error", 1, len(states), steps, fixed)] if one_step else []
     errors += [rollouts.error(f"rollout_error_{h}", h, len(states), h, fixed) for h in horizons]
     table = {error.name: error for error in errors}
     return ErrorTable(table, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])))
 
 
-class _Sums:
+def fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
+    """Components of a scene's states that errors leave out: those that cannot move, and activations with laws."""
+    movable = scene.movable[scene.predicted]
+    fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
+    lawful = isinstance(scene, Scene) and scene.activations.known.all()
+    return fixed | {"activation"} if lawful else fixed
+
+
+class ErrorSums:
     """Sums of squared errors of the model and of the persistence baseline, step by step."""
 
     def __init__(self, steps: int, layout: StateLayout, predicted: Tensor) -> None:
         self.layout, self.predicted = layout, predicted
         self.model = torch.zeros(steps, len(layout.names), dtype=torch.float64, device=predicted.device)
         self.persistence = torch.zeros_like(self.model)
-        self.diverged = [0] * steps  # sequences that have diverged by this step
+        self.diverged = torch.zeros(steps, dtype=torch.long, device=predicted.device)  # sequences, by this step
 
     def add(self, step: int, prediction: Tensor, truth: Tensor, initial: Tensor, alive: Tensor | None = None) -> Tensor:
         """Add ``[B, N, 13]`` states and return ``[B]``, where the prediction is still a state."""
@@ -144,16 +152,16 @@ class _Sums:
         components = {n: value / baselines[n] for n, value in squared.items() if n not in left_out}
         if not components:
             raise ValueError(f"Nothing moves in the trajectories, so {name} relative to no change has no meaning.")
-        return PredictionError(name, components, squared, baselines, left_out, sequences, self.diverged[steps - 1])
+        return PredictionError(name, components, squared, baselines, left_out, sequences, int(self.diverged[steps - 1]))
 
 
-def _add_rollouts(guarded: GuardedRollout, truth: Tensor, sums: _Sums, keep: int) -> Tensor:
+def _add_rollouts(guarded: GuardedRollout, truth: Tensor, sums: ErrorSums, keep: int) -> Tensor:
     """Add the errors of rollouts to ``sums``, return the first ``keep`` of them, NaN from where they diverged."""
     alive, kept = guarded.good_steps >= 0, [truth[:keep, 0]]
     for step in range(1, guarded.states.shape[1]):
         current = guarded.states[:, step]
         alive = sums.add(step - 1, current, truth[:, step], truth[:, 0], alive & (guarded.good_steps >= step))
-        sums.diverged[step - 1] += int((~alive).sum())
+        sums.diverged[step - 1] += (~alive).sum()
         kept.append(torch.where(alive[:keep, None, None], current[:keep], torch.nan))
     return torch.stack(kept, dim=1).cpu()
 
@@ -184,7 +192,7 @@ def _batches(
 
 def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:
     """``[..., N]``, whether nodes have a zero quaternion (or ``cos = sin = 0``)."""
-    angular = [layout.slices[component.name] for component in layout.components if component.kind != "add"]
+    angular = [layout.slices[component.name] for component in layout.components if not component.adds]
     return torch.stack([(state[..., where] == 0).all(-1) for where in angular]).any(0)
 
 

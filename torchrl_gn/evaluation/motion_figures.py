@@ -38,8 +38,8 @@ def plot_body_trajectory(
     Values that are not finite leave gaps. ``node`` is an index or a name; default: the middle moving one, link 3 of
     Swimmer6.
     """
-    if truth.ndim != 3 or truth.shape != prediction.shape or truth.shape[1:] != (scene.num_nodes, 13):
-        shapes = f"[T + 1, {scene.num_nodes}, 13], got {list(truth.shape)} and {list(prediction.shape)}"
+    if truth.ndim != 3 or truth.shape != prediction.shape or truth.shape[1:] != (scene.num_nodes, scene.state_size):
+        shapes = f"[T + 1, {scene.num_nodes}, {scene.state_size}], got {list(truth.shape)} and {list(prediction.shape)}"
         raise ValueError(f"Truth and prediction of scene {scene.name!r} must both be {shapes}.")
     index = node_index(scene, node)
     true, predicted = (states[:, index].detach().double().cpu().numpy() for states in (truth, prediction))

@@ -137,7 +137,7 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
 
 
 def _to_numpy(scene: Scene, what: str, states: Tensor) -> np.ndarray:
-    if states.ndim != 3 or states.shape[0] == 0 or states.shape[1:] != (scene.num_nodes, 13):
-        wanted = f"[T + 1, {scene.num_nodes}, 13]"
+    if states.ndim != 3 or states.shape[0] == 0 or states.shape[1:] != (scene.num_nodes, scene.state_size):
+        wanted = f"[T + 1, {scene.num_nodes}, {scene.state_size}]"
         raise ValueError(f"{what} of scene {scene.name!r} must be {wanted}, got {list(states.shape)}.")
     return states.detach().double().cpu().numpy()

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_gn.maths.surface_distance import from_box
+
 _TINY = 1e-12  # metres, and the same of slopes
 _PULL = 1e-8  # square metres: of all points alike near, the middle of the segment is taken
 
@@ -39,18 +41,7 @@ def segment_to_box(start: Tensor, direction: Tensor, half: Tensor) -> Nearest:
     before, after = _slope(start, direction, half, torch.stack((low, high), dim=-1)).unbind(-1)
     fraction = low + (-before / (after - before + _TINY)).clamp(0, 1) * (high - low)
     point = start + fraction.unsqueeze(-1) * direction
-    outside = _outside(point, half)
-    far = outside.square().sum(-1)
-    apart = far > _TINY**2
-    length = far.clamp(min=_TINY**2).sqrt()
-    depth = point.abs() - half  # [*B, 3] negative inside
-    x, y, z = depth.unbind(-1)
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    of_x = torch.where(torch.maximum(y, z) > x, zero, one)
-    of_y = torch.where(z > y, zero, 1 - of_x)
-    face = torch.stack((of_x, of_y, 1 - of_x - of_y), dim=-1) * torch.where(point < 0, -1.0, 1.0)
-    distance = torch.where(apart, length, depth.amax(-1))
-    normal = torch.where(apart.unsqueeze(-1), outside / length.unsqueeze(-1), face)
+    distance, normal = from_box(point, half)
     return Nearest(distance, normal, fraction)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -21,6 +22,8 @@ class Normalizer(Float64Buffers):
         size: number of features ``F``.
         floor: standard deviations up to this count as constant, as do those below 1e-7 of the mean.
         limit: normalised features are clamped to plus and minus this.
+        least: standard deviations below these ``[F]`` count as these, unless the feature is constant: for features that
+            hardly vary in data, but in a model's own predictions. Default: 0.
     """
 
     count: Tensor
@@ -29,7 +32,9 @@ class Normalizer(Float64Buffers):
     std: Tensor
     inverse_std: Tensor
 
-    def __init__(self, size: int, *, floor: float = 0.0, limit: float = math.inf) -> None:
+    def __init__(
+        self, size: int, *, floor: float = 0.0, limit: float = math.inf, least: Sequence[float] | None = None
+    ) -> None:
         super().__init__()
         if not 0 <= floor < math.inf:
             raise ValueError(f"floor={floor} must be a finite standard deviation, 0 or above.")
@@ -39,6 +44,10 @@ class Normalizer(Float64Buffers):
         for name in ("count", "mean", "m2", "std", "inverse_std"):
             derived = name.endswith("std")
             self.register_buffer(name, torch.zeros(size, dtype=torch.float64), persistent=not derived)
+        # No buffer: those of a module without memory (``to_empty``) are filled from files alone.
+        self.least = (0.0,) * size if least is None else tuple(least)
+        if len(self.least) != size:
+            raise ValueError(f"least must have {size} numbers, one a feature, not {len(self.least)}.")
         self.register_load_state_dict_post_hook(Normalizer._refresh)
 
     @property
@@ -91,6 +100,8 @@ class Normalizer(Float64Buffers):
     def _refresh(self, *_) -> None:
         std = (self.m2 / self.count.clamp(min=1)).sqrt()
         constant = (std <= self.floor) | (std <= 1e-7 * self.mean.abs())
+        if any(self.least):
+            std = torch.maximum(std, torch.tensor(self.least, dtype=std.dtype, device=std.device))
         # In place: TorchRL's losses hold on to a module's buffers.
         self.std.copy_(torch.where(constant, 0.0, std))
         self.inverse_std.copy_(torch.where(constant, 0.0, 1 / torch.where(constant, 1.0, std)))

@@ -159,7 +159,12 @@ def to_matrix(q: Tensor) -> Tensor:
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
     """Rotate vectors ``[..., 3]`` by quaternions ``[..., 4]``, broadcast."""
-    return (to_matrix(q).unflatten(-1, (3, 3)) @ v.unsqueeze(-1)).squeeze(-1)
+    return turned_by(to_matrix(q).unflatten(-1, (3, 3)), v)
+
+
+def turned_by(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors ``[*B, 3]`` turned by matrices ``[*B, 3, 3]``."""
+    return (matrices @ vectors.unsqueeze(-1)).squeeze(-1)
 
 
 def rotate_by(rotation_vector: Tensor, v: Tensor) -> Tensor:

@@ -12,17 +12,23 @@ from torch import Tensor
 
 from torchrl_gn.maths import quaternion
 
-Kind = Literal["add", "rotation", "circle"]
+Kind = Literal["add", "rotation", "circle", "scalar"]
 Encoding = Literal["matrix", "quaternion"]
 
-_SIZES: dict[str, tuple[int | None, int | None]] = {"add": (None, None), "rotation": (4, 3), "circle": (2, 1)}
+_SIZES: dict[str, tuple[int | None, int | None]] = {
+    "add": (None, None),
+    "scalar": (None, None),
+    "rotation": (4, 3),
+    "circle": (2, 1),
+}
 
 
 @dataclass(frozen=True)
 class Component:
     """One named group of state channels that is updated in one way.
 
-    ``"add"`` channels change by addition; ``"rotation"`` is a unit quaternion, rotated by a rotation vector (3 delta
+    ``"add"`` and ``"scalar"`` channels change by addition, and only the first may be a vector that turns with the
+    frame; ``"rotation"`` is a unit quaternion, rotated by a rotation vector (3 delta
     channels, Hamilton product, paper SM "Prediction of dynamic state change"); ``"circle"`` is a ``(cos, sin)`` pair,
     rotated by an angle (1 delta channel).
     """
@@ -46,6 +52,11 @@ class Component:
         """Number of channels in the state change."""
         return _SIZES[self.kind][1] or self.size
 
+    @property
+    def adds(self) -> bool:
+        """Whether it changes by addition."""
+        return self.kind in ("add", "scalar")
+
 
 @dataclass(frozen=True)
 class StateLayout:
@@ -68,7 +79,7 @@ class StateLayout:
             if rate.delta_size != component.delta_size:
                 raise ValueError(f"Component {component.name!r} and its rate {component.rate!r} differ in size.")
         # Known before anything is compiled: the compiler cannot trace their first use.
-        _ = self.size, self.delta_size, self.slices, self.delta_slices
+        _ = self.size, self.delta_size, self.slices, self.delta_slices, self.spatial
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -83,6 +94,12 @@ class StateLayout:
     def delta_size(self) -> int:
         """Number of channels of a state change, 12 for a body."""
         return sum(component.delta_size for component in self.components)
+
+    @cached_property
+    def spatial(self) -> StateLayout:
+        """Itself without scalars; they come last."""
+        kept = tuple(component for component in self.components if component.kind != "scalar")
+        return self if len(kept) == len(self.components) else StateLayout(kept)
 
     @cached_property
     def slices(self) -> dict[str, slice]:
@@ -100,7 +117,7 @@ class StateLayout:
         for component in self.components:
             where = self.slices[component.name]
             old, new = state[..., where], next_state[..., where]
-            if component.kind == "add":
+            if component.adds:
                 parts.append(new - old)
             elif component.kind == "rotation":
                 parts.append(quaternion.log(quaternion.product(new, quaternion.conjugate(old))))
@@ -115,7 +132,7 @@ class StateLayout:
         for component in self.components:
             old = state[..., self.slices[component.name]]
             change = delta[..., self.delta_slices[component.name]]
-            if component.kind == "add":
+            if component.adds:
                 parts.append(old + change)
             elif component.kind == "rotation":
                 parts.append(quaternion.normalize(quaternion.product(quaternion.exp(change), old)))
@@ -149,23 +166,35 @@ class StateLayout:
         ``matrix`` ``[*B, 3, 3]`` is that rotation, if known. ValueError if a component cannot be rotated.
         """
         transposed = self._transposed(rotation, matrix)
-        parts = [
-            quaternion.product(rotation.unsqueeze(-2), state[..., self.slices[c.name]])
-            if c.kind == "rotation"
-            else state[..., self.slices[c.name]] @ transposed
-            for c in self.components
-        ]
+        parts = []
+        for c in self.components:
+            values = state[..., self.slices[c.name]]
+            if c.kind == "rotation":
+                values = quaternion.product(rotation.unsqueeze(-2), values)
+            elif c.kind == "add":
+                values = values @ transposed
+            parts.append(values)
         return torch.cat(parts, dim=-1)
 
     def rotate_delta(self, delta: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
         """Rotate state changes ``[*B, N, delta_size]`` as :meth:`rotate` does states."""
-        vectors = delta.reshape(*delta.shape[:-2], delta.shape[-2] * len(self.components), 3)
-        return (vectors @ self._transposed(rotation, matrix)).reshape(delta.shape)
+        transposed, size = self._transposed(rotation, matrix), self._turning()
+        vectors = delta[..., :size].reshape(*delta.shape[:-2], delta.shape[-2] * (size // 3), 3)
+        turned = (vectors @ transposed).reshape(*delta.shape[:-1], size)
+        return turned if size == self.delta_size else torch.cat((turned, delta[..., size:]), dim=-1)
+
+    def _turning(self) -> int:
+        """Channels of a change that turn with the frame, the first ones; ValueError if some cannot be turned."""
+        for c in self.components:
+            if c.kind == "circle" or (c.kind != "scalar" and c.delta_size != 3):
+                raise ValueError(f"Component {c.name!r} is no vector or rotation in space and cannot be rotated.")
+        kinds = [c.kind == "scalar" for c in self.components]
+        if kinds != sorted(kinds):
+            raise ValueError("Scalars must come last in a state that is rotated.")
+        return sum(c.delta_size for c in self.components if c.kind != "scalar")
 
     def _transposed(self, rotation: Tensor, matrix: Tensor | None) -> Tensor:
-        for c in self.components:
-            if c.kind == "circle" or c.delta_size != 3:
-                raise ValueError(f"Component {c.name!r} is no vector or rotation in space and cannot be rotated.")
+        self._turning()
         return (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
 
     def encode(self, state: Tensor, encoding: Encoding = "matrix", matrices: Tensor | None = None) -> Tensor:
@@ -210,6 +239,13 @@ BODY_STATE = StateLayout(
     )
 )
 """State of a rigid body in the world frame: metres, unit quaternion, m/s, rad/s (13 channels)."""
+
+
+def body_layout(activations: int = 0) -> StateLayout:
+    """State of a rigid body and the activations of the actuators that it carries, behind :data:`BODY_STATE`."""
+    if not activations:
+        return BODY_STATE
+    return StateLayout((*BODY_STATE.components, Component("activation", activations, "scalar")))
 
 
 def joint_layout(extras: Sequence[str] = ()) -> StateLayout:

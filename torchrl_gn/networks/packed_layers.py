@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,10 +28,14 @@ class _Gather(NamedTuple):
     def __call__(self, buffers: Sequence[Tensor]) -> Tensor:
         """Rows ``[I, B, F]``."""
         buffer = buffers[self.source]
-        items = buffer[self.items.to(buffer.device)]
+        items = buffer[self.items]
         if self.rows is None:
             return items
-        return buffer.new_zeros(self.count, *buffer.shape[1:]).index_add(0, self.rows.to(buffer.device), items)
+        return buffer.new_zeros(self.count, *buffer.shape[1:]).index_add(0, self.rows, items)
+
+    def on(self, device: torch.device) -> _Gather:
+        """The same with its indices on a device."""
+        return self._replace(items=self.items.to(device), rows=None if self.rows is None else self.rows.to(device))
 
 
 class _Layer(NamedTuple):
@@ -69,6 +73,25 @@ class LayerShapes:
             for layer in layers.layers
         )
 
+        self._elsewhere: dict[torch.device, tuple[_Layer, ...]] = {}
+
+    def on(self, device: torch.device) -> tuple[_Layer, ...]:
+        """The layers with indices on a device, where they are copied to once."""
+        if device.type == "cpu":
+            return self.layers
+        if device not in self._elsewhere:
+            self._elsewhere[device] = tuple(
+                layer._replace(
+                    inputs=tuple(gather.on(device) for gather in layer.inputs),
+                    added=tuple(gather.on(device) for gather in layer.added),
+                )
+                for layer in self.layers
+            )
+        return self._elsewhere[device]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_elsewhere": {}}
+
     @property
     def weights(self) -> list[int]:
         """Rows and columns of every layer's weight, one after the other."""
@@ -98,7 +121,8 @@ class PackedLayers:
         """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, by torch operations."""
         batch, dtype = dynamic.nodes.shape[:-2], dynamic.nodes.dtype
         buffers = [items_first(dynamic.nodes), items_first(dynamic.edges)]
-        for layer, weight, table in zip(self.shapes.layers, self.plain_weights(), self._plain_tables(), strict=True):
+        layers = self.shapes.on(dynamic.nodes.device)
+        for layer, weight, table in zip(layers, self.plain_weights(), self._plain_tables(), strict=True):
             out = F.linear(torch.cat([gather(buffers) for gather in layer.inputs], -1), weight.to(dtype))
             for gather in layer.added:
                 out = out + gather(buffers)

@@ -10,21 +10,21 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.finite import is_traced, require_finite
+from torchrl_gn.finite import is_traced, require_all_finite
 from torchrl_gn.policies import ObservationModel, ObservationNetwork
 
 
 def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:
     """Entries of a batch, in the order of ``keys``; KeyError if one is missing, ValueError if NaN or Inf."""
-    values = []
+    values = {}
     for key in keys:
         value = tensordict.get(key, None)
         if value is None:
             present = sorted(map(str, tensordict.keys(True)))
             raise KeyError(f"{type(loss).__name__} needs {key!r}, the batch has {present}.")
-        require_finite(value, f"{key!r} of the batch")
-        values.append(value)
-    return values
+        values[f"{key!r} of the batch"] = value
+    require_all_finite(values)
+    return list(values.values())
 
 
 def require_fitted(loss: Any, *networks: nn.Module, remedy: str, also: Callable[[], None] | None = None) -> None:

@@ -39,6 +39,11 @@ class ForwardModelLoss(LossModule):
     Each component's error is divided by the variance of its change in this scene; the loss is the mean over components.
     Orientations: :math:`1 - (q_e \cdot q_p)^2` of the *change* quaternions (as printed, it is not zero if equal).
 
+    Robots move calmly most of the time and wildly at times: means of squared errors are then those of the wild samples.
+    With a ``size_floor`` :math:`c` each sample's errors are multiplied by :math:`(1 + c) / (c + s)`, where :math:`s` is
+    the mean square of the change that the model predicts, in the same units, and not differentiated: it is about 1 on
+    average. As it depends on the input alone, noisy targets stay unbiased.
+
     Differentiated: the model's weights, through the whole window or ``bptt_steps`` of it.
 
     Args:
@@ -50,6 +55,7 @@ class ForwardModelLoss(LossModule):
             the errors are those of the whole window. Default: never.
         channel_weights: ``[N, 12]`` (or broadcast) factors of each channel's squared error, for example of less than 1
             where measurement noise makes up most of a step's change. Default: all 1.
+        size_floor: mean square below which changes count as equally small. Default (paper): all samples count alike.
         residual_weight: factor of a penalty on the correction of known physics, squared like an error, in up to 128 of
             the batch's states under actions of others. In logs under feedback control it keeps a residual model from
             learning the controller as dynamics, and near the physics where the log has no data.
@@ -89,6 +95,7 @@ class ForwardModelLoss(LossModule):
         teacher_forced_steps: int = 1,
         bptt_steps: int | None = None,
         channel_weights: Tensor | None = None,
+        size_floor: float | None = None,
         residual_weight: float = 0.0,
         residual_noise: float = 0.0,
     ) -> None:
@@ -98,6 +105,8 @@ class ForwardModelLoss(LossModule):
         for name, size in sizes.items():
             if not 0 <= size < math.inf:
                 raise ValueError(f"{name}={size} must not be negative, NaN or infinite.")
+        if size_floor is not None and not 0 < size_floor < math.inf:
+            raise ValueError(f"size_floor={size_floor} must be above 0 and finite, or None for equal weights.")
         if isinstance(model, SpecializedPredictor):
             raise TypeError("A specialised model passes no gradient to the weights; train the bound model.")
         if teacher_forced_steps < 1:
@@ -109,7 +118,7 @@ class ForwardModelLoss(LossModule):
         if residual_weight and model.model.physics is None:
             raise ValueError(f"residual_weight={residual_weight} is for models with physics=, which this one lacks.")
         self.model, self.noise, self.generator = model, noise, generator
-        self.residual_weight, self.residual_noise = residual_weight, residual_noise
+        self.size_floor, self.residual_weight, self.residual_noise = size_floor, residual_weight, residual_noise
         self.teacher_forced_steps, self.bptt_steps = teacher_forced_steps, bptt_steps
         scale = torch.zeros(model.layout.delta_size, dtype=torch.float64, device=model.movable.device)
         self.register_buffer("noise_scale", scale)
@@ -168,7 +177,7 @@ class ForwardModelLoss(LossModule):
         clean.update(model.canonicalizer.recentered(state)[..., model.incidence.predicted, :].cpu())
         scale = torch.ones(layout.delta_size, dtype=torch.float64)
         for component in layout.components:
-            if component.kind == "add":
+            if component.adds:
                 scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]]
         self.noise_scale.copy_(scale)
         noisy = self.perturb(state)
@@ -200,12 +209,32 @@ class ForwardModelLoss(LossModule):
         state, action, next_state = self._read(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
-        layout, steps = self.model.layout, state.shape[1] if state.ndim == 4 else 1
+        steps = state.shape[1] if state.ndim == 4 else 1
         done = tensordict.get(unravel_key(("next", self.tensor_keys.done)), None)
         starts = starts_of(done, steps, self.teacher_forced_steps)
         parameters = self._read_parameters(tensordict, starts if state.ndim == 4 else None)
         if state.ndim == 3:
             state, action, next_state = (entry.unsqueeze(1) for entry in (state, action, next_state))
+        return self._losses(state, action, next_state, starts, parameters)
+
+    @without_autocast
+    def unchecked(self, tensordict: TensorDictBase) -> TensorDict:
+        """The same of a batch without ends and parameters, and no check: it never waits for a GPU."""
+        keys = [tensordict.get(key) for key in self.in_keys[:3]]
+        state, action, next_state = keys if keys[0].ndim == 4 else (entry.unsqueeze(1) for entry in keys)
+        starts = starts_of(None, state.shape[1], self.teacher_forced_steps)
+        return self._losses(state, action, next_state, starts, None)
+
+    def _losses(
+        self,
+        state: Tensor,
+        action: Tensor,
+        next_state: Tensor,
+        starts: list[Starts],
+        parameters: TensorDictBase | None,
+    ) -> TensorDict:
+        """Losses of windows ``[B, H, ...]``."""
+        layout, steps = self.model.layout, state.shape[1]
         current, hidden = self.perturb(state[:, 0]), None
         errors = state.new_zeros(len(layout.components))
         prepared = self.model.prepared_for_training(parameters)
@@ -289,7 +318,7 @@ class ForwardModelLoss(LossModule):
     def component_errors(self, delta: Tensor, target: Tensor) -> Tensor:
         """Error of each component: squared, by the variance of its change, averaged over samples and nodes."""
         layout, scale = self.model.layout, self._scale(delta)
-        errors = []
+        errors, weight_of = [], self._sample_weights(delta, scale)
         for component in layout.components:
             where = layout.delta_slices[component.name]
             if component.kind == "rotation":
@@ -300,5 +329,13 @@ class ForwardModelLoss(LossModule):
                 difference = delta[..., where] - target[..., where]
             weight = scale[:, where]
             count = (weight > 0).sum().clamp(min=1) * delta.shape[0]
-            errors.append((difference * weight).square().sum() / count)
+            square = (difference * weight).square()
+            errors.append((square if weight_of is None else square * weight_of).sum() / count)
         return torch.stack(errors)
+
+    def _sample_weights(self, delta: Tensor, scale: Tensor) -> Tensor | None:
+        """Weights ``[B, 1, 1]`` of samples by the size of their predicted change; None if all count alike."""
+        if (floor := self.size_floor) is None:
+            return None
+        size = (delta.detach() * scale).square().sum((-1, -2), keepdim=True) / (scale > 0).sum().clamp(min=1)
+        return (1 + floor) / (floor + size)

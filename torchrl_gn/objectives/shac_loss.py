@@ -78,7 +78,7 @@ class SHACLoss(LossModule):
                     f"{type(network).__name__} is of scene {network.scene.name!r}, not {env.scene.name!r}."
                 )
             env.scene.require_timestep(network.scene.timestep, f"{type(network).__name__}")
-        self.policy, self.value, self.steps = policy, value, int(steps)
+        self.policy, self.value, self.steps, self._fitted = policy, value, int(steps), False
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
         # Not registered, so that the model's weights stay out of parameters().
@@ -90,8 +90,10 @@ class SHACLoss(LossModule):
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         (state,) = read_entries(self, tensordict, ["state"])
-        if not (self.policy.fitted and self.value.fitted):
-            raise RuntimeError("Normalisers of policy or value have seen no data: call fit_normalizers first.")
+        if not self._fitted:
+            if not (self.policy.fitted and self.value.fitted):
+                raise RuntimeError("Normalisers of policy or value have seen no data: call fit_normalizers first.")
+            self._fitted = True  # asking waits for a device
         imagined, entropies = self._imagine(state)
         final = imagined["next", "state"][:, -1]
         with frozen(self.value):

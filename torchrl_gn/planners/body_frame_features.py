@@ -24,9 +24,10 @@ class BodyFrameFeatures(Float64Buffers):
     r"""Graph of a scene's bodies without the world, each seen in its own frame, normalised.
 
     A node has its velocities :math:`R^T v`, :math:`R^T \omega`, the world's origin :math:`-R^T x` and the world's axes,
-    the rows of :math:`R`; an edge, from body to body of a joint, the sender's pose in the receiver's frame, and as
-    static feature its direction. Position along axes where the task is the same everywhere, and axes that only the yaw
-    distinguishes, are left out. So features have the same meaning in scenes of any number of bodies.
+    the rows of :math:`R`, and activations of actuators; an edge, from body to body of a joint, the sender's pose in the
+    receiver's frame, and as static feature its direction. Position along axes where the task is the same everywhere,
+    and axes that only the yaw distinguishes, are left out. So features have the same meaning in scenes of any number of
+    bodies.
 
     TypeError for a robot known by its joints alone.
 
@@ -55,7 +56,8 @@ class BodyFrameFeatures(Float64Buffers):
         hidden = np.asarray(scene.translation_invariant) if invariances.recenter else np.zeros(3, bool)
         self.constants({"bodies": bodies, "visible": 1.0 - hidden, "direction": direction[:, None]})
         self.incidence = Incidence(edge_index, len(bodies))
-        self.size = GraphSize(9 + 3 * len(range(*self.axes.indices(3))), 12, 0)
+        activations = scene.state_size - BODY_STATE.size
+        self.size = GraphSize(9 + 3 * len(range(*self.axes.indices(3))) + activations, 12, 0)
         self.node_normalizer = Normalizer(self.size.nodes, floor=FLOOR, limit=LIMIT)
         self.edge_normalizer = Normalizer(self.size.edges, floor=FLOOR, limit=LIMIT)
 
@@ -96,7 +98,7 @@ class BodyFrameFeatures(Float64Buffers):
         own = world.mT
         seen = torch.stack((velocity, angular, -position * self.visible.to(state.dtype)), -1)
         axes = world[..., self.axes, :].flatten(-2)  # of the world, in the body's frame
-        nodes = torch.cat(((own @ seen).mT.flatten(-2), axes), -1)
+        nodes = torch.cat(((own @ seen).mT.flatten(-2), axes, state[..., BODY_STATE.size :]), -1)
         sender, receiver = self.incidence.edge_index
         frame, offset = own[..., receiver, :, :], position[..., sender, :] - position[..., receiver, :]
         relative = torch.cat((world[..., sender, :, :], offset.unsqueeze(-1)), -1)

@@ -23,6 +23,7 @@ from torchrl_gn.planners.plan import (
     KEY,
     RecedingHorizonPlanner,
     check_plannable,
+    device_of,
     flat_rows,
     keep_better,
     plan_primer,
@@ -140,7 +141,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         batch, device = tensordict.shape, self.imagined.device
         flat = flat_rows(tensordict)
         plan, planned = read_plan(flat, self.plan_shape, torch.float32)
-        states_at = cast(Tensor, tensordict.get("state", plan)).device
+        states_at = device_of(tensordict)
         plan, planned = self._scaled(plan.to(device)), planned.flatten().to(device)
         entries = self._entries(flat)
         lost = [key for key in self.imagined.carried_keys if key not in entries.keys()]

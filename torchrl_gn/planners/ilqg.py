@@ -131,10 +131,13 @@ class ILQGPlanner(RecedingHorizonPlanner):
     def plant(self, variant: int = 0) -> Plant:
         """What is planned on: of the true physics, one of the environment's scenes."""
         env = self._env
+        if isinstance(env, ModelEnv):
+            plant = self._plants.get(0)
+            if not isinstance(plant, LearnedPlant) or plant.device != env.device:  # it may have moved
+                self._plants[0] = LearnedPlant(cast(Predictor, env.predictor), env.device)
+            return self._plants[0]
         if variant not in self._plants:
-            if isinstance(env, ModelEnv):
-                self._plants[variant] = LearnedPlant(cast(Predictor, env.predictor))
-            elif self.num_threads is None and len(env.scenes) == 1:
+            if self.num_threads is None and len(env.scenes) == 1:
                 self._plants[variant] = SimulatedPlant(env.simulator, central=self.central)
             else:
                 threads = env.num_threads if self.num_threads is None else self.num_threads
@@ -157,6 +160,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         starts = self._starts(tensordict)
         actions, planned = read_plan(tensordict, self._plan_shape, torch.float64)
         task = cast(Any, tensordict.get("task", None))
+        task = None if task is None else task.to(env.device)
         plans = actions.detach().reshape(-1, *self._plan_shape).cpu().numpy().copy()
         resumed = planned.reshape(-1).tolist()
         tasks = None if task is None else _flat(task, len(tensordict.shape))
@@ -164,7 +168,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         variants = [0] * len(starts) if variant is None else variant.flatten().tolist()
         proposed: list[np.ndarray | None] = [None] * len(starts)
         if self.proposal is not None and (self.propose_every_step or not all(resumed)):
-            flat = flat_rows(tensordict.exclude("next", "action", KEY).detach())
+            flat = flat_rows(tensordict.exclude("next", "action", KEY).detach()).to(env.device)
             proposed = list(propose(self.proposal, env, flat, self.horizon).double().cpu().numpy())
         with frozen(env) if isinstance(env, ModelEnv) else contextlib.nullcontext():
             for row, start in enumerate(starts):
@@ -195,7 +199,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         count = None if env.ends is None else partial(self._count, task)
         solver = ILQGSolver(plant, reward, control_cost=self.control_cost, count=count)
         iterations = self.warm_up if plan is None else self.iterations
-        rest = np.zeros((1, *self._plan_shape))
+        rest = np.zeros((1, *self._plan_shape)) + env.scene.rest_action
         offered = rest[:0] if proposed is None or not (plan is None or self.propose_every_step) else proposed[None]
         attempts: list[Callable[[], np.ndarray]] = []
         attempts += [] if plan is None else [lambda: np.concatenate((plan[None], offered))]

@@ -96,13 +96,20 @@ def keep_better(best: Tensor, best_return: Tensor, actions: Tensor, total: Tenso
     return torch.where(better[..., None, None], actions, best), torch.where(better, total, best_return)
 
 
+def device_of(tensordict: TensorDictBase) -> torch.device | None:
+    """Where the entries are, also of a TensorDict without a device: with the state."""
+    state = cast("Tensor | None", tensordict.get("state", tensordict.get("physics", None)))
+    return tensordict.device if state is None else state.device
+
+
 def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Return planned actions ``[*B, *shape]``, zeros without a plan, and ``[*B, 1]`` whether planned."""
     batch = tensordict.shape
     plan = cast("TensorDictBase | None", tensordict.get(KEY, None))
     if plan is None:
-        empty = torch.zeros(*batch, *shape, dtype=dtype, device=tensordict.device)
-        return empty, torch.zeros(*batch, 1, dtype=torch.bool, device=tensordict.device)
+        device = device_of(tensordict)
+        empty = torch.zeros(*batch, *shape, dtype=dtype, device=device)
+        return empty, torch.zeros(*batch, 1, dtype=torch.bool, device=device)
     actions, planned = cast(Tensor, plan.get("actions")), cast(Tensor, plan.get("planned"))
     if actions.shape != (*batch, *shape):
         raise ValueError(

@@ -19,7 +19,7 @@ from torchrl.modules.planners.common import MPCPlannerBase
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.plan import KEY as PLAN
-from torchrl_gn.planners.plan import check_count
+from torchrl_gn.planners.plan import check_count, device_of
 
 KEY = "ahead"
 _OF_STEPS = ("reward", "discount", "done", "terminated")  # entries of a predicted step that a plan does not begin with
@@ -91,25 +91,29 @@ class PlanAhead(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action that was committed for now, and commit another."""
+        env, place = cast(Any, self.planner.env), device_of(tensordict)
+        here = tensordict if place == env.device else tensordict.to(env.device)
+        written = self._written(here)
+        if isinstance(env, ModelEnv) and env.carried_keys:
+            with torch.no_grad():
+                for key, value in env.carried(here.copy().update(written)).items():
+                    written.set(("next", key), value)
+        return tensordict.update(written if here is tensordict else written.to(place))
+
+    def _written(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """What to write of the planner, for a TensorDict on its environment's device."""
         ahead = cast("TensorDictBase | None", tensordict.get(KEY, None))
         planned = torch.zeros(tensordict.shape, dtype=torch.bool)
         if ahead is not None:
             planned = cast(Tensor, ahead["planned"]).squeeze(-1).cpu()
         if self.background:
-            written = self._in_background(tensordict, planned)
-        elif planned.all() or not planned.any():
-            written = self._plan(tensordict, bool(planned.any()))
-        else:
-            flat, rows = tensordict.reshape(-1), [planned.reshape(-1), ~planned.reshape(-1)]
-            parts = [self._plan(cast(TensorDictBase, flat[at]), bool(planned.reshape(-1)[at].all())) for at in rows]
-            order = torch.cat([at.nonzero().flatten() for at in rows]).argsort()
-            written = cast(TensorDictBase, torch.cat(cast(Any, parts))[order]).reshape(tensordict.shape)
-        tensordict.update(written)
-        if isinstance(env := self.planner.env, ModelEnv) and env.carried_keys:
-            with torch.no_grad():
-                for key, value in env.carried(tensordict).items():
-                    tensordict.set(("next", key), value)
-        return tensordict
+            return self._in_background(tensordict, planned)
+        if planned.all() or not planned.any():
+            return self._plan(tensordict, bool(planned.any()))
+        flat, rows = tensordict.reshape(-1), [planned.reshape(-1), ~planned.reshape(-1)]
+        parts = [self._plan(cast(TensorDictBase, flat[at]), bool(planned.reshape(-1)[at].all())) for at in rows]
+        order = torch.cat([at.nonzero().flatten() for at in rows]).argsort()
+        return cast(TensorDictBase, torch.cat(cast(Any, parts))[order]).reshape(tensordict.shape)
 
     def _plan(self, tensordict: TensorDictBase, resumed: bool) -> TensorDictBase:
         """What to write for episodes that all go on, or all begin."""

@@ -59,7 +59,7 @@ class SimulatedPlant:
 
     def follow(self, start: np.ndarray, count: int, steps: int, policy: Policy) -> Paths:
         paths = np.empty((count, steps + 1, len(start)))
-        bodies = np.empty((count, steps + 1, self.scene.num_nodes, 13))
+        bodies = np.empty((count, steps + 1, self.scene.num_nodes, self.scene.state_size))
         paths[:, 0], actions = start, np.empty(0)
         for t in range(steps):
             actions = policy(t, paths[:, t])
@@ -77,12 +77,12 @@ class SimulatedPlant:
 class LearnedPlant:
     """A learned model; states are its flattened body states.
 
-    Changes are those of MuJoCo's positions and velocities where joint coordinates follow from body states, which takes
-    ``2 nv`` gradients of the model a step; else of all ``N C`` channels.
+    Changes are those of MuJoCo's positions, velocities and activations where joint coordinates follow from body states,
+    which takes ``2 nv + na`` gradients of the model a step; else of all ``N C`` channels. ``device`` is the model's.
     """
 
-    def __init__(self, predictor: Predictor) -> None:
-        self.predictor, self.scene = predictor, predictor.scene
+    def __init__(self, predictor: Predictor, device: torch.device | str | None = "cpu") -> None:
+        self.predictor, self.scene, self.device = predictor, predictor.scene, device
         self._shape = self.scene.num_nodes, self.scene.state_size
         self._coordinates: JointCoordinates | None = None
         if isinstance(self.scene, Scene):
@@ -92,9 +92,9 @@ class LearnedPlant:
                 pass
 
     def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
-        state = torch.from_numpy(np.tile(start, (len(actions), 1))).unflatten(-1, self._shape)
+        state, given = self._tensors(np.tile(start, (len(actions), 1)), actions)
         with torch.no_grad():
-            bodies = self.predictor.rollout(state, torch.from_numpy(actions))[0].numpy()
+            bodies = self.predictor.rollout(state.unflatten(-1, self._shape), given)[0].cpu().numpy()
         paths = bodies.reshape(*bodies.shape[:2], -1)
         return paths, bodies, _stable_steps(paths)
 
@@ -104,8 +104,8 @@ class LearnedPlant:
         paths = bodies.reshape(count, steps + 1, -1)
         with torch.no_grad():
             for t in range(steps):
-                actions = torch.from_numpy(policy(t, paths[:, t]))
-                bodies[:, t + 1] = self.predictor.step(torch.from_numpy(bodies[:, t].copy()), actions)[0].numpy()
+                state, actions = self._tensors(bodies[:, t].copy(), policy(t, paths[:, t]))
+                bodies[:, t + 1] = self.predictor.step(state, actions)[0].cpu().numpy()
         return paths, bodies, _stable_steps(paths)
 
     def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:
@@ -114,18 +114,22 @@ class LearnedPlant:
         inverse = np.linalg.pinv(basis) if self._coordinates is not None else basis
         size = inverse.shape[1]
         # Row i of a step's Jacobian is the gradient of change i of the next state.
-        leaves = [torch.from_numpy(np.repeat(each, size, axis=0)) for each in (states[:-1], actions)]
+        leaves = self._tensors(*(np.repeat(each, size, axis=0) for each in (states[:-1], actions)))
         with torch.inference_mode(False), torch.enable_grad():
             state, action = (each.requires_grad_() for each in leaves)
             after = self.predictor.step(state, action)[0]
-            gradient = torch.from_numpy(inverse[1:].reshape(after.shape))
-            found = torch.autograd.grad(after, (state, action), gradient.to(after.dtype), materialize_grads=True)
-        of_state, of_action = (each.double().numpy().reshape(steps, size, -1) for each in found)
+            gradient = self._tensors(inverse[1:].reshape(after.shape))[0].to(after.dtype)
+            found = torch.autograd.grad(after, (state, action), gradient, materialize_grads=True)
+        of_state, of_action = (each.double().cpu().numpy().reshape(steps, size, -1) for each in found)
 
         def deviation(t: int, paths: np.ndarray) -> np.ndarray:
             return (paths - path[t]) @ inverse[t].T
 
         return Linearization(np.concatenate((of_state @ basis[:-1], of_action), axis=2), basis, deviation)
+
+    def _tensors(self, *arrays: np.ndarray) -> list[Tensor]:
+        """Arrays on the model's device."""
+        return [torch.from_numpy(each).to(self.device) for each in arrays]
 
     def _basis(self, states: np.ndarray) -> np.ndarray:
         """Body states ``[T, N C, X]`` by the coordinates that changes are in."""
@@ -138,7 +142,6 @@ class LearnedPlant:
         physics = np.zeros((count, self.scene.physics_size))
         physics[:, 1 : 1 + model.nq] = position
         physics[:, 1 + model.nq :][:, :nv] = velocity
-        # Activations do not show in body states.
         change = np.broadcast_to(epsilon * np.eye(tangent.size)[:nv], (count, nv, tangent.size))
         above, below = (self._simulator.observe(tangent.add(physics[:, None], step)) for step in (change, -change))
         by_position, here = (above - below) / (2 * epsilon), (above + below) / 2
@@ -148,11 +151,14 @@ class LearnedPlant:
         by_velocity[..., linear] = by_position[..., place]
         rate = quaternion.product(by_position[..., turn], quaternion.conjugate(here[..., turn]))
         by_velocity[..., angular] = 2 * rate[..., 1:]
-        basis = torch.cat((by_position, by_velocity), dim=1).numpy()
+        held = self.scene.activations
+        by_activation = by_position.new_zeros(count, model.na, *self._shape)
+        by_activation[:, range(model.na), held.node, BODY_STATE.size + held.slot] = 1.0
+        basis = torch.cat((by_position, by_velocity, by_activation), dim=1).numpy()
         # The model's quaternions may have the other sign.
         flips = np.sign((here.numpy()[:, 0, :, turn] * states[..., turn]).sum(-1, keepdims=True))
         basis[..., turn] *= flips[:, None]
-        return basis.reshape(count, 2 * nv, channels).swapaxes(1, 2)
+        return basis.reshape(count, 2 * nv + model.na, channels).swapaxes(1, 2)
 
 
 def _stable_steps(paths: np.ndarray) -> np.ndarray:

@@ -39,10 +39,10 @@ class StateFeatures(Float64Buffers):
         super().__init__()
         require_bodies(scene)
         self.scene, self.options = scene, canonicalizer or Canonicalizer(recenter=False, yaw=False)
-        self.canonicalizer = self.options.bind(scene, BODY_STATE)
+        self.canonicalizer = self.options.bind(scene, scene.layout)
         self.physical = PhysicalParameters.of(scene)
         self.constants({"rest": self.physical.rest, "pivot": self.physical.pivot})
-        self.size = scene.num_nodes * BODY_STATE.encoded_size()
+        self.size = scene.num_nodes * scene.layout.encoded_size()
         self.normalizer = Normalizer(self.size, floor=FLOOR, limit=LIMIT)
 
     @property
@@ -70,7 +70,7 @@ class StateFeatures(Float64Buffers):
     def _encoded(self, state: Tensor) -> Tensor:
         check_states(self.scene, state)
         canonical = self.canonicalizer(state, self.physical._replace(rest=self.rest, pivot=self.pivot))
-        return BODY_STATE.encode(canonical.state, "matrix", canonical.matrices).flatten(-2)
+        return self.scene.layout.encode(canonical.state, "matrix", canonical.matrices).flatten(-2)
 
     def description(self) -> dict[str, Any]:
         """JSON-able values for :meth:`arguments_from`."""
@@ -89,13 +89,13 @@ def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicaliz
     Compares rewards of random states with those of the same states moved and rotated.
     """
     generator = torch.Generator().manual_seed(0)
-    state, next_state = torch.randn(2, _STATES, scene.num_nodes, BODY_STATE.size, generator=generator).double()
+    state, next_state = torch.randn(2, _STATES, scene.num_nodes, scene.state_size, generator=generator).double()
     action = torch.randn(_STATES, scene.num_actions, generator=generator).double()
     for each in (state, next_state):
         where = each[..., BODY_STATE.slices["orientation"]]
         where.copy_(quaternion.normalize(where))
     inner = torch.as_tensor(scene.predicted).unsqueeze(-1)
-    shift = torch.zeros(BODY_STATE.size, dtype=torch.float64)
+    shift = torch.zeros(scene.state_size, dtype=torch.float64)
     shift[:3] = torch.as_tensor(scene.translation_invariant).double() * torch.tensor([0.7, -1.3, 0.4])
     before = reward(state, action, next_state, None)
 
@@ -108,14 +108,14 @@ def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicaliz
     if (frame := scene.yaw_frame) is not None:
         rotation = torch.zeros(4, dtype=torch.float64)
         rotation[0], rotation[1 + frame.axis] = 0.8, 0.6
-        yaw = keeps(lambda each: BODY_STATE.rotate(each, rotation.expand(_STATES, 4)))
+        yaw = keeps(lambda each: scene.layout.rotate(each, rotation.expand(_STATES, 4)))
     return Canonicalizer(recenter=keeps(lambda each: each + shift), yaw=yaw)
 
 
 def check_states(scene: Scene, state: Tensor) -> None:
     """Raise ValueError unless states are ``[*B, N, 13]`` of the scene, TypeError unless they are a tensor."""
     require_real(state, "The state", whole=False)
-    if state.shape[-2:] != (shape := (scene.num_nodes, BODY_STATE.size)):
+    if state.shape[-2:] != (shape := (scene.num_nodes, scene.state_size)):
         raise ValueError(f"States of {scene.name!r} must be {['*B', *shape]}, got {list(state.shape)}.")
 
 

@@ -45,4 +45,6 @@ class TerminalReward(nn.Module):
     def forward(self, state: Tensor, task: Tensor | None = None) -> Tensor:
         """Values ``[*B, 1]`` of states ``[*B, N, 13]``."""
         rest = state.new_zeros(*state.shape[:-2], self.scene.num_actions)
+        if len(self.scene.mocaps):  # of a pose zero is no rest
+            rest = rest + state.new_tensor(self.scene.rest_action)
         return self.weight * self.reward(state, rest, state, task)

@@ -54,6 +54,7 @@ class Bodies(Float64Buffers):
             raise ValueError(f"bodies must be different ones, got {list(names)}")
         found = [find_body(scene, name) for name in names]
         self.names, self.scene_name, self.node_names = tuple(names), scene.name, tuple(scene.node_names)
+        self.state_size = scene.state_size
         offset, rotation = np.stack([body.pos for body in found]), np.stack([body.quat for body in found])
         self.constants({"node": [body.node for body in found], "offset": offset, "rotation": rotation})
         # Most offsets are the identity: skip them, exactly.
@@ -99,8 +100,8 @@ class Bodies(Float64Buffers):
         return self._nodes(state)[..., _ANGULAR]
 
     def _nodes(self, state: Tensor) -> Tensor:
-        if state.shape[-2:] != (len(self.node_names), BODY_STATE.size):
-            wanted = f"[*B, {len(self.node_names)}, {BODY_STATE.size}]"
+        if state.shape[-2:] != (len(self.node_names), self.state_size):
+            wanted = f"[*B, {len(self.node_names)}, {self.state_size}]"
             raise ValueError(f"states of scene {self.scene_name!r} must be {wanted}, got {list(state.shape)}")
         return state.index_select(-2, self.node)
 

@@ -152,13 +152,16 @@ class Position(Reward):
 
 
 class Effort(Reward):
-    """Negative mean square of the controls, each relative to the larger of its bounds."""
+    """Negative mean square of the controls, not of mocap poses, each relative to the larger of its bounds."""
 
     scale: Tensor
 
     def __init__(self, scene: Scene):
         super().__init__()
-        bounds = np.maximum(np.abs(scene.action_low), np.abs(scene.action_high))
+        count = len(getattr(scene, "actuator_names", scene.action_low))
+        bounds = np.maximum(np.abs(scene.action_low), np.abs(scene.action_high))[:count]
+        if not len(bounds):
+            raise ValueError(f"Effort needs controls; scene {scene.name!r} has none.")
         if not (np.isfinite(bounds).all() and (bounds > 0).all()):
             raise ValueError(
                 f"Effort needs bounded controls; scene {scene.name!r} has bounds {bounds.tolist()}: give its"
@@ -168,7 +171,8 @@ class Effort(Reward):
         self.register_buffer("scale", torch.from_numpy(bounds))
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        return -(action / self.scale.to(action.dtype)).square().mean(-1, keepdim=True).to(next_state.dtype)
+        controls = action[..., : len(self.scale)]
+        return -(controls / self.scale.to(action.dtype)).square().mean(-1, keepdim=True).to(next_state.dtype)
 
 
 class AngularSpeed(Reward):

@@ -12,13 +12,17 @@ ActuatorKind = Literal["motor", "position", "velocity"]
 
 
 def actuator_kind(model: mujoco.MjModel, actuator: int) -> ActuatorKind:
-    """Whether an actuator follows position targets, velocity targets, or neither."""
+    """Whether an actuator follows position targets, velocity targets, or neither.
+
+    The control of an integrating position servo is its target's velocity.
+    """
     gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
     fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0
     if not fixed or model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE:
         return "motor"
     if bias[1] != 0:
-        return "position"
+        integrates = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_INTEGRATOR
+        return "velocity" if integrates else "position"
     return "velocity" if math.isclose(bias[2], -gain, rel_tol=1e-6) else "motor"
 
 
@@ -26,6 +30,24 @@ def holding_controls(model: mujoco.MjModel, servos: np.ndarray | int, length: np
     """Controls at which position servos exert no force on transmissions of these lengths, at rest."""
     gain, bias = model.actuator_gainprm[servos, 0], model.actuator_biasprm[servos]
     return length * (-bias[..., 1] / gain) - bias[..., 0] / gain
+
+
+def activated_servos(model: mujoco.MjModel) -> np.ndarray:
+    """Position servos ``[K]`` whose target is an activation: those that filter their control, or integrate it."""
+    kind = mujoco.mjtDyn
+    follows = np.isin(
+        model.actuator_dyntype, (int(kind.mjDYN_FILTER), int(kind.mjDYN_FILTEREXACT), int(kind.mjDYN_INTEGRATOR))
+    )
+    plain = (model.actuator_actnum == 1) & (model.actuator_plugin < 0)
+    fixed = (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)) & (model.actuator_gainprm[:, 0] != 0)
+    servo = (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)) & (model.actuator_biasprm[:, 1] != 0)
+    return np.flatnonzero(follows & plain & fixed & servo)
+
+
+def in_disabled_group(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator's group is switched off (``actuatorgroupdisable``)."""
+    group = int(model.actuator_group[actuator])
+    return 0 <= group < 31 and bool(model.opt.disableactuator >> group & 1)
 
 
 def drive_joints(model: mujoco.MjModel) -> np.ndarray:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.activations import find_activations
+from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.contact_points import find_contact_points
 from torchrl_gn.scenes.control_bounds import ActionBounds, set_control_bounds
 from torchrl_gn.scenes.invariance import movable_components, translation_invariant
 from torchrl_gn.scenes.keyframes import reference_keyframe
-from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph
+from torchrl_gn.scenes.mocap import NO_MOCAP_ACTIONS, MocapActions, find_mocap_actions
+from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph, UnsupportedSceneError
+from torchrl_gn.scenes.simulated_invariance import confirmed
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import EdgePair, Topology, find_joint_anchors, named, offset, topology
 from torchrl_gn.scenes.transmissions import find_transmissions
@@ -23,6 +29,7 @@ _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the sta
 )
 _REFERRING = ("actuators", "tendons", "equalities", "sensors", "excludes", "pairs")  # elements that name others
 _CONTROL_STEP, _LONGEST_CONTROL_STEP = 0.02, 0.025  # seconds, by default
+_MOST_SUBSTEPS = 10_000  # physics steps in a control step
 
 _LARGEST = 1e30  # static feature; networks read float32
 
@@ -35,6 +42,7 @@ def build_scene(
     settle_steps: int = 0,
     wide_starts: float = 0.5,
     action_bounds: ActionBounds | None = None,
+    mocap_actions: bool = False,
     origin: dict | None = None,
 ) -> Scene:
     """Read a scene from an MJCF model.
@@ -44,21 +52,31 @@ def build_scene(
     Default ``timestep`` [s] and errors as of :func:`~torchrl_gn.scenes.load_scene`.
     """
     model, graph = _compile(spec, name)
+    substeps = _substeps(model, timestep, name)
     _place_mocap_bodies(model)
     transmissions = find_transmissions(model, graph)
     pairs = transmissions.pairs
     actuator_names = tuple(named(model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator) for actuator in range(model.nu))
-    low, high = set_control_bounds(model, actuator_names, action_bounds)
-    substeps = _substeps(model, timestep, name)
+    mocaps = find_mocap_actions(model, action_bounds) if mocap_actions else NO_MOCAP_ACTIONS
+    if mocap_actions and not len(mocaps):
+        raise SceneError(f"No mocap body of scene {name!r} leads others by a weld or connect: none can be an action.")
+    _refuse_touching(model, graph, mocaps)
+    bounds = action_bounds
+    if isinstance(bounds, Mapping):
+        bounds = {key: pair for key, pair in bounds.items() if key not in mocaps.names}
+    low, high = set_control_bounds(model, actuator_names, bounds)
     node_names = tuple(named(model, mujoco.mjtObj.mjOBJ_BODY, body) for body in graph.body)
     static = static_graph(model, graph, transmissions, substeps * model.opt.timestep)
     _refuse_non_finite(static, name, node_names, pairs)
     ends = np.array([(pair.first, pair.second) for pair in pairs])
     data = mujoco.MjData(model)
-    movable = movable_components(model, data, graph.body)
+    activations = find_activations(model, pairs, transmissions.action)
+    bodies_move = movable_components(model, data, graph.body)
     mujoco.mj_resetData(model, data)
     mujoco.mj_kinematics(model, data)
-    invariant = translation_invariant(model, data, graph)
+    invariant, yaw_frame = translation_invariant(model, data, graph), find_yaw_frame(model, data, graph, bodies_move)
+    if "system" not in (origin or {}):  # whose invariances are known, and which are built by the thousand
+        invariant, yaw_frame = confirmed(model, graph, invariant, yaw_frame)
     return Scene(
         name=name,
         model=model,
@@ -72,15 +90,17 @@ def build_scene(
         receivers=ends[:, ::-1].flatten(),
         edge_action=np.repeat(transmissions.action, 2, axis=0),
         static=static,
-        movable=movable,
+        movable=np.concatenate((bodies_move, activations.mask(len(node_names))), axis=1),
         translation_invariant=invariant,
         joint_anchors=find_joint_anchors(model, data, graph),
-        yaw_frame=find_yaw_frame(model, data, graph, movable),
+        yaw_frame=yaw_frame,
         contact_points=find_contact_points(model, data, graph),
-        action_low=low,
-        action_high=high,
+        activations=activations,
+        mocaps=mocaps,
+        action_low=np.concatenate((low, mocaps.low)),
+        action_high=np.concatenate((high, mocaps.high)),
         substeps=substeps,
-        attachments=_attachments(model, graph),
+        attachments=_attachments(model, graph, mocaps),
         settle_steps=settle_steps,
         wide_starts=wide_starts,
         origin=origin or {},
@@ -93,6 +113,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     try:
         spec = _copy(spec)
         spec.option.disableflags |= int(flags.mjDSBL_WARMSTART)
+        _converge(spec.option)
         spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
         spec.option.enableflags &= ~int(sleep)
         graph = topology(spec.compile())
@@ -107,6 +128,19 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     if model.njnt == 0:
         raise SceneError(f"Scene {name!r} has no joint, so nothing can move. Add one.")
     return model, graph
+
+
+def _converge(option: mujoco.MjOption) -> None:
+    """Let the solver of constraints go on as long as by default, until it converges.
+
+    A scene has no warm starts, so that a state and an action give the next state. Files that rest on them, as those for
+    MJX do, ask for one to three iterations, which from a cold start end far from where theirs would.
+    """
+    default = mujoco.MjSpec().option
+    for name in ("iterations", "ls_iterations"):
+        setattr(option, name, max(getattr(option, name), getattr(default, name)))
+    for name in ("tolerance", "ls_tolerance"):
+        setattr(option, name, min(getattr(option, name), getattr(default, name)))
 
 
 def _place_mocap_bodies(model: mujoco.MjModel) -> None:
@@ -144,6 +178,12 @@ def _refuse_non_finite(static: StaticGraph, name: str, nodes: tuple[str, ...], p
 
 def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
     physics = model.opt.timestep
+    wanted = _CONTROL_STEP if timestep is None or not np.isfinite(timestep) else timestep
+    if not (0 < physics < np.inf and wanted / physics < _MOST_SUBSTEPS + 0.5):
+        raise SceneError(
+            f"The physics step of scene {name!r} is {physics:g} s, of which a control step of {wanted:g} s may take at"
+            f' most {_MOST_SUBSTEPS}: set <option timestep="0.002"/>, say, or another control step, timestep=.'
+        )
     if timestep is None:
         nearest = max(1, round(_CONTROL_STEP / physics))
         return nearest - 1 if nearest > 1 and nearest * physics > _LONGEST_CONTROL_STEP * (1 + 1e-9) else nearest
@@ -156,9 +196,24 @@ def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
     return substeps
 
 
-def _attachments(model: mujoco.MjModel, graph: Topology) -> dict[str, Attachment]:
-    attachments = {}
-    for body in np.setdiff1d(range(1, model.nbody), graph.body).tolist():
+def _refuse_touching(model: mujoco.MjModel, graph: Topology, mocaps: MocapActions) -> None:
+    """Raise for geoms of mocap bodies that can touch others: where they are then is in no state."""
+    if not len(mocaps):
+        return
+    led = np.isin(model.body_rootid[model.geom_bodyid], mocaps.body)
+    moving = graph.node_of_body[model.geom_bodyid] > 0
+    touching = np.flatnonzero(led & colliding_geoms(model)[:, moving].any(1))
+    if len(touching):
+        names = [named(model, mujoco.mjtObj.mjOBJ_GEOM, int(geom)) for geom in touching]
+        raise UnsupportedSceneError(
+            f"Geoms {names} of mocap bodies whose poses are actions can touch moving bodies, which states do not show:"
+            ' give them contype="0" conaffinity="0".'
+        )
+
+
+def _attachments(model: mujoco.MjModel, graph: Topology, mocaps: MocapActions) -> dict[str, Attachment]:
+    attachments, led = {}, np.flatnonzero(np.isin(model.body_rootid, mocaps.body))  # where these are is no state
+    for body in np.setdiff1d(range(1, model.nbody), [*graph.body, *led]).tolist():
         node = int(graph.node_of_body[body])
         if name := mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body):
             attachments[name] = Attachment(node, *offset(model, body, int(graph.body[node])))

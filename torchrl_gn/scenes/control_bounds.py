@@ -26,8 +26,8 @@ def set_control_bounds(
     """Bounds ``[A]`` of the controls, infinite where there are none; sets the finite ones in the model, which clamps.
 
     In this order: those ``chosen`` by name; ``ctrlrange``; the control at which a motor's force reaches its
-    ``forcerange``; the range of a position servo's joint; the pair ``chosen`` for all. ValueError if a name is unknown
-    or a pair is not two finite numbers in ascending order.
+    ``forcerange``; the range of a position servo's joint; a muscle's 0 to 1; the pair ``chosen`` for all. ValueError if
+    a name is unknown or a pair is not two finite numbers in ascending order.
     """
     by_name = {name: _checked(pair, name) for name, pair in chosen.items()} if isinstance(chosen, Mapping) else {}
     if unknown := [name for name in by_name if name not in names]:
@@ -68,7 +68,9 @@ def _checked(pair: Sequence[float], of: str) -> tuple[float, float]:
 
 
 def _implied(model: mujoco.MjModel, actuator: int) -> tuple[float, float] | None:
-    """Bounds that follow from the limit of a motor's force, or of a position servo's joint."""
+    """Bounds that follow from the limit of a motor's force, a position servo's joint, or those of any muscle."""
+    if model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_MUSCLE:
+        return 0.0, 1.0
     gain, joint = float(model.actuator_gainprm[actuator, 0]), int(model.actuator_trnid[actuator, 0])
     if actuator_kind(model, actuator) == "position":
         if not (drive_joints(model)[actuator] and model.jnt_limited[joint] and model.jnt_type[joint] in _SCALAR):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.actuator_kinds import in_disabled_group
 from torchrl_gn.scenes.topology import Topology, offset, topology
 
 if TYPE_CHECKING:
@@ -120,15 +121,20 @@ def _actuators(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
     for motor in range(len(model.actuator_trntype)):
         of = f"actuator {names.of(_OBJECT.mjOBJ_ACTUATOR, motor)}"
         types = [kind(getattr(model, f"actuator_{name}")[motor]).name for name, kind in kinds]
-        group = int(model.actuator_group[motor])
-        off = group >= 0 and model.opt.disableactuator >> group & 1
         ends, kind = model.actuator_trnid[motor].tolist(), types[0].removeprefix("mjTRN_")
         joint = [names.joints[ends[0]]] if kind.startswith("JOINT") else []
-        yield " ".join([of, *joint, *types, *["off"] * bool(off)])
+        yield " ".join([of, *joint, *types, *["off"] * in_disabled_group(model, motor)])
         for at in () if joint else ends:
             yield from names.element(_TARGETS.get(kind, _OBJECT.mjOBJ_SITE), at)
         yield from _arrays(of, model, "actuator", motor, _ACTUATORS)
         yield from _limits(of, model, "actuator", motor, ("forcerange", "forcelimited"))
+        if model.actuator_actnum[motor] > 0:
+            kind, count = mujoco.mjtDyn(model.actuator_dyntype[motor]).name, int(model.actuator_actnum[motor])
+            yield " ".join([of, kind, str(count), *["early"] * bool(model.actuator_actearly[motor])])
+            yield from _arrays(of, model, "actuator", motor, ("dynprm",))
+            yield from _limits(of, model, "actuator", motor, ("actrange", "actlimited"))
+        if "mjGAIN_MUSCLE" in types:
+            yield from _arrays(of, model, "actuator", motor, ("lengthrange",))
 
 
 def _geoms(model: mujoco.MjModel, names: _Names) -> Iterable[str]:

@@ -7,6 +7,10 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.activations import muscle_actuators
+from torchrl_gn.scenes.lines import known_tendon
+from torchrl_gn.scenes.topology import topology
+
 if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
 
@@ -104,20 +108,70 @@ def winding_joints(scene: Scene) -> np.ndarray:
 def actuator_laws(scene: Scene) -> np.ndarray:
     """``[E, C, 9]`` of the actuator in each control slot of an edge; 0 where its force is not known here.
 
-    Its gain and its bias are each a constant, a slope in the actuator's length and one in its velocity; then the
-    force's two limits, and its gear at the edge: what a unit of force exerts there, and how much longer the actuator
-    gets with the joint's coordinate.
+    Its gain and its bias are each a constant, a slope in the actuator's length and one in its velocity (0 of muscles,
+    see MuscleForces); then the force's two limits, and its gear at the edge: what a unit of force exerts there, and how
+    much longer the actuator gets with the joint's coordinate, the tendon's length or the crank's; 1 of sites.
     """
     model, action, known = scene.model, scene.edge_action[::2], known_slots(scene)
     gain, bias = model.actuator_gainprm[:, :3].copy(), model.actuator_biasprm[:, :3].copy()
     gain[model.actuator_gaintype == int(_GAIN.mjGAIN_FIXED), 1:] = 0
     bias[model.actuator_biastype == int(_BIAS.mjBIAS_NONE)] = 0
+    gain[muscle_actuators(model)] = bias[muscle_actuators(model)] = 0
     limits = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, (-FAR, FAR))
     names = ["actuator_gear[0]" + f"/{slot}" * (slot > 0) for slot in range(action.shape[1])]
     gear = scene.static.edges[::2, [scene.static.edge_names.index(name) for name in names]]
+    gear[np.isin(action, site_actuators(model))] = 1.0
     laws = np.zeros((*action.shape, 9))
     laws[known, :8], laws[known, 8] = np.concatenate((gain, bias, limits), axis=1)[action[known]], gear[known]
     return np.repeat(laws, 2, axis=0)
+
+
+def known_moments(scene: Scene) -> np.ndarray:
+    """``[J]`` bool, joints at which it follows from body states what a wrench on what they carry exerts."""
+    model = scene.model
+    groups, others = joint_groups(model, scene.body)
+    known = ~np.isin(np.arange(model.njnt), others)
+    for name in _HINGES[1:]:
+        for _, joints in groups[name]:
+            if np.ptp(model.jnt_pos[joints], axis=0).any():  # where each of several anchors is depends on the others
+                known[joints] = False
+    return known
+
+
+def straight_joints(scene: Scene) -> np.ndarray:
+    """``[J]`` bool, hinges and slides whose coordinate follows from body states."""
+    groups, _ = joint_groups(scene.model, scene.body)
+    straight = [joint for name in ("slide", *_HINGES) for _, joints in groups[name] for joint in joints]
+    return np.isin(np.arange(scene.model.njnt), straight)
+
+
+def site_actuators(model: mujoco.MjModel) -> list[int]:
+    """Actuators of sites."""
+    return np.flatnonzero(model.actuator_trntype == int(_TRANSMISSION.mjTRN_SITE)).tolist()
+
+
+def line_actuators(scene: Scene) -> list[int]:
+    """Actuators of spatial tendons, slider-cranks and sites whose length follows from body states, not coordinates."""
+    model, graph, joint_known = scene.model, topology(scene.model), known_moments(scene)
+    found = []
+    for actuator in range(len(model.actuator_trntype)):
+        kind, (target, other) = _TRANSMISSION(model.actuator_trntype[actuator]), model.actuator_trnid[actuator].tolist()
+        if kind == _TRANSMISSION.mjTRN_TENDON:
+            known = known_tendon(model, target) and not _tendon_limits_force(model, target)
+        elif kind == _TRANSMISSION.mjTRN_SITE:  # of two bodies that move MuJoCo leaves out what moves both
+            known = other < 0 or not graph.node_of_body[model.site_bodyid[other]]
+        else:
+            known = kind == _TRANSMISSION.mjTRN_SLIDERCRANK
+        pairs = np.flatnonzero((scene.edge_action[::2] == actuator).any(1))
+        if known and len(pairs) and (kind == _TRANSMISSION.mjTRN_SITE or joint_known[pairs].all()):
+            found.append(actuator)
+    return found
+
+
+def _tendon_limits_force(model: mujoco.MjModel, tendon: int) -> bool:
+    """Whether the force of all actuators of a tendon has limits."""
+    limited = getattr(model, "tendon_actfrclimited", None)  # MuJoCo before 3.3 has none
+    return limited is not None and bool(limited[tendon])
 
 
 def _of_coordinates(model: mujoco.MjModel, actuator: int) -> bool:
@@ -125,19 +179,19 @@ def _of_coordinates(model: mujoco.MjModel, actuator: int) -> bool:
     kind, target = _TRANSMISSION(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     if kind != _TRANSMISSION.mjTRN_TENDON:
         return kind in (_TRANSMISSION.mjTRN_JOINT, _TRANSMISSION.mjTRN_JOINTINPARENT)
-    limited = getattr(model, "tendon_actfrclimited", None)  # of all actuators of a tendon; MuJoCo before 3.3 has none
     fixed = model.wrap_type[model.tendon_adr[target]] == mujoco.mjtWrap.mjWRAP_JOINT
-    return bool(fixed) and not (limited is not None and limited[target])
+    return bool(fixed) and not _tendon_limits_force(model, target)
 
 
 def known_slots(scene: Scene) -> np.ndarray:
-    """``[E / 2, C]`` bool, control slots of actuators whose force follows from coordinates of hinges and slides."""
+    """``[E / 2, C]`` bool, control slots of actuators whose force follows from body states."""
     model, action = scene.model, scene.edge_action[::2]
-    groups, _ = joint_groups(model, scene.body)
     straight = np.zeros(len(action), dtype=bool)
-    straight[[joint for name in ("slide", *_HINGES) for _, joints in groups[name] for joint in joints]] = True
-    known = np.isin(model.actuator_gaintype, (int(_GAIN.mjGAIN_FIXED), int(_GAIN.mjGAIN_AFFINE)))
-    known &= np.isin(model.actuator_biastype, (int(_BIAS.mjBIAS_NONE), int(_BIAS.mjBIAS_AFFINE)))
-    known &= np.array([_of_coordinates(model, actuator) for actuator in range(model.nu)], dtype=bool)
+    straight[: model.njnt] = straight_joints(scene)
+    known = np.array([_of_coordinates(model, actuator) for actuator in range(model.nu)], dtype=bool)
     known &= ~np.isin(np.arange(model.nu), action[~straight])
+    known[line_actuators(scene)] = True
+    affine = np.isin(model.actuator_gaintype, (int(_GAIN.mjGAIN_FIXED), int(_GAIN.mjGAIN_AFFINE)))
+    affine &= np.isin(model.actuator_biastype, (int(_BIAS.mjBIAS_NONE), int(_BIAS.mjBIAS_AFFINE)))
+    known &= (affine | muscle_actuators(model)) & (model.actuator_plugin < 0)
     return np.append(known, False)[action]  # -1: no actuator

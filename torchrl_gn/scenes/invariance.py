@@ -10,6 +10,7 @@ from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.topology import Topology, offset
 
 TOLERANCE = 1e-9
+_LOCKED = 1e8  # damping [N s/m or N m s/rad] or armature [kg or kg m2] that holds a joint
 _Disable = mujoco.mjtDisableBit
 _Transmission = mujoco.mjtTrn
 
@@ -152,9 +153,9 @@ def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndar
     """Mask ``[N, 12]`` of movable components for root bodies ``[N]``; ``data`` is overwritten.
 
     Components, world frame: position 3, rotation vector 3, linear velocity 3, angular velocity 3. A row of the body
-    Jacobian that vanishes at random configurations vanishes everywhere. Constraints are ignored.
+    Jacobian that vanishes at random configurations vanishes everywhere. Constraints are ignored, locked joints kept.
     """
-    rng = np.random.default_rng(0)
+    rng, locked = np.random.default_rng(0), locked_dofs(model)
     largest = np.zeros((len(body), 6))  # largest entry of every Jacobian row
     jacobian = np.zeros((6, model.nv))
     free, ball = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
@@ -170,6 +171,15 @@ def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndar
         mujoco.mj_comPos(model, data)
         for node, body_id in enumerate(body):
             mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], int(body_id))
+            jacobian[:, locked] = 0.0
             largest[node] = np.maximum(largest[node], np.abs(jacobian).max(axis=1, initial=0.0))
     moves = largest > TOLERANCE
     return np.concatenate([moves, moves], axis=1)
+
+
+def locked_dofs(model: mujoco.MjModel) -> np.ndarray:
+    """Degrees of freedom ``[nv]``, bool, that damping or armature keeps in place, as of Gymnasium's Fetch (1e11).
+
+    A force of 1,000 N moves them by under 1e-5 m in a second.
+    """
+    return np.maximum(model.dof_damping, model.dof_armature) > _LOCKED

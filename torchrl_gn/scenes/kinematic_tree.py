@@ -14,6 +14,7 @@ from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import StaticGraph
 from torchrl_gn.scenes.topology import JointAnchors
 
+_MOST_JOINTS, _MOST_COMMANDS = 1_000, 100_000
 _BOUNDS = (("action_low", -np.inf), ("action_high", np.inf))
 
 
@@ -38,6 +39,7 @@ class KinematicTree:
 
     yaw_frame = None
     contact_points = None
+    world_contacts = None
     contact_pairs = None
 
     def __post_init__(self) -> None:
@@ -51,8 +53,12 @@ class KinematicTree:
                 f"Robot {self.name!r} needs at least one joint, and commands for each; got"
                 f" {len(self.joint_names)} joints and commands for {len(self.commands)}."
             )
-        if any(index < 0 for indices in self.commands for index in indices):
-            raise ValueError(f"commands={self.commands} of {self.name!r} must be indices from 0.")
+        if self.num_joints > _MOST_JOINTS:
+            raise ValueError(f"Robot {self.name!r} has {self.num_joints} joints; {_MOST_JOINTS} at most.")
+        if any(not 0 <= index < _MOST_COMMANDS for indices in self.commands for index in indices):
+            raise ValueError(
+                f"commands={self.commands} of {self.name!r} must be indices from 0, below {_MOST_COMMANDS}."
+            )
         if not 0 < self.timestep < np.inf:
             raise ValueError(f"timestep={self.timestep} of {self.name!r} must be positive.")
         if len(self.joint_parents) != self.num_joints or any(
@@ -89,6 +95,16 @@ class KinematicTree:
     @property
     def num_actions(self) -> int:
         return 1 + max((index for indices in self.commands for index in indices), default=-1)
+
+    @property
+    def rest_action(self) -> np.ndarray:
+        """``[A]`` commands of 0."""
+        return np.zeros(self.num_actions)
+
+    @property
+    def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds ``[A]`` to draw commands from: their own."""
+        return self.action_low, self.action_high
 
     @property
     def unbounded(self) -> tuple[str, ...]:
@@ -169,6 +185,7 @@ class KinematicTree:
         arrays = (static.nodes, static.edges, static.globals_, np.zeros((e, 3)), np.array([1.0, 0, 0, 0]), np.zeros(3))
         arrays += (np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 3)), np.zeros((n, 0)))
         arrays += (np.zeros((n, 7)), np.zeros((e, 8)), np.zeros((e, 0, 9)))
+        arrays += (np.zeros((1, 16)), np.zeros((1, 1, 2)), np.zeros((1, 22)))
         return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     def description(self) -> dict:

@@ -16,10 +16,15 @@ from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.control_bounds import ActionBounds, plain_bounds
 from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
-from torchrl_gn.scenes.mjcf_text import decoded_assets, encoded_assets, inlined, is_among, read_text, reads_files_early
+from torchrl_gn.scenes.mjcf_text import encoded_assets, inlined, read_text, reads_files_early
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
+from torchrl_gn.scenes.stored_mjcf import checked, is_among, model_files, require_stored, unpacked
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
+from torchrl_gn.scenes.urdf import add_motors, is_urdf, with_local_meshes
 from torchrl_gn.scenes.variants import build_system, make_variant
+
+_SUFFIXES = (".xml", ".mjcf", ".urdf")
+_MOST_SETTLE_STEPS = 1_000_000  # of a description
 
 
 def load_scene(
@@ -30,13 +35,15 @@ def load_scene(
     parameters: Mapping[str, float] | None = None,
     action_bounds: ActionBounds | None = None,
     wide_starts: float = 0.5,
+    mocap_actions: bool = False,
+    motors: bool = False,
 ) -> Scene:
     """Load a scene.
 
     Args:
         source: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"swimmerN"`` with N of at least
-            3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), the path of an MJCF file, ``"package://NAME/PATH"`` of one in
-            an installed Python package, MJCF text, or an ``MjSpec``. Visual meshes may be missing, which warns.
+            3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), an MJCF or URDF file, ``"package://NAME/PATH"`` of
+            one in an installed Python package, its text, or an ``MjSpec``. Visual meshes may be missing, which warns.
         timestep: control step, seconds, a multiple of the physics step; default: the paper's for its systems, the
             multiple nearest to 20 ms and at most 25 ms for other models (one physics step if that is longer).
         name: name of the scene; default: that of the system, file or model.
@@ -46,6 +53,11 @@ def load_scene(
             own (``ctrlrange``, a motor's ``forcerange``, the range of a position servo's joint).
         wide_starts: of an MJCF model, the share of :class:`~torchrl_gn.data.StartPoses` anywhere within the joint
             limits; the others stay near the reference pose.
+        mocap_actions: of an MJCF model, whether poses of mocap bodies to which constraints hold others are actions,
+            7 numbers each behind the controls: position, in ``action_bounds`` by names such as ``"hand.x"``, default
+            0.15 m to either side of the model's, and quaternion. Else they stay as in the model.
+        motors: whether each joint of a model without actuators gets a motor, named after it, as URDF files bring none:
+            of a torque or force within the joint's effort, else within ``action_bounds``.
 
     Raises:
         ValueError: if the name or a parameter is unknown; FileNotFoundError if the file does not exist.
@@ -59,11 +71,18 @@ def load_scene(
         raise ValueError(f"{source!r} has start states of its own; wide_starts goes with MJCF models.")
     if not 0 <= wide_starts <= 1:
         raise ValueError(f"wide_starts must be a share, 0 to 1, got {wide_starts!r}")
+    if mocap_actions and (is_system or parameters is not None):
+        raise ValueError(f"{source!r} has no mocap bodies; mocap_actions goes with MJCF models.")
+    if motors and (is_system or parameters is not None):
+        raise ValueError(f"{source!r} has motors of its own; motors goes with URDF and MJCF models.")
     chosen: dict[str, Any] = {"action_bounds": action_bounds, "wide_starts": wide_starts}
+    chosen["mocap_actions"] = mocap_actions
     if parameters is not None:
         return make_variant(source, parameters, timestep=timestep, name=name)
     if isinstance(source, mujoco.MjSpec):
         spec: Any = source
+        if motors:
+            add_motors(spec := spec.copy())
         return build_scene(spec, name=name or spec.modelname, timestep=timestep, **chosen)
     if isinstance(source, mujoco.MjModel):
         raise TypeError("load_scene needs MJCF, not a compiled MjModel; give its file, text or MjSpec.")
@@ -75,7 +94,7 @@ def load_scene(
         system = find_system(source)
         if system is not None:
             return build_system(system, system.build(), name, timestep)
-        if not (source.endswith((".xml", ".mjcf")) or set("/\\") & set(source) or Path(source).is_file()):
+        if not (source.lower().endswith(_SUFFIXES) or set("/\\") & set(source) or Path(source).is_file()):
             raise ValueError(_unknown(source))
     spec, origin = _read_mjcf(source if isinstance(source, str) else Path(source))
     own_name = spec.modelname if isinstance(source, str) and _is_mjcf(source) else Path(source).stem
@@ -83,6 +102,11 @@ def load_scene(
         origin["action_bounds"] = plain_bounds(action_bounds)
     if wide_starts != 0.5:
         origin["wide_starts"] = float(wide_starts)
+    if mocap_actions:
+        origin["mocap_actions"] = True
+    if motors:
+        add_motors(spec)
+        origin["motors"] = True
     return build_scene(spec, name=name or own_name, timestep=timestep, origin=origin, **chosen)
 
 
@@ -92,28 +116,25 @@ def as_scene(scene: Any) -> Any:
 
 
 def scene_from_description(description: dict) -> Scene:
-    """Rebuild the scene of a :meth:`Scene.description`; SceneChangedWarning if its physics differ here."""
-    if "kinematic_tree" in description:
-        # It has every attribute of a scene that models and errors read.
-        return cast(Scene, KinematicTree.from_description(description))
-    system = find_system(description["system"]) if "system" in description else None
-    if system is None and "system" in description:
-        raise ValueError(_unknown(description["system"]))
-    name, timestep = description["name"], description["timestep"]
-    if system and "parameters" in description:
-        scene = make_variant(system.name, description["parameters"], timestep=timestep, name=name)
-    else:
-        keys = ("system", "mjcf", "assets", "action_bounds", "wide_starts")
-        scene = build_scene(
-            system.build() if system else _rebuild_mjcf(description),
-            name=name,
-            timestep=timestep,
-            settle_steps=description["settle_steps"],
-            action_bounds=description.get("action_bounds"),
-            wide_starts=description.get("wide_starts", 0.5),
-            origin={key: description[key] for key in keys if key in description},
-        )
-    if scene.fingerprint() != description["fingerprint"]:
+    """Rebuild the scene of a :meth:`Scene.description`; SceneChangedWarning if its physics differ here.
+
+    Trusts no description: of MJCF nothing but the stored files is read, and what asks for too much is refused.
+
+    Raises:
+        SceneError: if it is damaged, of another version, or asks for too much.
+        ValueError: if it names an unknown system, or a robot without joints.
+    """
+    try:
+        scene = _rebuilt(description)
+        expected = description["fingerprint"]
+    except ValueError:
+        raise
+    except (LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, mujoco.FatalError) as error:
+        raise SceneError(
+            f"The description of a scene is damaged, or of another version of torchrl_gn ({type(error).__name__}:"
+            f" {error})."
+        ) from error
+    if scene.fingerprint() != expected:
         warnings.warn(
             f"Scene {scene.name!r} has other physics than its description; results may differ "
             f"(MuJoCo {mujoco.__version__} here).",
@@ -123,13 +144,38 @@ def scene_from_description(description: dict) -> Scene:
     return scene
 
 
+def _rebuilt(description: dict) -> Scene:
+    if "kinematic_tree" in description:
+        # It has every attribute of a scene that models and errors read.
+        return cast(Scene, KinematicTree.from_description(description))
+    system = find_system(description["system"]) if "system" in description else None
+    if system is None and "system" in description:
+        raise ValueError(_unknown(description["system"]))
+    name, timestep, settle_steps = description["name"], description["timestep"], description["settle_steps"]
+    if not isinstance(name, str) or not 0 <= settle_steps <= _MOST_SETTLE_STEPS:
+        raise SceneError(f"A stored scene has name={name!r} and settle_steps={settle_steps!r}, which cannot be.")
+    if system and "parameters" in description:
+        return make_variant(system.name, description["parameters"], timestep=timestep, name=name)
+    keys = ("system", "mjcf", "assets", "action_bounds", "wide_starts", "mocap_actions", "motors")
+    return build_scene(
+        system.build() if system else _rebuild_mjcf(description),
+        name=name,
+        timestep=timestep,
+        settle_steps=settle_steps,
+        action_bounds=description.get("action_bounds"),
+        wide_starts=description.get("wide_starts", 0.5),
+        mocap_actions=description.get("mocap_actions", False),
+        origin={key: description[key] for key in keys if key in description},
+    )
+
+
 def _unknown(name: str) -> str:
     names = ["swimmerN" if known == "swimmer6" else known for known in SYSTEMS]
     close = difflib.get_close_matches(name.lower(), SYSTEMS, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
     return (
         f"Unknown scene {name!r}.{hint} Known systems: {', '.join(names)} (N of at least 3); "
-        "or give the path of an MJCF file."
+        "or give the path of an MJCF or URDF file."
     )
 
 
@@ -140,15 +186,21 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
         raise FileNotFoundError(f"MJCF file not found: {path}")
     if path is not None and zipfile.is_zipfile(path):
         raise SceneError(f"{path} is an archive: unpack it, and load the XML file in it.")
+    text, folder = (str(source), Path()) if path is None else (read_text(path), path.parent)
+    if urdf := is_urdf(text):
+        text = with_local_meshes(text, folder)
     try:
-        kind = mujoco.MjSpec
-        spec = kind.from_string(str(source)) if path is None else kind.from_file(str(path))
+        if path is not None and path.suffix == ".xml" and not urdf:
+            spec = mujoco.MjSpec.from_file(str(path))
+        else:  # MuJoCo reads no file with another suffix, such as .mjcf or .URDF
+            spec = mujoco.MjSpec.from_string(text if path is None else inlined(text, folder))
+            spec.modelfiledir = "" if path is None else str(folder)
     except ValueError as error:
         label = "string" if path is None else f"file {path}"
-        raise SceneError(f"MuJoCo cannot read the MJCF {label}: {error}") from error
-    text, folder = (str(source), Path()) if path is None else (read_text(path), path.parent)
+        raise SceneError(f"MuJoCo cannot read the {'URDF' if urdf else 'MJCF'} {label}: {error}") from error
     text = inlined(text, folder)
     assets = encoded_assets(spec, text, folder)
+    checked(text, unpacked(assets))  # what could not be read again is refused now
     if dropped := drop_missing_visuals(spec, lambda file: is_among(file, assets, text)):
         few = ", ".join(dropped[:3]) + ", ..." * (len(dropped) > 3)
         warnings.warn(
@@ -161,14 +213,22 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
 
 def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
     """Parse what :func:`_read_mjcf` stored."""
-    assets, text = decoded_assets(origin["assets"]), origin["mjcf"]
+    text, assets = checked(origin["mjcf"], unpacked(origin["assets"]))
     # Attached models and flexes are read with the text, other files when it is compiled.
     early: dict[str, Any] = {"include": assets} if reads_files_early(text) else {}
+    if early and not hasattr(mujoco, "MjVfs"):
+        raise SceneError(
+            f"MuJoCo {mujoco.__version__} cannot read a stored scene with attached models or files of flexes, which"
+            " it looks for on disk alone: update to 3.4."
+        )
     try:
         spec = mujoco.MjSpec.from_string(text, assets=assets, **early)
     except ValueError as error:
         raise SceneError(f"MuJoCo {mujoco.__version__} cannot read a stored scene: {error}") from error
     drop_missing_visuals(spec, lambda file: is_among(file, assets, text))
+    require_stored(model_files(spec), assets, text)
+    if origin.get("motors"):
+        add_motors(spec)
     return spec
 
 

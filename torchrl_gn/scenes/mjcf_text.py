@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import re
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
 
 from torchrl_gn.scenes.scene import SceneError
+from torchrl_gn.scenes.stored_mjcf import model_files, packed, parsed
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-_DECLARATION = re.compile(r"^\s*<\?xml.*?\?>", re.DOTALL)
 
 
 def read_text(path: Path) -> str:
@@ -31,17 +29,9 @@ def inlined(text: str, folder: Path) -> str:
     """
     if "<include" not in _COMMENT.sub("", text):
         return text
-    root = _parsed(text, "the MJCF text")
+    root = parsed(text, "the MJCF text")
     _inline_children(root, folder, folder)
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def _parsed(text: str, what: str) -> ElementTree.Element:
-    # MuJoCo reads comments with "--" in them, which are no XML.
-    try:
-        return ElementTree.fromstring(_DECLARATION.sub("", _COMMENT.sub("", text)))
-    except ElementTree.ParseError as error:
-        raise SceneError(f"MuJoCo reads {what}, but it is no XML that can be stored: {error}") from error
 
 
 def _inline_children(element: ElementTree.Element, folder: Path, here: Path) -> None:
@@ -56,7 +46,7 @@ def _inline_children(element: ElementTree.Element, folder: Path, here: Path) -> 
         path = _found(child.attrib["file"], folder, here)
         if path is None:
             raise SceneError(f"The file {child.attrib['file']!r} that the model includes is not found from {folder}.")
-        root = _parsed(read_text(path), f"the included file {path}")
+        root = parsed(read_text(path), f"the included file {path}")
         _inline_children(root, folder, path.parent)
         element.extend(root)
 
@@ -72,13 +62,7 @@ def _found(file: str, *folders: Path) -> Path | None:
 
 def encoded_assets(spec: mujoco.MjSpec, text: str, folder: Path) -> dict[str, str]:
     """Files that a model reads, compressed and encoded, by the path under which MuJoCo asks for them."""
-    files = _files(spec, text, folder)
-    return {name: base64.b64encode(zlib.compress(content)).decode("ascii") for name, content in files}
-
-
-def decoded_assets(assets: Mapping[str, str]) -> dict[str, bytes]:
-    """Content of the files of :func:`encoded_assets`."""
-    return {name: zlib.decompress(base64.b64decode(content)) for name, content in assets.items()}
+    return {name: packed(content) for name, content in _files(spec, text, folder)}
 
 
 def reads_files_early(text: str) -> bool:
@@ -87,15 +71,13 @@ def reads_files_early(text: str) -> bool:
 
 
 def _files(spec: mujoco.MjSpec, text: str, folder: Path) -> Iterator[tuple[str, bytes]]:
-    textures = [texture.file for texture in spec.textures]
-    textures += [file for texture in spec.textures for file in texture.cubefiles]
-    wanted = [(spec.meshdir, mesh.file) for mesh in [*spec.meshes, *spec.hfields, *spec.skins]]
-    wanted += [(spec.texturedir, file) for file in textures]
-    root = _parsed(text, "the MJCF text") if reads_files_early(text) else ElementTree.Element("none")
-    wanted += [(place, flex.get("file")) for flex in root.iter("flexcomp") for place in (spec.meshdir, "")]
-    for directory, file in wanted:
-        if file and (path := _found(str(Path(directory, file)), folder)):
-            yield str(Path(directory, file)), path.read_bytes()
+    wanted = list(model_files(spec))
+    root = parsed(text, "the MJCF text") if reads_files_early(text) else ElementTree.Element("none")
+    flexes = [file for flex in root.iter("flexcomp") if (file := flex.get("file"))]
+    wanted += [Path(place, file) for file in flexes for place in (spec.meshdir, "")]
+    for file in wanted:
+        if path := _found(str(file), folder):
+            yield str(file), path.read_bytes()
     # Models that are attached, with what these read in turn.
     for model in root.iter("model"):
         if (file := model.get("file")) and (path := _found(file, folder)):
@@ -103,8 +85,3 @@ def _files(spec: mujoco.MjSpec, text: str, folder: Path) -> Iterator[tuple[str, 
             yield file, own.encode()
             for name, content in _files(mujoco.MjSpec.from_file(str(path)), own, path.parent):
                 yield str(Path(file).parent / name), content
-
-
-def is_among(file: Path, assets: Mapping[str, object], text: str) -> bool:
-    """Whether a mesh is among a model's stored files; one of an attached model does not say in which folder it is."""
-    return str(file) in assets or ("<model" in text and any(Path(name).name == file.name for name in assets))

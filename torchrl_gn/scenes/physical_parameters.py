@@ -13,10 +13,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchrl_gn.scenes.activations import activation_numbers
 from torchrl_gn.scenes.contact_points import contact_slots
+from torchrl_gn.scenes.couplings import constraint_numbers
 from torchrl_gn.scenes.force_elements import actuator_laws, joint_constants, joint_poses
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.static_features import is_member
+from torchrl_gn.scenes.tendons import tendon_numbers
 
 if TYPE_CHECKING:
     from torchrl_gn.scenes.kinematic_tree import KinematicTree
@@ -38,6 +41,9 @@ class PhysicalParameters(NamedTuple):
     joint_pose: Tensor  # [*B, N, 7] of each node in its parent's frame when no joint has moved
     joint: Tensor  # [*B, E, 8] axis, anchor and limits of each edge's joint, see joint_constants
     actuator: Tensor  # [*B, E, C, 9] law of the actuator in each control slot, see actuator_laws
+    contact_point: Tensor  # [*B, P, 16] points of bodies that can touch the world, see WorldContacts
+    contact_pair: Tensor  # [*B, P, S, 2] of points and surfaces of the world, alike
+    surface: Tensor  # [*B, S, 22] surfaces of the world, see Surface
 
     @classmethod
     def of(cls, scene: Scene | KinematicTree) -> PhysicalParameters:
@@ -50,6 +56,8 @@ class PhysicalParameters(NamedTuple):
         arrays = (static.nodes, static.edges, static.globals_, joint_axes(scene)[1].repeat(2, axis=0), rest, pivot)
         arrays += (anchors.parent_anchor, anchors.child_anchor, *contact_slots(scene)[:2])
         arrays += (joint_poses(scene), joint_constants(scene), actuator_laws(scene))
+        contacts = scene.world_contacts
+        arrays += tuple(_not_empty(each) for each in (contacts.points, contacts.pairs, contacts.constants))
         return cls(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     @classmethod
@@ -71,9 +79,14 @@ class PhysicalParameters(NamedTuple):
         return TensorDict(self._asdict())
 
 
+def _not_empty(array: np.ndarray) -> np.ndarray:
+    """An array with rows, of zeros, where it has none: ``torch.export`` saves no empty constants."""
+    return array if array.size else np.zeros([max(size, 1) for size in array.shape])
+
+
 def topology(scene: Scene) -> dict[str, object]:
     """Everything that the variants of a scene have in common, as comparable values by name."""
-    yaw_frame, joint_anchors = scene.yaw_frame, scene.joint_anchors
+    yaw_frame, joint_anchors, contacts = scene.yaw_frame, scene.joint_anchors, scene.world_contacts
     return {
         "number of nodes": scene.num_nodes,
         "edges": (scene.senders.tolist(), scene.receivers.tolist()),
@@ -85,6 +98,11 @@ def topology(scene: Scene) -> dict[str, object]:
         "joint anchors": (joint_anchors.parent.tolist(), joint_anchors.root.tolist(), joint_anchors.ancestors.tolist()),
         "joint axes": joint_axes(scene)[0].tolist(),
         "contact points": contact_slots(scene)[2].tolist(),
+        "tendons, slider-cranks or sites": tendon_numbers(scene),
+        "equality constraints": constraint_numbers(scene),
+        "activations": activation_numbers(scene.model),
+        "mocap poses": np.round(scene.mocap_poses, 9).tolist(),
+        "contacts with the world": (contacts.node.tolist(), contacts.touches.tolist(), contacts.kinds),
     }
 
 

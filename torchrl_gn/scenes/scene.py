@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.contact_pairs import ContactPairs, find_contact_pairs, possible_contacts
+from torchrl_gn.maths.state_layout import StateLayout, body_layout
+from torchrl_gn.scenes.activations import Activations
+from torchrl_gn.scenes.contact_pairs import ContactPairs, find_contact_pairs
 from torchrl_gn.scenes.contact_points import ContactPoints
 from torchrl_gn.scenes.fingerprint import physics
-from torchrl_gn.scenes.force_elements import joint_groups, known_slots, limited_joints
-from torchrl_gn.scenes.topology import EdgePair, JointAnchors, named
+from torchrl_gn.scenes.mocap import NEAR_TURN, NO_MOCAP_ACTIONS, MocapActions
+from torchrl_gn.scenes.scene_text import scene_text
+from torchrl_gn.scenes.topology import EdgePair, JointAnchors
+from torchrl_gn.scenes.world_contacts import WorldContacts, find_world_contacts
 from torchrl_gn.scenes.yaw_frame import YawFrame
-
-_MANY_CONTACTS = 500  # pairs of geoms from which on contact pairs take about a second to find
 
 
 class SceneError(ValueError):
@@ -74,11 +76,14 @@ class Scene:
     receivers: np.ndarray  # [E]
     edge_action: np.ndarray  # [E, C] actions at each edge, -1 where fewer than C, the most (or 1)
     static: StaticGraph
-    movable: np.ndarray  # [N, 12] bool: position 3, rotation 3, linear velocity 3, angular velocity 3; world frame
+    # [N, 12 + K] bool: position 3, rotation 3, linear velocity 3, angular velocity 3, in the world frame; activations
+    movable: np.ndarray
     translation_invariant: np.ndarray  # [3] bool, world axes along which the dynamics do not depend on position
     yaw_frame: YawFrame | None  # if the dynamics do not depend on the yaw
     joint_anchors: JointAnchors
     contact_points: ContactPoints | None
+    activations: Activations  # where states hold those of actuators
+    mocaps: MocapActions  # poses that are actions, behind the actuators' controls
     action_low: np.ndarray  # [A] -inf where unbounded
     action_high: np.ndarray  # [A]
     substeps: int  # physics steps in one control step
@@ -98,7 +103,42 @@ class Scene:
 
     @property
     def num_actions(self) -> int:
-        return len(self.actuator_names)
+        return len(self.action_names)
+
+    @cached_property
+    def without_mocap_actions(self) -> Scene:
+        """The same with the actuators' actions alone; mocap bodies stay as in the model."""
+        count = len(self.actuator_names)
+        low, high = self.action_low[:count], self.action_high[:count]
+        return replace(self, mocaps=NO_MOCAP_ACTIONS, action_low=low, action_high=high)
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """``[A]`` actuators, then numbers of the mocap poses that are actions."""
+        return self.actuator_names + self.mocaps.names
+
+    @property
+    def rest_action(self) -> np.ndarray:
+        """``[A]`` controls of 0 and mocap poses as in the model."""
+        return np.concatenate((np.zeros(len(self.actuator_names)), self.mocaps.rest))
+
+    @property
+    def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds ``[A]`` to draw actions from: those of quaternions of mocap poses near the model's."""
+        low, high, rest = self.action_low.copy(), self.action_high.copy(), self.rest_action
+        place = np.arange(self.num_actions) - len(self.actuator_names)
+        turns = (place >= 0) & (place % 7 > 2)
+        low[turns], high[turns] = rest[turns] - NEAR_TURN, rest[turns] + NEAR_TURN
+        return low, high
+
+    @property
+    def mocap_poses(self) -> np.ndarray:
+        """All that a simulation takes of mocap bodies where some poses are actions: bounds and poses, flat."""
+        if not len(self.mocaps):
+            return np.empty(0)
+        at = self.model.body_mocapid >= 0
+        poses = self.model.body_pos[at].ravel(), self.model.body_quat[at].ravel()
+        return np.concatenate((self.mocaps.low, self.mocaps.high, *poses))
 
     @property
     def timestep(self) -> float:
@@ -123,14 +163,43 @@ class Scene:
         """Nodes that can meet; the first call takes up to seconds."""
         return find_contact_pairs(self)
 
+    @cached_property
+    def world_contacts(self) -> WorldContacts:
+        """Points of bodies that can touch surfaces of the world, and these."""
+        return find_world_contacts(self)
+
+    @cached_property
+    def layout(self) -> StateLayout:
+        """Channels of a node's state: those of a body, and ``K`` activations of actuators that have some."""
+        return body_layout(self.activations.size)
+
     @property
     def state_size(self) -> int:
-        return 13  # position 3, quaternion 4, linear velocity 3, angular velocity 3
+        """Numbers ``C`` in a node's state: position 3, quaternion 4, velocities 6, ``K`` activations."""
+        return self.layout.size
 
     @property
     def sensor_slice(self) -> slice:
-        """Slice of ``mjData.sensordata`` that, reshaped to ``[..., N, 13]``, holds the state."""
+        """Slice of ``mjData.sensordata`` that, reshaped to ``[..., N, 13]``, holds the poses and velocities."""
         return slice(self.model.nsensordata - 13 * self.num_nodes, self.model.nsensordata)
+
+    def states(self, sensors: np.ndarray, physics: np.ndarray) -> np.ndarray:
+        """States ``[*B, N, C]`` of ``mjData.sensordata`` ``[*B, S]`` and physics ``[*B, S']`` of the same time."""
+        bodies = sensors[..., self.sensor_slice].reshape(*sensors.shape[:-1], self.num_nodes, 13)
+        if not self.model.na:
+            return bodies
+        first = 1 + self.model.nq + self.model.nv
+        act = physics[..., first : first + self.model.na]
+        return np.concatenate((bodies, self.activations.at_nodes(act, self.num_nodes)), axis=-1)
+
+    @property
+    def reference_state(self) -> np.ndarray:
+        """``[N, C]`` states of the model's reference pose, at rest."""
+        data = mujoco.MjData(self.model)
+        for stage in ("kinematics", "comPos", "comVel", "sensorPos", "sensorVel"):
+            getattr(mujoco, f"mj_{stage}")(self.model, data)
+        rest = np.concatenate((np.zeros(1), self.model.qpos0, np.zeros(self.model.nv + self.model.na)))
+        return self.states(data.sensordata, rest).copy()
 
     @property
     def predicted(self) -> np.ndarray:
@@ -139,9 +208,9 @@ class Scene:
 
     @property
     def unbounded(self) -> tuple[str, ...]:
-        """Names of actuators whose actions have no bounds."""
+        """Names of actions without bounds."""
         bounded = np.isfinite(self.action_low) & np.isfinite(self.action_high)
-        return tuple(name for name, known in zip(self.actuator_names, bounded, strict=True) if not known)
+        return tuple(name for name, known in zip(self.action_names, bounded, strict=True) if not known)
 
     def description(self) -> dict:
         """JSON-able values that rebuild the scene; SceneError if it is of an ``MjSpec``, whose XML rounds numbers."""
@@ -158,81 +227,4 @@ class Scene:
         return hashlib.sha256("\n".join(physics(self)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
-        rotations = "no axis" if self.yaw_frame is None else "xyz"[self.yaw_frame.axis]
-        rotations += " but for contacts with the world" * (self.yaw_frame is not None and not self.yaw_frame.exact)
-        step, physics_step = 1e3 * self.timestep, 1e3 * self.model.opt.timestep
-        counts = ((self.num_nodes, "node"), (self.num_edges, "edge"), (self.num_actions, "action"))
-        lines = [
-            f"Scene {self.name}: " + ", ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts),
-            f"  control step {step:g} ms = {self.substeps} x {physics_step:g} ms",
-            *([f"  after a reset, {self.settle_steps} physics steps without control"] * bool(self.settle_steps)),
-            f"  translation-invariant along {_axes(self.translation_invariant, 'no axis')},"
-            f" rotation-invariant about {rotations}",
-        ]
-        mass = dict(zip(self.static.node_names, self.static.nodes.T, strict=True))["mass"]
-        rows = [("node", "parent", "mass [kg]", "movable position", "movable rotation", "welded bodies")]
-        for node, name in enumerate(self.node_names):
-            parent = self.node_names[self.parent[node]] if node else "-"
-            welded = [body for body, attachment in self.attachments.items() if attachment.node == node]
-            free = (_axes(self.movable[node, :3]), _axes(self.movable[node, 3:6]))
-            rows.append((name, parent, f"{mass[node]:.4g}", *free, ", ".join(welded) or "-"))
-        lines += _table(rows)
-        rows = [("joint", "type", "between", "limits", "action", "bounds")]
-        limited = limited_joints(self.model)
-        for index, (pair, slots) in enumerate(zip(self.pairs, self.edge_action[::2].tolist(), strict=True)):
-            limits = "-"
-            if index < len(limited) and limited[index]:
-                low, high = self.model.jnt_range[index]
-                limits = f"[{low:.4g}, {high:.4g}]"
-            actions = [action for action in slots if action >= 0]
-            motors = ", ".join(f"{action}: {self.actuator_names[action]}" for action in actions)
-            bounds = ", ".join(f"[{self.action_low[a]:.4g}, {self.action_high[a]:.4g}]" for a in actions)
-            between = f"{self.node_names[pair.first]} - {self.node_names[pair.second]}"
-            rows.append((pair.name, pair.kind, between, limits, motors or "-", bounds or "-"))
-        return "\n".join([*lines, *_table(rows), *self._notes(), *self._contacts()])
-
-    def _notes(self) -> list[str]:
-        """What the edges do not show."""
-        model, kind = self.model, mujoco.mjtObj
-        idle = [name for action, name in enumerate(self.actuator_names) if action not in self.edge_action]
-        driven = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]
-        tendons = [named(model, kind.mjOBJ_TENDON, tendon) for tendon in range(model.ntendon) if tendon not in driven]
-        shown = {pair.name for pair in self.pairs if pair.element == "constraint"}
-        equalities = [named(model, kind.mjOBJ_EQUALITY, one) for one in np.flatnonzero(model.eq_active0).tolist()]
-        mocap = [named(model, kind.mjOBJ_BODY, body) for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
-        hidden = [self.joint_names[joint] for joint in joint_groups(model, self.body)[1]]
-        forces = np.setdiff1d(self.edge_action[self.edge_action >= 0], self.edge_action[::2][known_slots(self)])
-        notes = {
-            "no bounds": self.unbounded,
-            "actuators that move nothing": idle,
-            "joints without features, as their bodies do not show them": hidden,
-            "actuators without features of their forces": [self.actuator_names[action] for action in forces],
-            "passive tendons, without edges": tendons,
-            "constraints without edges": [name for name in equalities if name not in shown],
-            "mocap bodies, fixed at the pose of the model": mocap,
-        }
-        return [f"  {what}: {', '.join(names)}" for what, names in notes.items() if names]
-
-    def _contacts(self) -> list[str]:
-        """What can meet, for printing; of a large scene pairs only if they are known: finding them takes seconds."""
-        points = self.contact_points
-        touching = [] if points is None else [self.node_names[node] for node in np.unique(points.node)]
-        lines = [f"  touch the plane: {', '.join(touching)}"] * bool(touching)
-        if "contact_pairs" not in vars(self) and (count := len(possible_contacts(self))) > _MANY_CONTACTS:
-            return [*lines, f"  {count:,} pairs of geoms may collide; scene.contact_pairs finds which nodes can meet"]
-        pairs, names = self.contact_pairs, self.node_names
-        if len(pairs.nodes):
-            more = f", and {pairs.left_out} less frequent pairs that are left out" * (pairs.left_out > 0)
-            lines.append(f"  can meet: {', '.join(f'{names[a]} - {names[b]}' for a, b in pairs.nodes)}{more}")
-        if pairs.ignored:
-            lines.append(f"  no contact features of {', '.join(pairs.ignored)}")
-        return lines
-
-
-def _axes(flags: np.ndarray, none: str = "-") -> str:
-    return "".join(axis for axis, flag in zip("xyz", flags, strict=True) if flag) or none
-
-
-def _table(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        return scene_text(self)

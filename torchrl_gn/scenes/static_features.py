@@ -22,9 +22,10 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.actuator_kinds import drive_joints
+from torchrl_gn.scenes.constraints import joined_frames
 from torchrl_gn.scenes.scene import StaticGraph
 from torchrl_gn.scenes.topology import Topology, offset
-from torchrl_gn.scenes.transmissions import Transmissions, anchors
+from torchrl_gn.scenes.transmissions import Transmissions
 
 Columns = list[tuple[str, np.ndarray]]
 
@@ -157,7 +158,8 @@ def _constraint_columns(model: mujoco.MjModel, graph: Topology, equality: np.nda
     if not len(which):
         return []
     ends = [
-        [point for _, point in sorted(anchors(model, graph, one), key=lambda end: end[0])] for one in which.tolist()
+        [place for _, place, _ in sorted(joined_frames(model, graph, one), key=lambda end: end[0])]
+        for one in which.tolist()
     ]
     first, second = np.array(ends).transpose(1, 0, 2)
     columns: Columns = [

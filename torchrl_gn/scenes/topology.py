@@ -13,15 +13,15 @@ class EdgePair:
     """Two directed edges between nodes, of a joint, an actuator or an equality constraint."""
 
     name: str  # of the joint, actuator or constraint
-    kind: str  # "hinge", "slide", "ball", "free"; "tendon", "site", "slidercrank", "body"; "connect", "weld"
+    kind: str  # "hinge", "slide", "ball", "free"; "site", "body"; "connect", "weld"
     first: int  # node; a joint's parent
     second: int  # node; a joint's child
 
     @property
     def element(self) -> str:
         """What the pair belongs to: a joint, an actuator or a constraint."""
-        others = {"tendon": "actuator", "site": "actuator", "slidercrank": "actuator", "body": "actuator"}
-        return {**others, "connect": "constraint", "weld": "constraint"}.get(self.kind, "joint")
+        others = {"site": "actuator", "body": "actuator", "connect": "constraint", "weld": "constraint"}
+        return others.get(self.kind, "joint")
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,22 @@ def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray,
         pos, quat = model.body_pos[body] + rotated, product
         body = int(model.body_parentid[body])
     return pos, quat
+
+
+def in_node(model: mujoco.MjModel, graph: Topology, body: int, point: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
+    """Node of a body, a point ``[3]`` of the body in the node's frame, and the body's quaternion ``[4]`` there."""
+    node, rotated = int(graph.node_of_body[body]), np.empty(3)
+    pos, quat = offset(model, body, int(graph.body[node]))
+    mujoco.mju_rotVecQuat(rotated, point, quat)
+    return node, pos + rotated, quat
+
+
+def site_in_node(model: mujoco.MjModel, graph: Topology, site: int) -> tuple[int, np.ndarray, np.ndarray]:
+    """Node of a site, its place ``[3]`` and quaternion ``[4]`` in the node's frame."""
+    node, place, quat = in_node(model, graph, int(model.site_bodyid[site]), model.site_pos[site])
+    orientation = np.empty(4)
+    mujoco.mju_mulQuat(orientation, quat, model.site_quat[site])
+    return node, place, orientation
 
 
 @dataclass(frozen=True, eq=False)

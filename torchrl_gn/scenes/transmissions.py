@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.constraints import active_constraints, joined_frames, joins_bodies
+from torchrl_gn.scenes.lines import moved_joints, tendon_ends
 from torchrl_gn.scenes.scene import UnsupportedSceneError
-from torchrl_gn.scenes.topology import EdgePair, Topology, named, offset
+from torchrl_gn.scenes.topology import EdgePair, Topology, named, site_in_node
 
 _TRANSMISSION, _WRAP, _OBJECT, _EQUALITY = mujoco.mjtTrn, mujoco.mjtWrap, mujoco.mjtObj, mujoco.mjtEq
-_Disable = mujoco.mjtDisableBit
 _Place = int | tuple[int, int]  # a joint, or two nodes
 
 
@@ -31,9 +32,9 @@ def find_transmissions(model: mujoco.MjModel, graph: Topology) -> Transmissions:
     """Edge pairs and control slots of a model; UnsupportedSceneError if an actuator hides a state or has no place.
 
     A control acts at the pair of its joint; of every joint of a fixed tendon, with its gear times the coefficient; of
-    consecutive nodes on a spatial tendon's path; of a slider-crank's two nodes; of the world and the node of a site or
-    of an adhesive body; of both nodes with a refsite. Two nodes without joint get a pair of their own. The gear of a
-    site is its force and torque about the node's origin in the node's frame, with a refsite those of the refsite's.
+    every joint that a spatial tendon or a slider-crank moves; of the world and the node of a site or of an adhesive
+    body; of both nodes with a refsite. Two nodes without joint get a pair of their own. The gear of a site is its force
+    and torque about the node's origin in the node's frame, with a refsite those of the refsite's.
     """
     pairs = list(graph.pairs)
     slots: list[dict[int, tuple[np.ndarray, int]]] = [{} for _ in pairs]
@@ -70,12 +71,8 @@ def _refuse_hidden_states(model: mujoco.MjModel, actuator: int) -> None:
     controls, history = getattr(model, "actuator_ctrlnum", None), getattr(model, "actuator_history", None)
     if controls is not None and controls[actuator] != 1:
         raise UnsupportedSceneError(f"{label} has {controls[actuator]} controls; a slot of an edge takes one.")
-    delayed = history is not None and history[actuator, 0] > 0
-    if model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE or delayed:
-        raise UnsupportedSceneError(
-            f"{label} has activation dynamics or a delay, a state that body states do not"
-            " show. Use dyntype none and no delay."
-        )
+    if history is not None and history[actuator, 0] > 0:
+        raise UnsupportedSceneError(f"{label} has a delay, whose past controls states do not show. Use none.")
 
 
 def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[tuple[_Place, np.ndarray, int]]:
@@ -95,11 +92,11 @@ def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[t
                 yield (0, node), _wrench(model, graph, target, gear), node
         case _TRANSMISSION.mjTRN_SITE | _TRANSMISSION.mjTRN_SLIDERCRANK:
             node, reference = (int(nodes[model.site_bodyid[site]]) for site in (target, other))
-            ends = min(node, reference), max(node, reference)
-            if node != reference and kind == _TRANSMISSION.mjTRN_SITE:
-                yield ends, _wrench(model, graph, other, gear), reference
+            if kind == _TRANSMISSION.mjTRN_SLIDERCRANK:
+                for joint in moved_joints(graph, [(reference, node)]):
+                    yield joint, gear, -1
             elif node != reference:
-                yield ends, gear, -1
+                yield (min(node, reference), max(node, reference)), _wrench(model, graph, other, gear), reference
         case _TRANSMISSION.mjTRN_BODY:
             if not nodes[target]:
                 raise UnsupportedSceneError(
@@ -114,23 +111,17 @@ def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[t
 
 
 def _tendon_places(model: mujoco.MjModel, graph: Topology, tendon: int) -> Iterator[tuple[_Place, float]]:
-    """Joints of a fixed tendon with their coefficients, or consecutive nodes of a spatial one with factor 1."""
-    first = int(model.tendon_adr[tendon])
-    coefficients: dict[_Place, float] = {}
-    previous = None
+    """Joints that a tendon moves: of a fixed one with their coefficients, of a spatial one with factor 1."""
+    first, coefficients = int(model.tendon_adr[tendon]), dict[_Place, float]()
     for wrap in range(first, first + int(model.tendon_num[tendon])):
-        kind, at = _WRAP(model.wrap_type[wrap]), int(model.wrap_objid[wrap])
-        if kind == _WRAP.mjWRAP_JOINT:
+        if model.wrap_type[wrap] == int(_WRAP.mjWRAP_JOINT):
+            at = int(model.wrap_objid[wrap])
             coefficients[at] = coefficients.get(at, 0.0) + float(model.wrap_prm[wrap])
-            continue
-        if kind == _WRAP.mjWRAP_PULLEY:
-            previous = None
-            continue
-        node = int(graph.node_of_body[(model.site_bodyid if kind == _WRAP.mjWRAP_SITE else model.geom_bodyid)[at]])
-        if previous is not None and node != previous:
-            coefficients[min(previous, node), max(previous, node)] = 1.0
-        previous = node
-    yield from coefficients.items()
+    yield from (
+        coefficients.items()
+        if coefficients
+        else ((at, 1.0) for at in moved_joints(graph, tendon_ends(model, graph, tendon)))
+    )
 
 
 def _pair_between(pairs: list[EdgePair], nodes: tuple[int, int]) -> int:
@@ -140,51 +131,21 @@ def _pair_between(pairs: list[EdgePair], nodes: tuple[int, int]) -> int:
 
 def _wrench(model: mujoco.MjModel, graph: Topology, site: int, gear: np.ndarray) -> np.ndarray:
     """Force and torque ``[6]`` about the origin of a site's node, in its frame, of a gear in the site's frame."""
-    _, point, quat = _in_node(model, graph, int(model.site_bodyid[site]), model.site_pos[site])
-    orientation, force, torque = np.empty(4), np.empty(3), np.empty(3)
-    mujoco.mju_mulQuat(orientation, quat, model.site_quat[site])
+    _, point, orientation = site_in_node(model, graph, site)
+    force, torque = np.empty(3), np.empty(3)
     mujoco.mju_rotVecQuat(force, gear[:3], orientation)
     mujoco.mju_rotVecQuat(torque, gear[3:], orientation)
     return np.concatenate((force, torque + np.cross(point, force)))
 
 
-def _in_node(
-    model: mujoco.MjModel, graph: Topology, body: int, point: np.ndarray
-) -> tuple[int, np.ndarray, np.ndarray]:
-    """Node of a body, a point ``[3]`` of the body in the node's frame, and the body's quaternion ``[4]`` there."""
-    node, rotated = int(graph.node_of_body[body]), np.empty(3)
-    pos, quat = offset(model, body, int(graph.body[node]))
-    mujoco.mju_rotVecQuat(rotated, point, quat)
-    return node, pos + rotated, quat
-
-
 def _constraints(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, EdgePair]]:
     """Pairs of the active connect and weld constraints between two nodes."""
-    if model.opt.disableflags & (_Disable.mjDSBL_EQUALITY | _Disable.mjDSBL_CONSTRAINT):
-        return
-    for equality in np.flatnonzero(model.eq_active0).tolist():
-        kind = _EQUALITY(model.eq_type[equality])
-        if kind in (_EQUALITY.mjEQ_CONNECT, _EQUALITY.mjEQ_WELD):
-            first, second = sorted(node for node, _ in anchors(model, graph, equality))
+    for equality in active_constraints(model):
+        if joins_bodies(model, equality):
+            first, second = sorted(node for node, _, _ in joined_frames(model, graph, equality))
             if first != second:
-                yield (
-                    equality,
-                    EdgePair(named(model, _OBJECT.mjOBJ_EQUALITY, equality), _plain(kind.name), first, second),
-                )
-
-
-def anchors(model: mujoco.MjModel, graph: Topology, equality: int) -> list[tuple[int, np.ndarray]]:
-    """Both nodes of a connect or weld constraint, and its anchors ``[3]`` in their frames, metres."""
-    found, data = [], model.eq_data[equality]
-    weld = model.eq_type[equality] == _EQUALITY.mjEQ_WELD
-    for end, at in enumerate((int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality]))):
-        if model.eq_objtype[equality] == _OBJECT.mjOBJ_SITE:
-            body, point = int(model.site_bodyid[at]), model.site_pos[at]
-        else:
-            # A weld has one anchor, in the second body, and the second body's position in the first.
-            body, point = at, data[3 * (end == (0 if weld else 1)) :][:3]
-        found.append(_in_node(model, graph, body, point)[:2])
-    return found
+                kind = _plain(_EQUALITY(model.eq_type[equality]).name)
+                yield equality, EdgePair(named(model, _OBJECT.mjOBJ_EQUALITY, equality), kind, first, second)
 
 
 def _plain(name: str) -> str:

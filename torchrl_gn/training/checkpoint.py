@@ -3,33 +3,34 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 import importlib.metadata
 import json
 import os
-import struct
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 import torchrl_gn
-from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel
 from torchrl_gn.identification import IdentifyingModel
+from torchrl_gn.maths import Normalizer
 from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import Scene, scene_from_description
+from torchrl_gn.training.description_limits import MemoryLimit, check_whole_numbers
+from torchrl_gn.training.nested_state import flatten, unflatten
+from torchrl_gn.training.tensor_files import DAMAGE, digest_of, read_tensors, write_tensors
 
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"  # of a run folder
 WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")  # the models that come with the package
-FORMAT = 4  # version of the checkpoint format that this package writes and reads
-DAMAGE = (SafetensorError, OSError, struct.error)  # what reading a damaged file raises
+FORMAT = 5  # version of the checkpoint format that this package writes
+_IN_HEADER = 4  # version, which it reads too, that has the description in the header, where files have little room
+_DESCRIPTION = "description"  # name of the tensor with the bytes of the description's JSON
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
 Trained = ForwardModel | IdentifyingModel | Agent | StateValue | BoundedPolicy  # what a checkpoint can hold
@@ -45,7 +46,7 @@ _Kind = TypeVar("_Kind")
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be used: missing, damaged, of a newer format, or not ours."""
+    """A checkpoint that cannot be used: missing, damaged, of a newer format, not ours, or forged."""
 
 
 @dataclass(repr=False)
@@ -141,6 +142,7 @@ def save_checkpoint(
 
     Raises:
         TypeError: if no checkpoint can hold the model.
+        OSError: if there is no space; the checkpoint that was there is kept.
     """
     scenes = list(scene) if isinstance(scene, Sequence) else [scene]
     if isinstance(model, BoundPredictor):
@@ -150,9 +152,8 @@ def save_checkpoint(
         kinds = ", ".join(cast(type, each).__name__ for each in (BoundPredictor, *KINDS.values()))
         raise TypeError(f"A checkpoint cannot hold a {type(model).__name__}; give one of {kinds}.")
     tensors: dict[str, Tensor] = {}
-    plain = _flatten(training or {}, "training", tensors)
+    plain = flatten(training or {}, "training", tensors)
     tensors |= {f"model.{name}": value for name, value in model.state_dict().items()}
-    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     description = {
         "kind": kind,
         "model": model.description(),
@@ -163,15 +164,17 @@ def save_checkpoint(
         "training": plain,
     }
     text = json.dumps(description)  # in their order: that of an observation is where its numbers are
-    digest = digest_of(tensors, text)
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata={"format": str(FORMAT), "description": text, "sha256": digest})
+    # No text of the header, which must stay below 100 MB: meshes are in the description of their scene.
+    tensors[_DESCRIPTION] = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
+    write_tensors(path, tensors, format=str(FORMAT))
 
 
 def read_checkpoint(
     path: str | os.PathLike, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
 ) -> Checkpoint:
     """Read a checkpoint file, or that of a run folder. Weights in half precision compute in single precision.
+
+    Anybody's file may be read: no code in it runs, and no size in it is believed.
 
     Args:
         physics: the function that a forward model corrects, which no checkpoint holds.
@@ -189,34 +192,51 @@ def read_checkpoint(
         tensors, metadata = read_tensors(path)
     except DAMAGE as error:
         raise CheckpointError(f"Checkpoint {path} is damaged ({error}); use another or train again.") from error
-    if not {"format", "description", "sha256"} <= metadata.keys():
+    number = metadata.get("format", "")
+    if not re.fullmatch("[0-9]{1,9}", number) or "sha256" not in metadata:
         raise CheckpointError(f"{path} is a safetensors file, but no checkpoint of torchrl_gn.")
-    if int(metadata["format"]) != FORMAT:
-        what = "update torchrl_gn" if int(metadata["format"]) > FORMAT else "train again"
+    if int(number) not in (FORMAT, _IN_HEADER):
+        what = "update torchrl_gn" if int(number) > FORMAT else "train again"
         raise CheckpointError(
-            f"Checkpoint {path} has format {metadata['format']}, this version reads format {FORMAT}; {what}."
+            f"Checkpoint {path} has format {number}, this version reads formats {_IN_HEADER} and {FORMAT}; {what}."
         )
-    text = metadata["description"]
-    if digest_of(tensors, text) != metadata["sha256"]:
+    in_header = metadata.get("description", "")
+    if digest_of(tensors, in_header) != metadata["sha256"]:
         raise CheckpointError(f"Checkpoint {path} is damaged (checksum differs); use another or train again.")
-    for name, value in tensors.items():
-        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            raise CheckpointError(f"Checkpoint {path} has NaN or Inf in {name!r}; use another or train again.")
-    description = json.loads(text)
-    weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
-    stored = next(value.dtype for name, value in weights.items() if name.endswith(".weight"))
     try:
-        given = {} if physics is None else {"physics": physics}
-        model = KINDS[description["kind"]].from_description(description["model"], **given)
-        model.to(torch.float32 if stored == torch.float16 else stored).load_state_dict(weights)
-    except (RuntimeError, TypeError) as error:
-        what = str(error).splitlines()[0]
+        for name, value in tensors.items():
+            if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+                raise CheckpointError(f"Checkpoint {path} has NaN or Inf in {name!r}; use another or train again.")
+        text = tensors.pop(_DESCRIPTION).numpy().tobytes() if _DESCRIPTION in tensors else in_header
+        return _checkpoint_of(json.loads(text), tensors, {} if physics is None else {"physics": physics})
+    except CheckpointError:
+        raise
+    except ValueError as error:
+        raise CheckpointError(f"Checkpoint {path} cannot be used: {error}") from error
+    except (RuntimeError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError) as error:
         raise CheckpointError(
-            f"Checkpoint {path} is of another version of torchrl_gn, whose networks are not built as here ({what});"
-            " train again."
+            f"Checkpoint {path} is of another version of torchrl_gn, whose networks are not built as here, or forged"
+            f" ({type(error).__name__}: {(str(error).splitlines() or [''])[0]}); train again."
         ) from error
-    plain = {name: description[name] for name in ("config", "versions", "metrics")}
-    return Checkpoint(model, description["scenes"], **plain, training=_unflatten(description["training"], tensors))
+
+
+def _checkpoint_of(description: dict, tensors: dict[str, Tensor], given: dict[str, Any]) -> Checkpoint:
+    """The checkpoint of a description and tensors that are whole, but may be anybody's."""
+    scenes, plain = description["scenes"], {name: description[name] for name in ("config", "versions", "metrics")}
+    if not all(isinstance(each, dict) for each in [*scenes, *plain.values()]) or not isinstance(scenes, list):
+        raise TypeError("scenes, config, versions and metrics are no dictionaries")
+    weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
+    stored = next((value.dtype for name, value in weights.items() if name.endswith(".weight")), None)
+    if stored is None or not stored.is_floating_point:
+        raise TypeError(f"weights are of dtype {stored}")
+    check_whole_numbers(description["model"])
+    with MemoryLimit(sum(value.nbytes for value in weights.values()), len(weights)):
+        model = KINDS[description["kind"]].from_description(description["model"], **given)
+    model.to(torch.float32 if stored == torch.float16 else stored).load_state_dict(weights)
+    for name, module in model.named_modules():
+        if isinstance(module, Normalizer) and not bool(torch.isfinite(module.inverse_std).all()):
+            raise ValueError(f"the statistics {name!r} have no standard deviation")
+    return Checkpoint(model, scenes, **plain, training=unflatten(description["training"], tensors))
 
 
 def pretrained_names() -> list[str]:
@@ -253,43 +273,3 @@ def load_pretrained(
             f" do are {names}.{hint}"
         )
     return read_checkpoint(source, physics=physics)
-
-
-def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file; raises what :data:`DAMAGE` lists if it cannot be read."""
-    with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
-
-
-def digest_of(tensors: Mapping[str, Tensor], text: str = "") -> str:
-    """Checksum of tensors on the CPU, by name, dtype and shape, and of a text."""
-    digest = hashlib.sha256(text.encode())
-    for name in sorted(tensors):
-        value = tensors[name].contiguous()
-        digest.update(f"{name}{value.dtype}{list(value.shape)}".encode())
-        digest.update(value.flatten().view(torch.uint8).numpy().tobytes() if value.numel() else b"")
-    return digest.hexdigest()
-
-
-def _flatten(value: Any, prefix: str, tensors: dict[str, Tensor]) -> Any:
-    """Plain mirror of a nested structure in which each tensor is replaced by its name."""
-    if isinstance(value, Tensor):
-        tensors[prefix] = value
-        return {"tensor": prefix}
-    if isinstance(value, Mapping):
-        return {"dict": [[key, _flatten(item, f"{prefix}.{key}", tensors)] for key, item in value.items()]}
-    if isinstance(value, (list, tuple)):
-        return {"list": [_flatten(item, f"{prefix}.{index}", tensors) for index, item in enumerate(value)]}
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return {"value": value}
-    raise TypeError(f"Checkpoint entry {prefix} has type {type(value).__name__}; only tensors and plain values fit.")
-
-
-def _unflatten(mirror: Any, tensors: Mapping[str, Tensor]) -> Any:
-    if "tensor" in mirror:
-        return tensors[mirror["tensor"]]
-    if "dict" in mirror:
-        return {key: _unflatten(item, tensors) for key, item in mirror["dict"]}
-    if "list" in mirror:
-        return [_unflatten(item, tensors) for item in mirror["list"]]
-    return mirror["value"]

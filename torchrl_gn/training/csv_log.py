@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,16 +13,18 @@ from torchrl_gn.atomic import atomic_path
 class CsvLog:
     """Write ``path``: a row for each step, ``step`` and a column for each name, empty where nothing was logged.
 
-    A file that is there goes on; its rows of the same or later steps are replaced by the first row that is logged.
+    A file that is there goes on; its rows of the same or later steps are replaced by the first row that is logged. Rows
+    that a full disk or a power cut left damaged are left out, with a warning.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self._names, self._rows = path, ["step"], []
+        damaged = 0
         if path.exists():
-            with path.open(newline="") as file:
-                reader = csv.DictReader(file)
-                self._rows = list(reader)
-                self._names = list(reader.fieldnames or self._names)
+            self._names, self._rows, damaged = _read(path)
+        if damaged:
+            warnings.warn(f"{path}: {damaged} damaged rows are left out.", stacklevel=2)
+            self._rewrite()
         self._resumed = bool(self._rows)
 
     def log(self, numbers: Mapping[str, float], step: int) -> None:
@@ -46,3 +49,25 @@ class CsvLog:
             writer = csv.DictWriter(file, self._names)
             writer.writeheader()
             writer.writerows(self._rows)
+
+
+def _read(path: Path) -> tuple[list[str], list[dict[str, str]], int]:
+    """Names, whole rows, and the number of others; a last row without its line's end is cut."""
+    text = path.read_bytes().decode(errors="replace")
+    *whole, cut = text.splitlines(keepends=True) or [""]
+    lines = [*whole, cut] if cut.endswith("\n") else whole
+    names = next(csv.reader(lines[:1]), [])
+    if names[:1] != ["step"] or len(set(names)) < len(names) or "\0" in lines[0]:
+        return ["step"], [], len(lines) + (not cut.endswith("\n") and bool(cut))
+    fields = [[] if "\0" in line else next(csv.reader([line]), []) for line in lines[1:]]
+    rows = [dict(zip(names, each, strict=True)) for each in fields if _is_whole(each, len(names))]
+    return names, rows, len(fields) - len(rows) + (not cut.endswith("\n") and bool(cut))
+
+
+def _is_whole(fields: list[str], count: int) -> bool:
+    try:
+        int(fields[0])
+        [float(each) for each in fields if each]
+    except (ValueError, IndexError):
+        return False
+    return len(fields) == count

@@ -20,13 +20,16 @@ def make_collector(
 ) -> BaseCollector:
     """Make a collector that explores, with further options of ``torchrl.collectors.Collector``.
 
-    ``env`` are environments, or functions that make some, each for a Ray actor; ``seed=None`` keeps their seeds.
+    ``env`` are environments, or functions that make some, each for a Ray actor; ``seed=None`` keeps their seeds. The
+    policy's weights may be on another device than the environments.
     """
     options |= {"exploration_type": ExplorationType.RANDOM}
     collector_kwargs: dict[str, Any] = {"track_traj_ids": False, "auto_register_policy_transforms": False}
     if isinstance(env, EnvBase):
         if seed is not None:
             env.set_seed(seed)
+        if (device := device_of(policy)) not in (None, env.device):
+            options |= {"policy_device": device, "env_device": env.device}
         return Collector(env, policy, **options, **collector_kwargs)
     makers = list(env)
     if seed is not None:
@@ -35,6 +38,12 @@ def make_collector(
     collector = Collector(makers, policy, backend="ray", sync=True, backend_options=backend_options, **options)
     collector.update_policy_weights_(policy)
     return collector
+
+
+def device_of(policy: TensorDictModuleBase) -> torch.device | None:
+    """Where a policy's weights are; None without any."""
+    weight = next(policy.parameters(), None)
+    return None if weight is None else weight.device
 
 
 def _seeded(make: Callable[[], EnvBase], seed: int) -> EnvBase:

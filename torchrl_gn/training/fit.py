@@ -52,6 +52,7 @@ def fit(
     lr: float | None = None,
     batch_size: int = 200,
     noise: float = 0.0,
+    size_floor: float | None = 0.02,
     seed: int = 0,
     progress: bool = True,
 ) -> History:
@@ -72,6 +73,8 @@ def fit(
             for example ``lambda weights: torch.optim.AdamW(weights, lr=1e-3)``.
         lr: peak learning rate, instead of the preset's.
         noise: standard deviation of the input noise, in standard deviations of each component.
+        size_floor: weighs calm samples more, see :class:`~torchrl_gn.objectives.ForwardModelLoss`; None (paper): all
+            weigh alike.
         seed: seed of batches and noise. Weights are made before, with torch's global generator.
 
     Raises:
@@ -81,7 +84,8 @@ def fit(
         ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
-    loss = ForwardModelLoss(model, noise=noise, generator=torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    loss = ForwardModelLoss(model, noise=noise, size_floor=size_floor, generator=generator)
     scheduled = _make_optimizer(model.model, optimizer, lr)
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
     transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()

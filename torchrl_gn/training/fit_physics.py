@@ -48,16 +48,17 @@ def fit_physics(
         ValueError: if no parameter requires a gradient.
     """
     layout = layout_of(scene)
-    moving = torch.as_tensor(scene.predicted)
     parameters = [parameter for parameter in physics.parameters() if parameter.requires_grad]
     if not parameters:
         raise ValueError("The physics have no parameter that requires a gradient: there is nothing to fit.")
+    device = parameters[0].device
+    moving = torch.as_tensor(scene.predicted, device=device)
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, window=window, seed=seed)
     optimizer = torch.optim.Adam(parameters, lr=lr)
     errors: list[float] = []
     present = present_actions(scene)
     for step in range(steps):
-        batch = buffer.sample()
+        batch = buffer.sample().to(device)
         actions, truth = cast(Tensor, batch["action"])[..., :present], cast(Tensor, batch["next", "state"])
         start = state = cast(Tensor, batch["state"])[:, 0]
         predicted = []

@@ -59,8 +59,9 @@ class Muon(torch.optim.Optimizer):
                     self.state[parameter]["momentum_buffer"] = torch.zeros_like(parameter)
             moments = [self.state[parameter]["momentum_buffer"] for parameter in parameters]
             by_torch = list(range(len(parameters)))
-            with contextlib.suppress(NoCompilerError):
-                by_torch = self._update_natively(parameters, moments, group)
+            if any(parameter.is_cpu for parameter in parameters):
+                with contextlib.suppress(NoCompilerError):
+                    by_torch = self._update_natively(parameters, moments, group)
             if by_torch:
                 self._update([parameters[i] for i in by_torch], [moments[i] for i in by_torch], group)
         return loss
@@ -89,7 +90,11 @@ class Muon(torch.optim.Optimizer):
         nesterov = torch._foreach_lerp(gradients, moments, group["momentum"])  # pyright: ignore
         for parameter, update in zip(parameters, _orthogonalize_all(nesterov), strict=True):
             rows, columns = parameter.shape
-            parameter.sub_(update, alpha=group["lr"] * math.sqrt(max(1, rows / columns)))
+            rate = group["lr"] * math.sqrt(max(1, rows / columns))
+            if isinstance(rate, Tensor):  # which a CUDA graph reads anew each time
+                parameter.sub_(update * rate.to(update.dtype))
+            else:
+                parameter.sub_(update, alpha=rate)
 
 
 def _is_plain(tensor: Tensor | None, like: Tensor) -> bool:

@@ -17,11 +17,13 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import HardUpdate, LossModule
 
+from torchrl_gn.cache import keep_inductor_private
 from torchrl_gn.dynamics.executors.compiled import check_compiling
 from torchrl_gn.finite import require_finite
+from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.policies import Agent
-from torchrl_gn.training.experience import buffer_state, load_buffer_state, make_collector
+from torchrl_gn.training.experience import buffer_state, device_of, load_buffer_state, make_collector
 from torchrl_gn.training.optimizers import clip_gradients
 
 _KEPT = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
@@ -125,7 +127,10 @@ class OffPolicyTrainer:
         self._loss = self._total_loss if compile is False else self._first_loss
 
     def run(self) -> Iterator[LearningProgress]:
-        """Train until all frames are spent, yielding after every batch; raises what :meth:`update` does."""
+        """Train until all frames are spent, yielding after every batch; raises what :meth:`update` does.
+
+        Ctrl-C and SIGTERM, at once while experience is collected or judged, never come in the middle of a change.
+        """
         if not self.curve.frames:
             self._evaluate()
         if self.owed >= 1 or self._evaluation_is_due:  # interrupted between a batch and its updates
@@ -143,8 +148,8 @@ class OffPolicyTrainer:
         )
         threads = torch.get_num_threads()
         try:
-            start = time.perf_counter()
-            for batch in collector:
+            start, batches = time.perf_counter(), iter(collector)
+            while (batch := _next(batches)) is not None:
                 # TorchRL closes a SerialEnv with the last batch, which resets the number of threads.
                 torch.set_num_threads(threads)
                 self.remember(batch)
@@ -160,9 +165,10 @@ class OffPolicyTrainer:
         """Make the updates owed, and evaluate if due; ``start`` is when collecting began."""
         losses: dict[str, list[float]] = {}
         while self.owed >= 1:
-            for name, value in self.update().items():
-                losses.setdefault(name, []).append(value)
-            self.owed -= 1
+            with held():
+                for name, value in self.update().items():
+                    losses.setdefault(name, []).append(value)
+                self.owed -= 1
         self.seconds += time.perf_counter() - start
         evaluation = self._evaluate() if self._evaluation_is_due else None
         means = {name: sum(values) / len(values) for name, values in losses.items()}
@@ -176,13 +182,15 @@ class OffPolicyTrainer:
 
     def remember(self, batch: TensorDictBase) -> None:
         """Add finite transitions ``[*B]`` to the replay buffer and the agent's normalisers; else raise ValueError."""
-        steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1).to(self._weights[0].device)
+        steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1)
         require_finite(steps, "Experience")
-        self.agent.update_normalizers(steps["observation"], steps["action"], steps["next", "observation"])
-        self.buffer.extend(steps)
-        self.frames += len(steps)
-        if self.frames > self.random_frames:
-            self.owed += self.updates_per_frame * len(steps)
+        there = steps.to(self._weights[0].device)
+        with held():
+            self.agent.update_normalizers(there["observation"], there["action"], there["next", "observation"])
+            self.buffer.extend(steps.to("cpu"))  # where the buffer is
+            self.frames += len(steps)
+            if self.frames > self.random_frames:
+                self.owed += self.updates_per_frame * len(steps)
 
     @without_autocast
     def update(self) -> dict[str, float]:
@@ -190,16 +198,18 @@ class OffPolicyTrainer:
 
         FloatingPointError, and no change, if a loss or a gradient is not finite.
         """
-        total, losses = self._loss(self.buffer.sample().to(self._weights[0].device))
+        with let_in_at_once():  # the first may be compiled for minutes
+            total, losses = self._loss(self.buffer.sample().to(self._weights[0].device))
         values = {name: float(value) for name, value in losses.items()}
         if not math.isfinite(sum(values.values())):
             raise FloatingPointError(f"Losses are {values} at update {self.updates}; lower the learning rate.")
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         clip_gradients(self._weights, self.max_norm, f"update {self.updates}")
-        self.optimizer.step()
-        self.target.step()
-        self.updates += 1
+        with held():
+            self.optimizer.step()
+            self.target.step()
+            self.updates += 1
         return values
 
     def _first_loss(self, batch: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -207,6 +217,7 @@ class OffPolicyTrainer:
         # TorchRL's losses create modules at their first call, after which all would compile again. The warning is about
         # an option that tensordict reads and torch has deprecated.
         warnings.filterwarnings("ignore", "torch._dynamo.config.inline_inbuilt_nn_modules", FutureWarning)
+        keep_inductor_private()
         self._loss = torch.compile(self._total_loss, fullgraph=True, dynamic=False)
         return self._total_loss(batch)
 
@@ -220,10 +231,12 @@ class OffPolicyTrainer:
         return torch.stack(list(losses.values())).sum(), {name: value.detach() for name, value in losses.items()}
 
     def _evaluate(self) -> float:
-        value = self.evaluate()
-        for name in ("frames", "updates", "seconds"):
-            getattr(self.curve, name).append(getattr(self, name))
-        self.curve.returns.append(value)
+        with let_in_at_once():
+            value = self.evaluate()
+        with held():
+            for name in ("frames", "updates", "seconds"):
+                getattr(self.curve, name).append(getattr(self, name))
+            self.curve.returns.append(value)
         return value
 
     def state_dict(self) -> dict[str, Any]:
@@ -255,6 +268,11 @@ class OffPolicyTrainer:
             setattr(self, name, value)
 
 
+def _next(batches: Iterator[TensorDictBase]) -> TensorDictBase | None:
+    with let_in_at_once():
+        return next(batches, None)
+
+
 @torch.no_grad()
 def mean_return(env: EnvBase, policy: TensorDictModuleBase, steps: int, *, seed: int = 0) -> float:
     """Return the mean return of one episode per environment ``[num_envs]``, without exploration.
@@ -263,7 +281,8 @@ def mean_return(env: EnvBase, policy: TensorDictModuleBase, steps: int, *, seed:
     """
     env.set_seed(seed)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        rollout = env.rollout(steps, policy, break_when_any_done=False, break_when_all_done=True)
+        options = {"break_when_any_done": False, "break_when_all_done": True}
+        rollout = env.rollout(steps, policy, auto_cast_to_device=device_of(policy) not in (None, env.device), **options)
     reward, done = rollout["next", "reward"], rollout["next", "done"]
     # Environments reset themselves when done: count the first episode only.
     first_episode = torch.cat((torch.ones_like(done[:, :1]), (~done[:, :-1]).cumprod(1).bool()), dim=1)

@@ -59,16 +59,50 @@ class ScheduledOptimizer:
         if the gradient is not finite.
         """
         norm = clip_gradients(self._parameters, self.max_norm, f"step {step}")
-        factor = None if self.schedule is None else self.schedule(step, fraction)
-        for optimizer, rates in zip(self.optimizers, self._peak_rates, strict=True):
-            if factor is not None:
-                for group, rate in zip(optimizer.param_groups, rates, strict=True):
-                    group["lr"] = rate * factor
+        self.set_rates(step, fraction)
+        for optimizer in self.optimizers:
             optimizer.step()
         return norm
 
+    def set_rates(self, step: int, fraction: float) -> None:
+        """Set the learning rates of the schedule, in place where they are tensors."""
+        if self.schedule is None:
+            return
+        factor = self.schedule(step, fraction)
+        for optimizer, rates in zip(self.optimizers, self._peak_rates, strict=True):
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                if isinstance(group["lr"], torch.Tensor):
+                    group["lr"].fill_(rate * factor)
+                else:
+                    group["lr"] = rate * factor
+
+    @property
+    def parameters(self) -> list[torch.Tensor]:
+        """All that is trained."""
+        return self._parameters
+
+    def make_recordable(self) -> bool:
+        """Keep learning rates and step counts on the GPU, so that a CUDA graph can hold an update.
+
+        Return False, and change nothing, if some optimiser cannot.
+        """
+        if not all(isinstance(each, (Muon, torch.optim.Adam)) for each in self.optimizers):
+            return False
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = torch.as_tensor(group["lr"], dtype=torch.float32, device=group["params"][0].device)
+                if isinstance(optimizer, torch.optim.Adam):
+                    group["capturable"] = True
+        return True
+
     def state_dict(self) -> dict:
-        return {str(index): optimizer.state_dict() for index, optimizer in enumerate(self.optimizers)}
+        state = {str(index): optimizer.state_dict() for index, optimizer in enumerate(self.optimizers)}
+        for each in state.values():  # as numbers, which any device reads
+            for group in each["param_groups"]:
+                group["lr"] = float(group["lr"])
+                if "capturable" in group:
+                    group["capturable"] = False
+        return state
 
     def load_state_dict(self, state: dict) -> None:
         for index, optimizer in enumerate(self.optimizers):
@@ -80,13 +114,14 @@ def clip_gradients(parameters: Iterable[torch.Tensor], max_norm: float, when: st
     parameters = list(parameters)
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = nn.utils.get_total_norm(gradients)
-    if not norm.isfinite():
+    if not math.isfinite(size := float(norm)):  # the one wait for a device
         # Squares overflow float32 from 1.8e19 on, where the gradient itself may be finite.
         norm = nn.utils.get_total_norm([gradient.double() for gradient in gradients])
-    if not norm.isfinite():
+        size = float(norm)
+    if not math.isfinite(size):
         raise FloatingPointError(f"The gradient is not finite at {when}; lower the learning rate.")
     nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
-    return float(norm)
+    return size
 
 
 def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | None = None) -> ScheduledOptimizer:

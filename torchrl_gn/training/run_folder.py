@@ -10,12 +10,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, ClassVar
 
-from torchrl_gn.atomic import atomic_path, write_json
+from filelock import FileLock, Timeout
+
+from torchrl_gn.atomic import atomic_path, remove_leftovers, write_json
 from torchrl_gn.processor import instruction_sets, processor_name, restrictions
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.json"
+LOCK_FILE = ".lock"  # held by the process that runs there
 _RECIPE = "# A run of "  # the first line of CONFIG_FILE, with the recipe's name
 
 
@@ -35,10 +38,13 @@ def _plain(value: Any) -> Any:
 class RunFolder:
     """Folder with a run's configuration, metrics, checkpoint, figures and videos; an existing one is resumed.
 
-    Default: ``runs/<name>/<time>``. A ValueError if it holds a run of another recipe.
+    Default: ``runs/<name>/<time>``. No other process gets it until this one ends or calls :meth:`release`. A ValueError
+    if it holds a run of another recipe, or another process is there. Removes the temporary files of processes that
+    were killed while they wrote to it.
     """
 
     _latest: ClassVar[RunFolder | None] = None
+    _locks: ClassVar[dict[Path, FileLock]] = {}  # of this process
 
     def __init__(self, path: str | os.PathLike | None, name: str) -> None:
         self.path = Path(path) if path else _new_folder(Path("runs") / name)
@@ -49,6 +55,10 @@ class RunFolder:
         if first.startswith(_RECIPE) and (other := first.removeprefix(_RECIPE)) != name:
             raise ValueError(f"run_dir={self.path} holds a run of {other}, not of {name}. Name a new run_dir.")
         self.path.mkdir(parents=True, exist_ok=True)
+        if (here := self.path.resolve()) not in self._locks and (lock := lock_folder(here)) is not None:
+            self._locks[here] = lock
+        if first.startswith(_RECIPE):  # not in any folder that a user names
+            remove_leftovers(self.path)
         self._start = time.perf_counter()
         self._written: list[Path] = []
         RunFolder._latest = self
@@ -58,10 +68,16 @@ class RunFolder:
         RunFolder._latest = self  # for the processes that share the folder of rank 0
 
     @classmethod
+    def release(cls) -> None:
+        """Leave this process's folders to others."""
+        while cls._locks:
+            cls._locks.popitem()[1].release(force=True)
+
+    @classmethod
     def what_is_kept(cls) -> str:
         """Say what an interrupted run leaves in this process's latest folder, and how to resume."""
         run = cls._latest
-        if run is None or not any(path.name != CONFIG_FILE for path in run.path.glob("*")):
+        if run is None or not any(path.name not in (CONFIG_FILE, LOCK_FILE) for path in run.path.glob("*")):
             return "nothing was kept."
         return f"progress is saved in {run.path}; resume with run_dir={run.path}."
 
@@ -102,7 +118,8 @@ class RunFolder:
             )
 
     def write_config(self, text: str) -> None:
-        """Write ``config.yaml``: the recipe's name, then ``text``."""
+        """Write ``config.yaml``: the recipe's name, then ``text``. Metrics of before go, as the run goes on."""
+        (self.path / METRICS_FILE).unlink(missing_ok=True)
         with atomic_path(self.file(CONFIG_FILE)) as temporary:
             temporary.write_text(f"{_RECIPE}{self.name}\n{text}")
 
@@ -117,6 +134,23 @@ class RunFolder:
         }
         write_json(self.file(METRICS_FILE), everything)
         return everything
+
+
+def lock_folder(path: Path, *, seconds: float = 0.0) -> FileLock | None:
+    """Lock a run folder for this process, and wait up to ``seconds`` for it; the lock dies with the process.
+
+    None on a file system without locks. ValueError if another process has it.
+    """
+    lock = FileLock(path / LOCK_FILE)
+    try:
+        lock.acquire(timeout=seconds)
+    except Timeout:
+        raise ValueError(
+            f"run_dir={path} is in use by another process; wait for its end, or name a new run_dir."
+        ) from None
+    except NotImplementedError:
+        return None
+    return lock
 
 
 def _new_folder(parent: Path) -> Path:

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
 import torch
 from torch import nn
 from torchrl.data import ReplayBuffer
 
+from torchrl_gn.dynamics.executors.native.preparation import around_preparation
+from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss, SeveralScenesLoss
 from torchrl_gn.processor import threads_for_native
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.optimizers import ScheduledOptimizer
+from torchrl_gn.training.recorded_update import RecordedUpdates
 from torchrl_gn.training.workers import Workers
 
 
@@ -36,6 +39,7 @@ class Trainer:
 
     With several ``workers``, each process trains on its shard of every batch; gradients are averaged, and the clock,
     validation and checkpoint of rank 0 count. The result equals that of one process up to rounding and input noise.
+    The time that steps take to be prepared for C++, once a process, is no part of the budget.
 
     Args:
         optimizer: from ``make_optimizer``, or any of ``torch.optim`` (no schedule, no clipping).
@@ -72,9 +76,10 @@ class Trainer:
         self.workers = workers or Workers()
         self.model = loss.trained
         self.device = next(self.model.parameters()).device
-        self.step, self.seconds = 0, 0.0
+        self.step, self.seconds, self._paused = 0, 0.0, 0.0
         self.best, self.since_best, self.validated = math.inf, 0, 0
         self.best_weights: dict[str, torch.Tensor] = {}
+        self._recorded: RecordedUpdates | None = None
         # Seconds by part of a step.
         self.spent = {"sampling": 0.0, "model": 0.0, "optimizer": 0.0, "validation": 0.0, "caller": 0.0}
 
@@ -92,34 +97,43 @@ class Trainer:
     def run(self) -> Iterator[Progress]:
         """Train until the budget is spent, yielding after every step.
 
-        FloatingPointError, and no change, if the loss or the gradient is not finite.
+        FloatingPointError, and no change, if the loss or the gradient is not finite. Ctrl-C and SIGTERM wait until a
+        step and its validation are whole, so that :meth:`state_dict` resumes exactly after them, too.
         """
         module, fraction = self.workers.wrap(self.loss), self.workers.agree(lambda: self.fraction)
-        native = getattr(self.loss, "reason", "no forward model") is None
+        with let_in_at_once():  # it may take minutes
+            native = getattr(self.loss, "reason", "no forward model") is None
+        if self._recorded is None and self.workers.size == 1:
+            self._recorded = RecordedUpdates.of(self.loss, self.optimizer, self.device)
         while fraction < 1 and (self.patience is None or self.since_best < self.patience):
-            with fast_matmul(), threads_for_native() if native else nullcontext():
-                loss = self._update(module, fraction)
-            fraction = self.workers.agree(lambda: self.fraction)
-            validation = self._validation(fraction)
-            start = self.budget.now()
+            with held(), around_preparation(self._pause):
+                with fast_matmul(), threads_for_native() if native else nullcontext():
+                    loss = self._update(module, fraction)
+                fraction = self.workers.agree(lambda: self.fraction)
+                validation = self._validation(fraction)
+            start = self._now()
             yield Progress(self.step, self.seconds, fraction, loss, validation)
             self._lap("caller", start)
 
     @without_autocast
     def _update(self, module: nn.Module, fraction: float) -> float:
-        clock = self.budget.now()
+        clock = self._now()
         buffer = self.buffer
         if self.unroll is not None and fraction >= 1 - self.unroll_fraction - 1e-9:  # tolerates rounding
             buffer = self.unroll
         batch = buffer.sample().to(self.device)
         clock = self._lap("sampling", clock)
+        if self._recorded is not None and (value := self._recorded(batch, self.step, fraction)) is not None:
+            self._lap("model", clock)
+            self.step += 1
+            return value
         loss = module(batch)["loss_forward_model"]
-        # Averaged over processes, so that all raise if one does.
+        self.optimizer.zero_grad()
+        loss.backward()
+        # Averaged over processes, so that all raise if one does; read last, as it waits for a device.
         mean = self.workers.mean(loss.item())
         if not math.isfinite(mean):
             raise FloatingPointError(f"The loss is {mean} at step {self.step}; lower the learning rate.")
-        self.optimizer.zero_grad()
-        loss.backward()
         clock = self._lap("model", clock)
         self.optimizer.step(self.step, fraction)
         self._lap("optimizer", clock)
@@ -131,7 +145,7 @@ class Trainer:
         due = math.floor(fraction * self.validations)
         if self.validate is None or due <= self.validated:
             return None
-        start = self.budget.now()
+        start = self._now()
         with fast_matmul():
             error = self.workers.agree(self.validate)
         self.validated = due
@@ -142,8 +156,18 @@ class Trainer:
         self._lap("validation", start)
         return error
 
+    @contextmanager
+    def _pause(self) -> Iterator[None]:
+        """Stop the training's clock."""
+        start = self.budget.now()
+        yield
+        self._paused += self.budget.now() - start
+
+    def _now(self) -> float:
+        return self.budget.now() - self._paused
+
     def _lap(self, part: str, since: float) -> float:
-        now = self.budget.now()
+        now = self._now()
         self.spent[part] += now - since
         self.seconds += now - since
         return now

@@ -54,6 +54,10 @@ class Workers:
         dist.all_reduce(shared)
         return float(shared) / self.size
 
+    def any(self, mine: bool) -> bool:
+        """Whether it holds for any process."""
+        return self.mean(float(mine)) > 0
+
     def device(self, name: str) -> torch.device:
         """Return this process's device: ``"cuda"`` means one GPU per process. ValueError if there is no such device."""
         try:

@@ -159,6 +159,38 @@ def test_a_flat_hdf5_file(arrays, tmp_path):
         load_robot_log(tmp_path / "log.h5")
 
 
+def test_links_of_hdf5_files_read_no_other_file(arrays, tmp_path):
+    """And go round once."""
+    h5py = pytest.importorskip("h5py")
+    rows, secret = len(arrays["angle"]), tmp_path / "secret.h5"
+    (tmp_path / "secret").write_bytes(bytes(8 * rows))
+    with h5py.File(secret, "w") as file:
+        file["q"], file["demo_1/actions"] = np.zeros(rows), np.zeros((3, 1))
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["angle"], file["velocity"], file["command"] = arrays["angle"], arrays["velocity"], arrays["command"]
+        file["length"], file["timestep"] = LENGTH, STEP
+        file["a/linked"], file["a/dead"] = h5py.ExternalLink(str(secret), "q"), h5py.SoftLink("/nothing")
+        file["a/through"] = h5py.SoftLink("/a/linked")
+        file.create_dataset("a/raw", (rows,), "f8", external=[(str(tmp_path / "secret"), 0, 8 * rows)])
+        layout = h5py.VirtualLayout((rows,), "f8")
+        layout[:] = h5py.VirtualSource(str(secret), "q", (rows,))
+        file["a"].create_virtual_dataset("virtual", layout)
+        group = file["a"]
+        group["self"] = group
+        for _ in range(40):  # 2**40 ways down
+            deeper = group.create_group("one")
+            group["two"] = group = deeper
+    log = load_robot_log(tmp_path / "log.h5")
+    assert_same(log, {name: arrays[name] for name in arrays if name != "episode"})
+    named = {f"a/{name}" for name in ("linked", "dead", "through", "raw", "virtual", "self")}
+    assert named <= log.unread.keys() and len(log.unread) == len(named) + 40
+    assert set(log.unread.values()) == {"in another file, or the same as another group"}
+    with h5py.File(tmp_path / "demo.h5", "w") as file:
+        file["data/demo_1"] = h5py.ExternalLink(str(secret), "demo_1")
+    with pytest.raises(DatasetError, match=r"\['demo_1'\] of its data lie in another file"):
+        load_robot_log(tmp_path / "demo.h5")
+
+
 @pytest.mark.parametrize(("suffix", "package"), [(".parquet", "pyarrow"), (".h5", "h5py")])
 def test_a_missing_package_is_named(suffix, package, tmp_path, monkeypatch):
     def missing(name: str):

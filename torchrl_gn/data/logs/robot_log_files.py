@@ -12,6 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from torchrl_gn.data.dataset_files import DatasetError
+from torchrl_gn.data.logs.log_checks import check_robot_log
 from torchrl_gn.data.logs.robot_log import RobotLog, short_way
 from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, Source, read_log_arrays
 
@@ -45,7 +46,9 @@ def load_robot_log(
         degrees: the file has degrees and degrees/s.
 
     Raises:
-        DatasetError: if the file is missing, incomplete, or contradicts itself or ``timestep``.
+        DatasetError: if the file is missing, incomplete, or contradicts itself or ``timestep``: a name of several
+            columns, rows out of order, velocities of another sign or unit than the changes of the angles.
+            LogContentWarning where numbers are only unlikely.
         ImportError: if the format needs a package that is not installed.
     """
     path = Path(path)
@@ -55,11 +58,13 @@ def load_robot_log(
         raise DatasetError(f"{path}: a robot log is a {', '.join(READERS)} file, or a LeRobot dataset folder.")
     try:
         found = read_log_arrays(path)
-        log = _log(found, {**found.names, **(names or {})}, timestep)
+        given = {**found.names, **(names or {})}
+        log = _log(found, given, timestep)
+        if degrees:
+            log = replace(log, angle=np.deg2rad(log.angle), velocity=np.deg2rad(log.velocity))
+        check_robot_log(log, degrees=degrees, measured=given.get("velocity") != "")
     except (ValueError, OSError, KeyError, EOFError, BadZipFile) as error:
         raise DatasetError(f"{path} cannot be read as a robot log: {error}") from error
-    if degrees:
-        return replace(log, angle=np.deg2rad(log.angle), velocity=np.deg2rad(log.velocity))
     return log
 
 

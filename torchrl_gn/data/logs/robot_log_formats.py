@@ -36,16 +36,26 @@ def read_log_arrays(path: Path) -> LogArrays:
 
 
 def _read_npz(path: Path) -> LogArrays:
-    return LogArrays(dict(np.load(path, allow_pickle=False)))
+    with np.load(path, allow_pickle=False) as file:
+        _refuse_twice(file.files)
+        return LogArrays(dict(file))
 
 
 def _read_csv(path: Path) -> LogArrays:
     with path.open() as file:
         header = [name.strip() for name in file.readline().split(",")]
+    _refuse_twice(header)
     table = np.atleast_2d(np.loadtxt(path, delimiter=",", skiprows=1, dtype=np.float64))
     if table.shape[1] != len(header):
         raise ValueError(f"{len(header)} names for {table.shape[1]} columns")
     return LogArrays(_grouped(dict(zip(header, table.T, strict=True))))
+
+
+def _refuse_twice(names: Sequence[str]) -> None:
+    """Raise ValueError for a name of several columns."""
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        where = [index for index, name in enumerate(names) if name == twice[0]]
+        raise ValueError(f"columns {where} are all named {twice[0]!r}; give each a name of its own")
 
 
 def _read_parquet(path: Path) -> LogArrays:
@@ -80,6 +90,8 @@ def _read_hdf5(path: Path) -> LogArrays:
     with h5py.File(path, "r") as file:
         data = file.get("data")
         demos = sorted(filter(_DEMO.fullmatch, data), key=_demo_number) if isinstance(data, h5py.Group) else []
+        if elsewhere := [demo for demo in demos if not _is_in(data.get(demo), file)]:
+            raise ValueError(f"{elsewhere} of its data lie in another file")
         if not demos:
             arrays, unread = _hdf5_arrays(file, h5py)
             arrays |= {name: np.asarray(value) for name, value in file.attrs.items() if np.isreal(value).all()}
@@ -125,6 +137,10 @@ def _grouped(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         base, number = re.fullmatch(r"(.*?)(\d*)", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
         single = values.ndim == 1 and np.issubdtype(values.dtype, np.number)
         groups.setdefault(base if single else name, []).append((int(number or 0) if single else 0, values))
+    for base, group in groups.items():
+        numbers = [number for number, _ in group]
+        if len(set(numbers)) < len(numbers):
+            raise ValueError(f"several columns are {base!r} with the number {max(numbers, key=numbers.count)}")
     ordered = {
         base: [values for _, values in sorted(group, key=lambda entry: entry[0])] for base, group in groups.items()
     }
@@ -138,6 +154,7 @@ def _parquet_columns(files: Sequence[Path]) -> tuple[dict[str, np.ndarray], dict
     """Columns ``[R]``, or ``[R, k]`` of lists of equal length, and why others are not read."""
     pq = _optional("pyarrow.parquet", files[0])
     schema = pq.read_schema(files[0])
+    _refuse_twice(schema.names)
     flat = {entry.name for entry in schema if not _nested(entry.type)}
     unread = {name: "neither numbers nor text, nor lists of them" for name in schema.names if name not in flat}
     wanted = [name for name in schema.names if name in flat]
@@ -172,20 +189,32 @@ def _column(values: Any) -> np.ndarray:
 def _hdf5_arrays(group: Any, h5py: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Numeric datasets of up to two dimensions below a group, by path, and why others are not read."""
     arrays, unread = {}, {}
-    for name, values in _datasets(group, h5py):
-        if values.ndim > 2:
+    for name, values in _datasets(group, h5py, "", {group}):
+        if values is None:
+            unread[name] = "in another file, or the same as another group"
+        elif values.ndim > 2:
             unread[name] = f"of shape {list(values.shape)}"
         else:
             arrays[name] = values.asstr()[()] if h5py.check_string_dtype(values.dtype) else np.asarray(values[()])
     return arrays, unread
 
 
-def _datasets(group: Any, h5py: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, entry in group.items():
-        if isinstance(entry, h5py.Group):
-            yield from _datasets(entry, h5py, f"{prefix}{name}/")
+def _datasets(group: Any, h5py: Any, prefix: str, seen: set[Any]) -> Iterator[tuple[str, Any]]:
+    """Datasets below a group, by path; None for those elsewhere, and for groups ``seen`` before: links may go round."""
+    for name in group:
+        entry, path = group.get(name), f"{prefix}{name}"
+        if not _is_in(entry, group) or entry in seen:
+            yield path, None
+        elif isinstance(entry, h5py.Group):
+            seen.add(entry)
+            yield from _datasets(entry, h5py, f"{path}/", seen)
         elif isinstance(entry, h5py.Dataset):
-            yield f"{prefix}{name}", entry
+            yield path, None if entry.external or entry.is_virtual else entry
+
+
+def _is_in(entry: Any, group: Any) -> bool:
+    """Whether a link of a group leads to its own file."""
+    return entry is not None and entry.file.filename == group.file.filename
 
 
 def _demo_number(name: str) -> int:

@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 from torchrl_gn.dynamics.constraints.maximal_coordinates import MaximalProjection
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.scenes.invariance import locked_dofs
 from torchrl_gn.scenes.physical_parameters import joint_axes
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 def make_projection(scene: Scene) -> MaximalProjection:
     """The projection of a scene: in generalised coordinates where they are fewer than its bodies' rotation rates."""
-    fewer = len(_dofs(scene)) < np.count_nonzero(scene.movable[:, 9:])
+    fewer = len(_dofs(scene)) < np.count_nonzero(scene.movable[:, 9:12])
     return GeneralizedProjection(scene) if fewer else MaximalProjection(scene)
 
 
@@ -149,16 +150,17 @@ class GeneralizedProjection(MaximalProjection):
 
 def _dofs(scene: Scene) -> list[tuple[int, int, int, np.ndarray, int]]:
     """Degrees of freedom: node, node that fixes the axis, edge or -1, else an axis in the world, index of the hinge."""
-    model, joints = scene.model, scene.joint_anchors
+    model, joints, locked = scene.model, scene.joint_anchors, locked_dofs(scene.model)
     frames, _ = joint_axes(scene)
     dofs: list[tuple[int, int, int, np.ndarray, int]] = []
     for node in range(scene.num_nodes):
-        free = scene.movable[node, 9:].nonzero()[0]
+        free = scene.movable[node, 9:12].nonzero()[0]
         if joints.parent[node] != node:
             body = int(scene.body[node])
             own = model.body_jntadr[body] + np.arange(model.body_jntnum[body])
             if (model.jnt_type[own] == int(mujoco.mjtJoint.mjJNT_HINGE)).all() and len(own) <= 2:
-                dofs += [(node, int(frames[j]), 2 * int(j), np.zeros(3), stage) for stage, j in enumerate(own)]
+                turning = [(stage, int(j)) for stage, j in enumerate(own) if not locked[model.jnt_dofadr[j]]]
+                dofs += [(node, int(frames[j]), 2 * j, np.zeros(3), stage) for stage, j in turning]
                 continue
             free = np.arange(3)  # a ball, or more hinges than can be told apart
         dofs += [(node, 0, -1, np.eye(3)[axis], 0) for axis in free]

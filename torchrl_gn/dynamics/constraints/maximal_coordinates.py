@@ -48,7 +48,7 @@ class MaximalProjection(Float64Buffers):
         root_moves = scene.movable[joints.root, :3]
         # Where a joined group as a whole is: the mean of its bodies' predictions, or its root where that cannot move.
         whole = np.where(root_moves[:, None, :], mean[:, :, None], root[:, :, None])  # [N, N, 3]
-        rotates = scene.movable[:, 9:].ravel()
+        rotates = scene.movable[:, 9:12].ravel()
         values = {
             "parent": joints.parent,
             # These two act on all coordinates of all bodies in a row, [3 N].
@@ -56,7 +56,7 @@ class MaximalProjection(Float64Buffers):
             "relative": np.eye(3 * count) - _each_coordinate(whole),
             "rotating": rotates.nonzero()[0],
             "scatter": np.eye(3 * count)[:, rotates],
-            "movable": scene.movable,
+            "movable": scene.movable[:, : BODY_STATE.delta_size],
         }
         self.constants(values)
         # Keep the non-zero rows and columns: planar scenes need under half.

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_gn.cache import keep_inductor_private
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.networks.core import UnfoldedCore
@@ -135,12 +136,19 @@ class _Differentiable(torch.autograd.Function):
 def _compile(function: Callable) -> Callable:
     # Small linear systems are solved through Python's fallback, of which the compiler warns.
     logging.getLogger("torch._inductor.ir").addFilter(_is_worth_showing)
+    keep_inductor_private()
     options: dict[str, Any] = {"guard_filter_fn": _input_guards}
     if not torch.cuda.is_available():
         # The kernels of a small graph take less time than calling them from Python.
         options["cpp_wrapper"] = True
-    limits: dict[str, Any] = {"recompile_limit": 1000, "isolate_recompiles": True}  # type checkers know no overload
-    return torch.compile(function, fullgraph=True, dynamic=False, options=options, **limits)
+    return torch.compile(function, fullgraph=True, dynamic=False, options=options, **recompile_limits())
+
+
+def recompile_limits() -> dict[str, Any]:
+    """Options of ``torch.compile`` for a function of its own with many shapes; none with a torch before 2.13."""
+    known = inspect.signature(torch.compile).parameters
+    wanted = {"recompile_limit": 1000, "isolate_recompiles": True}
+    return {name: value for name, value in wanted.items() if name in known}
 
 
 def _input_guards(guards: Sequence[Any]) -> list[bool]:

@@ -10,6 +10,7 @@ from torchrl_gn.dynamics.features.canonical_state import CanonicalState
 from torchrl_gn.dynamics.features.feature import StepInputs
 from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.networks.graph import Graph, graph_concat
 
 
@@ -45,6 +46,9 @@ class EagerExecutor:
 def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> CanonicalState:
     """Canonical state of ``[*B, N, 13]``, with the change that the program's physics predict in its frame."""
     canonical = program.canonicalizer(state, program.parameters)
+    if program.activations is not None:
+        present = action[..., : program.controls.present]
+        canonical = canonical._replace(activations=program.activations(state, program.controls.clipped(present)))
     if program.physics is None:
         return canonical
     after = program.physics(state, action[..., : program.controls.present])
@@ -59,7 +63,8 @@ def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> Cano
 
 def features(program: StepProgram, canonical: CanonicalState, action: Tensor) -> tuple[Tensor, Tensor]:
     """Dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised."""
-    inputs = StepInputs(canonical, program.controls(action), program.parameters)
+    controls, action = program.controls, program.controls.clipped(action)
+    inputs = StepInputs(canonical, controls.at_edges(action), program.parameters, action[..., : controls.present])
     nodes = [feature(inputs) for feature in program.node_features]
     edges = [_of_all_edges(feature(inputs), program.edge_index.shape[1]) for feature in program.edge_features]
     nodes, edges = (torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0] for parts in (nodes, edges))
@@ -95,7 +100,7 @@ def delta(
 
 
 def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predicted: Tensor) -> Tensor:
-    """Change ``[*B, N, 12]`` of a state from the network's output ``[*B, N, F_out]``."""
+    """Change ``[*B, N, 12 + K]`` of a state from the network's output ``[*B, N, F_out]``."""
     residual = program.output(predicted, state.dtype)
     if canonical.change is not None:
         residual = canonical.change + residual
@@ -103,14 +108,17 @@ def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predi
         residual = program.layout.rotate_delta(residual, *canonical.rotation)
     if program.timestep is not None:
         residual = program.layout.integrate(state, residual, program.timestep)
-    change = residual * program.movable
+    change = predicted = residual * program.movable
     if program.projection is not None:
         # Without a rotation the canonical state's matrices are the world's.
         matrices = canonical.matrices if canonical.rotation is None else program.canonicalizer.matrices(state)
         assert matrices is not None
         assert program.position_weight is not None
         change = program.projection(state, matrices, change, program.position_weight, program.parameters)
-    return change
+    if canonical.activations is None:
+        return change
+    activations = predicted[..., BODY_STATE.delta_size :] + canonical.activations.change
+    return torch.cat((change[..., : BODY_STATE.delta_size], activations), dim=-1)
 
 
 def step(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -13,10 +14,14 @@ from torch.nn.functional import pad
 from torchrl_gn.dynamics.features.controls import controls_per_edge, require_slots
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.dynamics.joint_moments import LinesAtJoints
+from torchrl_gn.dynamics.lines import Lines
+from torchrl_gn.dynamics.muscle_forces import MuscleForces
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
-from torchrl_gn.scenes.force_elements import FAR, actuator_laws, winding_joints
+from torchrl_gn.scenes.activations import muscle_actuators
+from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators, winding_joints
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
@@ -29,7 +34,9 @@ _SIZE = 4
 class Actuators(Feature):
     """Force of each actuator by its law in MuJoCo, and a servo's error.
 
-    A stiff servo's force depends on angles finer than a network resolves. Paper: it sees the control alone.
+    A stiff servo's force depends on angles finer than a network resolves. A spatial tendon's or slider-crank's acts at
+    each joint that it moves, times its moment arm there, so that all act as motors of joints do. Paper: it sees the
+    control alone.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
@@ -38,12 +45,14 @@ class Actuators(Feature):
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has actuators whose force is not proportional to the control."""
+        """Whether a scene has actuators whose force at their edges is not proportional to the control."""
         if not isinstance(scene, Scene):
             return False
         laws = actuator_laws(scene)
         limits = np.abs(laws[..., 6:8])
-        return bool((laws[..., 1:6] != 0).any() or ((limits > 0) & (limits < FAR)).any())
+        pulling = set(line_actuators(scene)) - set(site_actuators(scene.model))  # their arms vary
+        contracts = laws[np.isin(scene.edge_action, np.flatnonzero(muscle_actuators(scene.model))), 8].any()
+        return bool(pulling or contracts or (laws[..., 1:6] != 0).any() or ((limits > 0) & (limits < FAR)).any())
 
     def resolved(self, scene: Scene) -> Actuators:
         return replace(self, per_joint=controls_per_edge(scene))
@@ -64,6 +73,12 @@ class _Bound(Float64Buffers):
     winds: Tensor
     holds: Tensor
     is_servo: Tensor
+    line: Tensor
+    moment: Tensor
+    no_line: Tensor
+    activated: Tensor
+    activation: Tensor
+    is_muscle: Tensor
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
@@ -85,14 +100,56 @@ class _Bound(Float64Buffers):
         laws = actuator_laws(scene)[::2]
         holds, acts = laws[..., 4] != 0, laws[..., 8] != 0  # a position; at all
         winds &= holds & acts & (sums.sum(1) == 1).reshape(action.shape)
+        self.lines = self._lines(scene, action)
+        muscles = np.isin(action, np.flatnonzero(muscle_actuators(model)))
+        self.muscles = MuscleForces(model, np.where(muscles, action, -1)) if muscles.any() else None
+        driven = np.where(action >= 0, np.append(model.actuator_actadr + model.actuator_actnum - 1, -1)[action], -1)
+        driven[np.append(model.actuator_actadr, -1)[action] < 0] = -1
+        self.any_driven = bool((driven >= 0).any())
+        driving = {"activated": driven >= 0, "activation": np.where(driven >= 0, driven, model.na)}
+        self.constants({**driving, "is_muscle": muscles})
         self.any_winds = bool(winds.any())
         self.constants({"winds": winds, "holds": holds, "is_servo": acts & (holds | (laws[..., 5] != 0))})
 
-    def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, E, 4 C]``; 0 of an actuator whose force does not follow from joint coordinates.
+    def _lines(self, scene: Scene, action: np.ndarray) -> LinesAtJoints | None:
+        """Register in which slots are which lines; None without lines."""
+        lines = line_actuators(scene)
+        if not lines:
+            return None
+        model, sites = scene.model, site_actuators(scene.model)
+        pulled = [each for each in lines if model.actuator_trntype[each] == int(mujoco.mjtTrn.mjTRN_TENDON)]
+        order = [*pulled, *(each for each in lines if each not in pulled)]
+        slots = [
+            (order.index(each), joint) for joint, row in enumerate(action.tolist()) for each in row if each in order
+        ]
+        at_joints = [(line, joint) for line, joint in slots if order[line] not in sites]
+        # Behind the lines stands a length of 0, behind the moments at joints the 1 of sites.
+        line, moment = (np.full(action.shape, count) for count in (len(order), len(at_joints)))
+        for (joint, slot), actuator in np.ndenumerate(action):
+            if actuator in order:
+                line[joint, slot] = order.index(actuator)
+                if actuator not in sites:
+                    moment[joint, slot] = at_joints.index((order.index(actuator), joint))
+        self.constants({"line": line, "moment": moment, "no_line": torch.as_tensor(line == len(order))})
+        tendons = model.actuator_trnid[pulled, 0].tolist()
+        return LinesAtJoints(scene, Lines(scene, tendons, order[len(pulled) :]), at_joints)
 
-        Of each actuator at an edge: its force or torque there, now and a step on (N or N m), and a servo's error,
-        clipped to 0.05 and to 0.005 of its joint's unit and scaled to 1.
+    def _drives(self, inputs: StepInputs) -> tuple[Tensor, Tensor]:
+        """What drives each actuator ``[*B, P, C]``, its control or activation: now, and a step on."""
+        control, step = inputs.controls[..., ::2, :], inputs.canonical.activations
+        if step is None or not self.any_driven:
+            return control, control
+        now, later = (
+            torch.where(self.activated, pad(each, (0, 1))[..., self.activation], control)
+            for each in (step.now, step.later)
+        )
+        return now, later
+
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """Features ``[*B, E, 4 C]``; 0 of an actuator whose force does not follow from body states.
+
+        Of each actuator at an edge: its force or torque there, now and a step on (N or N m; at balls, free joints and
+        sites that along its line), and a servo's error, clipped to 0.05 and to 0.005 of its unit and scaled to 1.
         """
         state, matrices = inputs.canonical[:2]
         assert matrices is not None
@@ -101,23 +158,33 @@ class _Bound(Float64Buffers):
         found = self.coordinates.joints(state, matrices, inputs.parameters.joint_pose, joint)
         missing = self.pairs - self.joints
         gain, bias, gear = law[..., :3], law[..., 3:6], law[..., 8]
-        control, sums = inputs.controls[..., ::2, :], self.sums.to(state.dtype)
+        drives, sums = self._drives(inputs), self.sums.to(state.dtype)
         coordinate, rate = (pad(each, (0, missing)).unsqueeze(-1) for each in (found.coordinate, found.rate))
         if self.any_winds:
             slope = bias[..., 1] * gear
-            away = (gain[..., 0] * control + bias[..., 0]) / torch.where(self.winds, -slope, 1.0) - coordinate
+            away = (gain[..., 0] * drives[0] + bias[..., 0]) / torch.where(self.winds, -slope, 1.0) - coordinate
             nearest = coordinate + away - torch.atan2(away.sin(), away.cos())
             coordinate = torch.where(self.winds, nearest, coordinate)
-        length, velocity = (((each * gear).flatten(-2) @ sums).view(control.shape) for each in (coordinate, rate))
+        length, velocity = (((each * gear).flatten(-2) @ sums).view(drives[0].shape) for each in (coordinate, rate))
+        arm = gear
+        if self.lines is not None:
+            pulls = self.lines(state, matrices, found)
+            here, rate = (gear * pad(each, (0, 1))[..., self.line] for each in (pulls.length, pulls.velocity))
+            length, velocity = torch.where(self.no_line, length, here), torch.where(self.no_line, velocity, rate)
+            arm = gear * torch.where(self.no_line, 1.0, pad(pulls.moment, (0, 1), value=1.0)[..., self.moment])
         low, high = self.bound_low.to(state.dtype), self.bound_high.to(state.dtype)
         forces, free = [], []
-        for at in (length, length + self.timestep * velocity):
+        for at, drive in zip((length, length + self.timestep * velocity), drives, strict=True):
             scale = gain[..., 0] + gain[..., 1] * at + gain[..., 2] * velocity
-            force = scale * control + bias[..., 0] + bias[..., 1] * at + bias[..., 2] * velocity
+            if self.muscles is not None:
+                scale = torch.where(self.is_muscle, self.muscles.gain(at, velocity), scale)
+            force = scale * drive + bias[..., 0] + bias[..., 1] * at + bias[..., 2] * velocity
+            if self.muscles is not None:
+                force = torch.where(self.is_muscle, force + self.muscles.bias(at), force)
             free.append(force)
             clipped = torch.minimum(torch.maximum(force, law[..., 6]), law[..., 7])
-            forces.append((gear * clipped).clamp(low, high))
-        # How far the joint, or its rate, is from where the servo exerts nothing.
+            forces.append((arm * clipped).clamp(low, high))
+        # How far the joint or tendon, or its rate, is from where the servo exerts nothing.
         unit = (torch.where(self.holds, bias[..., 1], bias[..., 2]) * gear).abs()
         error = torch.where(self.is_servo, free[0] / torch.where(self.is_servo, unit, 1.0), 0.0)
         parts = [*forces, *((error / near).clamp(-1, 1) for near in _NEAR)]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BodyState(Feature):
-    """Encoded canonical state of each body."""
+    """Encoded canonical state of each body, without the activations that it holds for actuators."""
 
     part: ClassVar[Literal["nodes", "edges"]] = "nodes"
 
@@ -32,7 +32,7 @@ class BodyState(Feature):
             raise ValueError(f"encoding={self.encoding!r} is not known; use one of {list(get_args(Encoding))}.")
 
     def size(self, layout: StateLayout) -> int:
-        return layout.encoded_size(self.encoding)
+        return layout.spatial.encoded_size(self.encoding)
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         return _Bound(self, scene, layout, canonicalizer)
@@ -45,7 +45,7 @@ class _Bound(Float64Buffers):
         self, options: BodyState, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer
     ) -> None:
         super().__init__()
-        self.layout = layout
+        self.layout, self.channels = layout.spatial, layout.spatial.size
         self.encoding: Encoding = options.encoding
         invariant = torch.as_tensor(scene.translation_invariant)
         # In a scene that rotates about an axis, both others must be invariant to be hidden at every yaw.
@@ -53,11 +53,12 @@ class _Bound(Float64Buffers):
         across = invariant if yaw is None else torch.arange(3) != yaw.axis
         self.hides = bool(not options.positions and invariant.any() and invariant[across].all())
         if self.hides:
-            visible = torch.ones(scene.num_nodes, layout.size)
+            visible = torch.ones(scene.num_nodes, self.channels)
             visible[:, layout.slices["position"]] -= canonicalizer.shifted
             self.constants({"visible": visible})
 
     def forward(self, inputs: StepInputs) -> Tensor:
         state, matrices = inputs.canonical[:2]
+        state = state[..., : self.channels]
         shown = state * self.visible.to(state.dtype) if self.hides else state
         return self.layout.encode(shown, self.encoding, matrices)

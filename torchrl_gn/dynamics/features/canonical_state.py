@@ -15,6 +15,7 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
 
 if TYPE_CHECKING:
+    from torchrl_gn.dynamics.activation_laws import ActivationStep
     from torchrl_gn.scenes import Scene
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
@@ -37,6 +38,7 @@ class CanonicalState(NamedTuple):
     matrices: Tensor | None  # [*B, N, 3, 3] of its orientations; None if the state has none
     rotation: FrameRotation | None  # from the yaw frame to the world; None without a yaw frame
     change: Tensor | None = None  # [*B, N, 12] in this frame, as known physics predict it; None without physics
+    activations: ActivationStep | None = None  # of actuators that have some; None without
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,14 @@ class ControlInputs(Float64Buffers):
 
     def forward(self, action: Tensor) -> Tensor:
         """Controls ``[*B, E, C]`` of actions ``[*B, A]``, clipped to the actuators' limits as in MuJoCo."""
-        # 0 * action: an infinite action gives NaN and not the limit.
-        action = action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype)) + 0 * action
+        return self.at_edges(self.clipped(action))
+
+    def at_edges(self, action: Tensor) -> Tensor:
+        """Controls ``[*B, E, C]`` of actions ``[*B, A]`` that are within the limits."""
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
         return padded[..., self.edge_action]
+
+    def clipped(self, action: Tensor) -> Tensor:
+        """Actions ``[*B, A]`` within the actuators' limits."""
+        # 0 * action: an infinite action gives NaN and not the limit.
+        return action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype)) + 0 * action

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.maths.state_layout import StateLayout
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer, CanonicalState
@@ -24,6 +24,7 @@ class StepInputs(NamedTuple):
     canonical: CanonicalState  # the canonical state
     controls: Tensor  # [*B, E, C] controls at each edge's joint, clipped to the actuators' limits
     parameters: PhysicalParameters  # physical parameters of the scene, or of each sample
+    action: Tensor | None = None  # [*B, A] of the present step, within its bounds
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,10 @@ class Feature:
         """Number of features of each node or edge."""
         raise NotImplementedError
 
+    def least_scales(self, layout: StateLayout) -> list[float]:
+        """Least standard deviation of each number, for those that hardly vary in data; 0: that of the data."""
+        return [0.0] * self.size(layout)
+
     def added_edges(self, scene: Scene) -> np.ndarray:
         """Senders above receivers ``[2, X]`` of the edges that it adds."""
         return np.empty((2, 0), dtype=np.int64)
@@ -59,7 +64,7 @@ class Feature:
 
     def require_bodies(self, scene: Scene, layout: StateLayout) -> None:
         """Raise ValueError unless states are those of bodies."""
-        if layout != BODY_STATE:
+        if "orientation" not in layout.names:
             raise ValueError(
                 f"{type(self).__name__} needs states of bodies; scene {scene.name!r} has others: leave the feature out."
             )

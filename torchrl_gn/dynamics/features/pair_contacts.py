@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.maths.box_distance import segment_to_box
 from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.quaternion import turned_by
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
 
 if TYPE_CHECKING:
@@ -140,12 +141,12 @@ class BoundPairContacts(Float64Buffers):
         )
         rotation, radius, sign = self.rotation.to(dtype), self.radius.to(dtype), self.sign.to(dtype)
         segment, box = matrices[..., self.segment_node, :, :], matrices[..., self.box_node, :, :]  # [*B, C, 3, 3]
-        origin = position[..., self.segment_node, :] + _turned(segment, start)
-        middle = position[..., self.box_node, :] + _turned(box, center)
+        origin = position[..., self.segment_node, :] + turned_by(segment, start)
+        middle = position[..., self.box_node, :] + turned_by(box, center)
         frame = box @ rotation
-        back, line = frame.mT, _turned(segment, direction)
-        near = segment_to_box(_turned(back, origin - middle), _turned(back, line), half)
-        normal = _turned(frame, near.normal)
+        back, line = frame.mT, turned_by(segment, direction)
+        near = segment_to_box(turned_by(back, origin - middle), turned_by(back, line), half)
+        normal = turned_by(frame, near.normal)
         distance = near.distance - radius.sum(-1)
         # In the middle between both surfaces.
         inwards = radius[:, 0] + 0.5 * distance
@@ -171,7 +172,3 @@ class BoundPairContacts(Float64Buffers):
             if index < self.places:
                 kept[index] = torch.cat((candidate, kept[index][..., count:, :]), dim=-2)
         return torch.stack(kept, dim=-2)
-
-
-def _turned(matrices: Tensor, vectors: Tensor) -> Tensor:
-    return (matrices @ vectors.unsqueeze(-1)).squeeze(-1)

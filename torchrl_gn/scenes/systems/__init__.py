@@ -54,10 +54,10 @@ _BY_NAME: dict[str, System] = {
 }
 
 SYSTEMS: tuple[str, ...] = tuple(_BY_NAME)
-"""Names of the paper's seven systems; ``swimmerN`` exists for every N from 3."""
+"""Names of the paper's seven systems; ``swimmerN`` exists for every N from 3 to 500."""
 
 
 def find_system(name: str) -> System | None:
-    """The system of that name, or None; ValueError for ``swimmerN`` with ``N < 3``."""
-    links = re.fullmatch(r"swimmer(\d+)", name)
+    """The system of that name, or None; ValueError for ``swimmerN`` with N outside of 3 to 500."""
+    links = re.fullmatch(r"swimmer(\d{1,9})", name)
     return swimmer(int(links[1])) if links else _BY_NAME.get(name)

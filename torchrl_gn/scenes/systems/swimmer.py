@@ -15,11 +15,13 @@ import mujoco
 
 from torchrl_gn.scenes.systems.system import ParameterRange, System, resize_along_y, resize_capsule, suite_model
 
+_MOST_LINKS = 500  # compiling more takes MuJoCo many seconds
+
 
 def swimmer(links: int) -> System:
-    """The swimmer with ``links`` links, head included; ValueError below 3."""
-    if links < 3:
-        raise ValueError(f"A swimmer has at least 3 links, got {links}.")
+    """The swimmer with ``links`` links, head included; ValueError below 3 and above 500."""
+    if not 3 <= links <= _MOST_LINKS:
+        raise ValueError(f"A swimmer has at least 3 links and at most {_MOST_LINKS}, got {links}.")
     ranges = {f"length_{name}": ParameterRange(0.3, 2.0) for name in _links(links)}
     ranges["thickness"] = ParameterRange(0.5, 5.0)
     return System(f"swimmer{links}", partial(_build, links), timestep=0.02, ranges=ranges, vary=partial(_vary, links))

@@ -9,23 +9,25 @@ import os
 import platform
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
 import torch
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
-from torchrl_gn.atomic import atomic_path
-from torchrl_gn.processor import cache_folder
+from torchrl_gn.cache import SharedCacheError, cache_folder, make_private, open_private, warn_of, write_private
 
 L = TypeVar("L")
 
 SOURCES = sorted(path for path in Path(__file__).parent.iterdir() if path.suffix in (".h", ".cpp"))
+_LIMIT = 1800.0  # seconds for a library, waiting for other processes included; two cores build it in one minute
+_ANSWER = 30.0  # seconds for a compiler to say its version
 
 
 class NoCompilerError(FileNotFoundError):
@@ -36,6 +38,12 @@ def find_compiler() -> list[str] | None:
     """Command of the C++ compiler: ``CXX``, which may have arguments, else c++, g++ or clang++; None without one."""
     command = shlex.split(os.environ.get("CXX", "")) or list(filter(shutil.which, ("c++", "g++", "clang++")))[:1]
     return command if command and shutil.which(command[0]) else None
+
+
+def compiler_version(compiler: Sequence[str]) -> str:
+    """First line of what a compiler says of its version; NoCompilerError if it does not."""
+    (version,) = _run([[*compiler, "--version"]], time.monotonic() + _ANSWER)
+    return version.partition("\n")[0]
 
 
 def load(
@@ -52,67 +60,100 @@ def load(
     A library is kept for its sources, compiler, options and ``parts``.
 
     Raises:
-        NoCompilerError: without a working C++ compiler.
+        NoCompilerError: without a C++ compiler that works and ends in time, thirty minutes; the latter two it says.
     """
     compiler = find_compiler()
     if compiler is None:
         raise NoCompilerError("There is no C++ compiler: install g++ for the native executor.")
-    version = _run([*compiler, "--version"]).splitlines()[:1]
+    try:
+        return _load(name, what, compiler, sources, link, parts, opened)
+    except NoCompilerError as error:
+        sys.stderr.write(f"{error} PyTorch runs instead.\n")
+        raise
+
+
+def _load(
+    name: str,
+    what: str,
+    compiler: Sequence[str],
+    sources: Mapping[str, Sequence[str]],
+    link: Sequence[str],
+    parts: Sequence[str],
+    opened: Callable[[Path], L],
+) -> L:
+    deadline = time.monotonic() + _LIMIT
     options = [option for each in sources.values() for option in each]
-    key = [*compiler, *version, *options, *link, *parts, sys.platform]
+    key = [*compiler, compiler_version(compiler), *options, *link, *parts, sys.platform]
     digest = hashlib.sha256("\n".join([*key, *(path.read_text() for path in SOURCES)]).encode())
     name = f"{name}-{digest.hexdigest()[:16]}.so"
-    build = functools.partial(_build, what, compiler, sources, link)
+    build = functools.cache(functools.partial(_build, what, compiler, sources, link, deadline))
     try:
-        folder = cache_folder()
-        file = folder / name
-        if _is_whole(file):
-            return opened(file)
-        folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / f".{name}.lock"):  # others wait for whoever builds
-            if not _is_whole(file):
-                for left in folder.glob(f".{file.stem}.*.so"):  # by a build that was interrupted
-                    left.unlink()
-                build(file)
-        return opened(file)
+        file = cache_folder() / name
+        if (library := _kept(file)) is None:
+            make_private(file.parent)
+            # Others wait for whoever builds.
+            with FileLock(file.with_name(f".{name}.lock"), timeout=max(0.0, deadline - time.monotonic())):
+                if (library := _kept(file)) is None:
+                    for left in file.parent.glob(f".{file.stem}.*.so"):  # by a build that was interrupted
+                        left.unlink()
+                    write_private(file, build())
+                    library = _kept(file)
+        if library is not None:
+            return opened(library)
     except NoCompilerError:
         raise
+    except Timeout:
+        raise NoCompilerError(f"Another process has been building {what} for {_LIMIT:.0f} s: stop it.") from None
+    except SharedCacheError as error:
+        warn_of(error)
     except (OSError, RuntimeError):  # no home, or none to write to
         pass
     with tempfile.TemporaryDirectory(prefix="torchrl_gn-") as temporary:
         file = Path(temporary) / name  # code in the home may not be run, either
-        build(file)
-        return opened(file)
+        write_private(file, build())
+        if (library := _kept(file)) is None:
+            raise OSError(f"{file} was changed while it was made: choose another folder by TMPDIR.")
+        return opened(library)
 
 
 def _build(
-    what: str, compiler: Sequence[str], sources: Mapping[str, Sequence[str]], link: Sequence[str], file: Path
-) -> None:
-    """Compile, all sources at once, to a file that ends with its SHA-256."""
+    what: str,
+    compiler: Sequence[str],
+    sources: Mapping[str, Sequence[str]],
+    link: Sequence[str],
+    deadline: float,
+) -> bytes:
+    """Compile, all sources at once; return a library and its SHA-256."""
     sys.stderr.write(f"Building {what} for this processor, once: about a minute.\n")
-    with atomic_path(file) as temporary, tempfile.TemporaryDirectory(prefix="torchrl_gn-") as objects:
+    with tempfile.TemporaryDirectory(prefix="torchrl_gn-") as objects:
         places = {source: str(Path(objects) / f"{source}.o") for source in sources}
-        with ThreadPoolExecutor(len(sources)) as pool:
-            list(
-                pool.map(
-                    _run,
-                    [
-                        [*compiler, str(Path(__file__).parent / source), *options, "-c", "-o", places[source]]
-                        for source, options in sources.items()
-                    ],
-                )
-            )
-        _run([*compiler, *places.values(), "-shared", "-pthread", *link, "-o", str(temporary)])
-        with temporary.open("ab") as out:
-            out.write(hashlib.sha256(temporary.read_bytes()).digest())
+        library = Path(objects) / "library.so"
+        compiles = [
+            [*compiler, str(Path(__file__).parent / source), *options, "-c", "-o", places[source]]
+            for source, options in sources.items()
+        ]
+        _run(compiles, deadline)
+        _run([[*compiler, *places.values(), "-shared", "-pthread", *link, "-o", str(library)]], deadline)
+        content = library.read_bytes()
+        return content + hashlib.sha256(content).digest()
 
 
-def _is_whole(file: Path) -> bool:
-    """Whether a library is there, and not damaged, which could end the process."""
-    with contextlib.suppress(OSError):
-        content = file.read_bytes()
-        return hashlib.sha256(content[:-32]).digest() == content[-32:]
-    return False
+def _kept(file: Path) -> Path | None:
+    """Path by which to load a library that is whole and that nobody else can have written; None without one.
+
+    It names an open file, so that what is loaded is what was checked. It stays open: by the same path the system's
+    loader would take another library for this one.
+    """
+    try:
+        descriptor = open_private(file)
+    except OSError:
+        return None
+    with open(descriptor, "rb", closefd=False) as content:
+        whole = content.read()
+    if hashlib.sha256(whole[:-32]).digest() == whole[-32:]:  # a damaged one could end the process
+        return Path(f"/proc/self/fd/{descriptor}")
+    os.close(descriptor)
+    return None
 
 
 def instruction_flags() -> list[str]:
@@ -123,10 +164,44 @@ def instruction_flags() -> list[str]:
     return sets.get(torch.backends.cpu.get_cpu_capability(), [])
 
 
-def _run(command: Sequence[str]) -> str:
-    try:
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    except (OSError, subprocess.CalledProcessError) as error:
-        lines = (getattr(error, "stderr", "") or str(error)).splitlines()
-        first = next((line for line in lines if "error" in line), "".join(lines[-1:]))
-        raise NoCompilerError(f"The C++ compiler {command[0]} failed: {first.strip()}") from error
+def _run(commands: Sequence[Sequence[str]], deadline: float) -> list[str]:
+    """What commands write, which run at once; none goes on after the deadline, a failure or an interrupt."""
+    begin, running = time.monotonic(), []
+    with contextlib.ExitStack() as stack:
+        for command in commands:
+            files = [stack.enter_context(tempfile.TemporaryFile("w+", errors="replace")) for _ in range(2)]
+            try:
+                # A session of their own, as compilers start processes that outlive them.
+                process = subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=files[0], stderr=files[1], start_new_session=True
+                )
+            except OSError as error:
+                raise _failure(command, str(error)) from error
+            stack.callback(_kill, process)
+            running.append((command, process, *files))
+        for command, process, _, errors in running:
+            try:
+                code = process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                seconds = time.monotonic() - begin
+                raise NoCompilerError(
+                    f"The C++ compiler {command[0]} was stopped after {seconds:.0f} s: choose another by CXX."
+                ) from None
+            if code:
+                errors.seek(0)
+                raise _failure(command, errors.read() or f"it ended with code {code}")
+        for _, _, output, _ in running:
+            output.seek(0)
+        return [output.read() for _, _, output, _ in running]
+
+
+def _kill(process: subprocess.Popen) -> None:
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def _failure(command: Sequence[str], text: str) -> NoCompilerError:
+    lines = text.splitlines()
+    first = next((line for line in lines if "error" in line), "".join(lines[-1:]))
+    return NoCompilerError(f"The C++ compiler {command[0]} failed: {first.strip()}")

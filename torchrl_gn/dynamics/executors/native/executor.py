@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -14,11 +15,12 @@ from torch.utils._python_dispatch import _disable_current_modes
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native.build import NoCompilerError
 from torchrl_gn.dynamics.executors.native.operators import load_operators
+from torchrl_gn.dynamics.executors.native.preparation import LARGE, preparation
 from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, batch_of
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths, may_be_constant
 from torchrl_gn.dynamics.executors.native.structure import structure
 from torchrl_gn.dynamics.executors.native.trace import UntraceableError
-from torchrl_gn.dynamics.program import StepProgram, numbers_of
+from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.networks.core import ListedCore, UnfoldedCore
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.layers import LayerList
@@ -27,6 +29,7 @@ from torchrl_gn.networks.tensor_tree import in_dtype
 from torchrl_gn.processor import native_threads
 
 _NUMBERS = (torch.float32, torch.float64)  # of states, actions, weights
+_FEW = 0.05  # share of components that are constant, of bodies that move: without them a tape is about as long
 _TENSORS = (Tensor, torch.nn.Parameter)
 
 
@@ -39,7 +42,7 @@ class NativeExecutor:
     do by rounding. Several threads may run it at once.
 
     The state maths is traced for states whose components that cannot move are those of the scene's reference pose, and
-    once more for any others.
+    once more for any others; of large scenes where hardly a body has such components, only once for all states.
 
     Args:
         program: one of those that it is to run.
@@ -57,10 +60,11 @@ class NativeExecutor:
         self.parameters = ParameterInputs.of(program)
         self.channels = program.layout.delta_size if change else program.layout.size
         try:
-            self._load()
-            if program.dtype == torch.bfloat16 and not load_operators().has_bfloat16():
-                raise NoCompilerError("This processor multiplies no bfloat16.")
-            self.structure = self._trace(program, layers)
+            with preparation(len(program.reference)):
+                self._load()
+                if program.dtype == torch.bfloat16 and not load_operators().has_bfloat16():
+                    raise NoCompilerError("This processor multiplies no bfloat16.")
+                self.structure = self._trace(program, layers)
         except (NoCompilerError, UntraceableError) as error:
             self.reason = str(error)
 
@@ -92,23 +96,17 @@ class NativeExecutor:
             packed = pack_pairs(weights)
         else:  # products of others than float32 and float64, which a module was cast to, are torch's
             plain = torch.cat([weight.reshape(-1) for weight in weights]).to(sums)
-            packed = operators.pack(plain, self.shapes.weights, True).to(program.dtype)
+            packed = operators.pack(plain.cpu(), self.shapes.weights, True).to(plain.device, program.dtype)
         tables = [
             layer.table.reshape(-1) for layer in layers.layers if layer.table is not None and layer.table.ndim == 2
         ]
         rows = torch.cat([*tables, packed.new_empty(0, dtype=sums)]).to(sums)
-        numbers = (
-            torch.cat([part.reshape(-1) for part in numbers_of(program)] or [torch.empty(0)]).double().unsqueeze(0)
-        )
-        given = self.parameters.read(program.parameters)
-        if given.shape[1]:
-            numbers = torch.cat((numbers.expand(len(given), -1), given), 1)
         core = PackedLayers(
             self.shapes,
             core.predicted,
             packed,
-            operators.pack(rows, self.shapes.tables, False),
-            numbers.contiguous(),
+            operators.pack(rows.cpu(), self.shapes.tables, False).to(rows.device),
+            self.parameters.numbers(program),
             pack_sample_tables(layers, sums),
         )
         return replace(program, core=core)
@@ -192,14 +190,27 @@ class NativeExecutor:
                 .reshape(-1, *constant.shape)
                 .all(0)
             )
-            special = self._state_maths(program, layers, reference, constant)
-            try:
-                general = self._state_maths(program, layers, reference, np.zeros_like(constant))
-            except UntraceableError:  # states that need it are left to torch
-                general = None
+            special, general = self._both_maths(program, layers, reference, constant)
             words = structure(layers, special, general)
             self._compare(program, words, special.is_constant, general is not None)
         return words
+
+    def _both_maths(
+        self, program: StepProgram, layers: LayerList, reference: np.ndarray, constant: np.ndarray
+    ) -> tuple[StateMaths, StateMaths | None]:
+        """State maths of usual states and of others; in large scenes one of all, where it is hardly longer."""
+        usual = functools.partial(self._state_maths, program, layers, reference, constant)
+        of_all = functools.partial(self._state_maths, program, layers, reference, np.zeros_like(constant))
+        varies = ~constant.all(1, keepdims=True)  # [N, 1] bodies that move
+        if len(reference) < LARGE or not varies.any() or constant.mean(where=varies) > _FEW:
+            special, general = usual(), None
+            with contextlib.suppress(UntraceableError):  # states that need it are left to torch
+                general = of_all()
+            return special, general
+        try:
+            return of_all(), None
+        except UntraceableError:
+            return usual(), None
 
     def _state_maths(
         self, program: StepProgram, layers: LayerList, state: np.ndarray, constant: np.ndarray
@@ -210,7 +221,9 @@ class NativeExecutor:
         predicted = torch.arange(layers.nodes[0], device="cpu")[core.predicted].numpy()
         width = last.count * len(last.weight) // max(len(predicted), 1)
         state = np.where(constant, state, 0.0)
-        return StateMaths(program, state, constant, predicted, width, self.parameters, self.change)
+        maths = StateMaths(program, state, constant, predicted, width, self.parameters, self.change)
+        _ = maths.forward, maths.adjoint  # assembled here, where the caller can do without: they may be too long
+        return maths
 
     def _compare(self, program: StepProgram, words: Tensor, constant: np.ndarray, general: bool) -> None:
         """UntraceableError unless steps in float64 are those of torch, in states of both state maths."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import shlex
+from ctypes import CDLL
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ def _operators_or_reason() -> Any:
         sources = {"engine.cpp": [*options, "-O3", *own], "operators.cpp": [*options, *torch_options, *own]}
         link = [*own, f"-L{root / 'lib'}", "-ltorch_cpu", "-lc10"]
         parts = (processor_name(), processor_flags(), torch.__version__)
-        load("operators", "the native executor", sources, link, parts, lambda file: torch.ops.load_library(str(file)))
+        load("operators", "the native executor", sources, link, parts, lambda file: CDLL(str(file)))
         return torch.ops.torchrl_gn
     except (OSError, ValueError) as error:
         return str(error)

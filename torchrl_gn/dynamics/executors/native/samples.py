@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from torchrl_gn.dynamics.executors.native.trace import Array
-from torchrl_gn.dynamics.program import StepProgram, parameter_inputs
+from torchrl_gn.dynamics.program import StepProgram, numbers_of, parameter_inputs
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
-_DIMS = (2, 2, 1, 2, 1, 1, 2, 2, 3, 2, 2, 2, 3)  # of each physical parameter without batch
+_DIMS = (2, 2, 1, 2, 1, 1, 2, 2, 3, 2, 2, 2, 3, 2, 3, 2)  # of each physical parameter without batch
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,29 @@ class ParameterInputs:
         """Their values ``[B, P]`` float64; of parameters without batch, or without inputs, ``[1, P]``."""
         if not len(self):
             return torch.empty(1, 0, dtype=torch.float64, device="cpu")
+        if not parameters[0].is_cpu:
+            return self._read_there(parameters)
         parts = [part[:, varies] for part, varies in zip(_flat(parameters), self.varies, strict=True)]
         count = max(map(len, parts))
         return torch.from_numpy(np.concatenate([np.broadcast_to(part, (count, part.shape[1])) for part in parts], 1))
+
+    def numbers(self, program: StepProgram) -> Tensor:
+        """What the state maths reads of the model and of samples, ``[1 or B, P]`` float64."""
+        own = [part.reshape(-1) for part in numbers_of(program)] or [program.reference.new_empty(0)]
+        numbers = torch.cat(own).double().unsqueeze(0)
+        if len(self):
+            given = self.read(program.parameters)
+            numbers = torch.cat((numbers.expand(len(given), -1), given), 1)
+        return numbers.contiguous()
+
+    def _read_there(self, parameters: PhysicalParameters) -> Tensor:
+        """As :meth:`read`, on another device and without waiting for it."""
+        parts = []
+        for value, varies, dims in zip(parameters, self.varies, _DIMS, strict=True):
+            flat = value.detach().double().reshape(math.prod(value.shape[: value.ndim - dims]), -1)
+            parts.append(flat[:, torch.from_numpy(np.flatnonzero(varies)).to(flat.device)])
+        count = max(map(len, parts))
+        return torch.cat([part.expand(count, -1) for part in parts], 1)
 
 
 def batch_of(parameters: PhysicalParameters) -> torch.Size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import replace
 from typing import Any
@@ -68,12 +69,32 @@ class StateMaths:
             self._after = delta.ravel()[changes].tolist()
         # Varying channels, action, the network's output, numbers.
         self._groups = groups
-        # Phase 0: network inputs from the varying channels and the action; phase 1: the result from the network's
-        # output.
-        self.forward = assemble(graph, self._groups, [self._inputs, self._after])
-        self.adjoint = self._pull_back()
 
-    def _pull_back(self) -> Tape:
+    @functools.cached_property
+    def forward(self) -> Tape:
+        """Phase 0: network inputs from varying channels and action; phase 1: the result from the network's output."""
+        return assemble(self._graph, self._groups, [self._inputs, self._after])
+
+    def separate(self, name: str) -> Tape:
+        """One of four tapes that share no registers, as engines need that run the network in between.
+
+        ``"inputs"`` and ``"result"`` are the two phases of ``forward``; ``"inputs_adjoint"`` and ``"result_adjoint"``
+        are the pull-back of each by itself.
+        """
+        graph, groups, (varying, actions, outputs, _) = self._graph, self._groups, self._groups
+        if name == "inputs":
+            return assemble(graph, groups, [self._inputs])
+        if name == "result":
+            return assemble(graph, groups, [self._after])
+        of_after, of_inputs = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
+        if name == "inputs_adjoint":
+            found = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
+        else:
+            found = gradient(graph, self._after, of_after, [*outputs, *varying, *actions])
+        return assemble(graph, [*groups, of_after, of_inputs], [found])
+
+    @functools.cached_property
+    def adjoint(self) -> Tape:
         """The pull-back of ``forward``.
 
         Phase 0: gradient of the network's output from that of the result. Phase 1: gradients of state and action

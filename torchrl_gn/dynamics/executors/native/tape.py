@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -35,87 +36,110 @@ class Tape:
 def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Sequence[Sequence[Any]]) -> Tape:
     """Tape of the outputs of every phase: only what they need, each once, in as few registers as its order allows."""
     results = [[_index(graph, each) for each in outputs] for outputs in phases]
-    inputs = {each.index for group in groups for each in group}
+    inputs = [each.index for group in groups for each in group]
     order, ends = _schedule(graph.nodes, results, inputs)
     order, ends, nodes = _fused(graph.nodes, order, ends, results)
+    arguments = [nodes[index][1] for index in order]
 
-    # Registers: inputs that are read keep theirs, as a group may be written between phases; others are reused after
-    # their last use.
-    is_read = {operand for index in order for operand in nodes[index][1]} | {i for outputs in results for i in outputs}
-    last = {operand: position for position, index in enumerate(order) for operand in nodes[index][1]}
-    released: dict[int, list[int]] = {}  # before an instruction: outputs that were read after the phase before it
-    expiring: dict[int, list[int]] = {}  # with an instruction: its operands
-    kept_until = {index: ends[phase] for phase, outputs in enumerate(results) for index in outputs}
-    for index in order:
-        read, until = last.get(index, -1), kept_until.get(index, -1)
-        (released if until > read else expiring).setdefault(max(read, until), []).append(index)
-    used = (each.index for group in groups for each in group if each.index in is_read)
-    where = {index: register for register, index in enumerate(used)}
-    count, free = len(where), []
-    instructions: list[tuple[int, ...]] = []
-    constants: dict[float, int] = {}
-    for position, index in enumerate(order):
-        free += [where[each] for each in released.get(position, ())]
-        operation, operands, constant = nodes[index]
-        a, b, c = (*[where[operand] for operand in operands], 0, 0, 0)[:3]
-        free += [where[each] for each in expiring.get(position, ())]
-        if not free:
-            free.append(count)
-            count += 1
-        where[index] = free.pop()
-        k = constants.setdefault(constant, len(constants))
-        instructions.append((CODES[operation], where[index], a, b, c, 0, k))
+    # Inputs that are read keep their registers, as a group may be written between phases. Values are numbered: those
+    # inputs, then what instructions make; the last is none.
+    is_read = np.zeros(len(nodes), dtype=bool)
+    is_read[[*itertools.chain(*arguments, *results)]] = True
+    used = list(dict.fromkeys(index for index in inputs if is_read[index]))
+    value_of = np.full(len(nodes), -1)
+    value_of[used], value_of[order] = np.arange(len(used)), len(used) + np.arange(len(order))
+    operands = np.full((3, len(order)), -1)
+    for place, row in enumerate(itertools.zip_longest(*arguments, fillvalue=-1)):
+        found = np.array(row, dtype=np.int64)
+        operands[place] = np.where(found < 0, -1, value_of[found])
+    places = _registers(operands, [value_of[outputs] for outputs in results], ends, len(used))
+    count = int(places.max(initial=0)) + 1
     if count > _MOST_REGISTERS:
         raise UntraceableError(f"The state maths of this scene needs {count} registers.")
+
+    known: dict[float, int] = {}
+    instructions = np.zeros(len(order), dtype=INSTRUCTION)
+    instructions["code"] = [CODES[nodes[index][0]] for index in order]
+    instructions["out"] = places[len(used) : -1]
+    for name, row in zip("abc", operands, strict=True):
+        instructions[name] = places[row]
+    instructions["k"] = [known.setdefault(nodes[index][2], len(known)) for index in order]
+    places = np.where(is_read, places[value_of], -1).astype(np.int32)
     return Tape(
-        instructions=np.array(instructions, dtype=INSTRUCTION),
-        constants=np.array(list(constants) or [0.0]),
+        instructions=instructions,
+        constants=np.array(list(known) or [0.0]),
         phases=tuple(ends),
-        inputs=tuple(np.array([where.get(each.index, -1) for each in group], dtype=np.int32) for group in groups),
-        outputs=tuple(np.array([where[index] for index in outputs], dtype=np.int32) for outputs in results),
-        registers=max(count, 1),
+        inputs=tuple(places[np.array([each.index for each in group], dtype=np.int64)] for group in groups),
+        outputs=tuple(places[np.array(outputs, dtype=np.int64)] for outputs in results),
+        registers=count,
     )
+
+
+def _registers(operands: np.ndarray, results: list[np.ndarray], ends: list[int], inputs: int) -> np.ndarray:
+    """Registers ``[V + 1]`` of values ``[V]``: inputs keep theirs, others give them back after their last use.
+
+    The last value is none, in register 0.
+    """
+    count = operands.shape[1]
+    read, kept = np.full((2, inputs + count + 1), -1)
+    for row in operands:
+        positions = np.full_like(read, -1)
+        positions[row] = np.arange(count)  # the last one stays
+        np.maximum(read, positions, out=read)
+    for outputs, end in zip(results, ends, strict=True):
+        kept[outputs] = end
+    # With an instruction: its operands; before it: outputs that were read after the phase before it.
+    until = np.maximum(read, kept)[inputs:-1]
+    order = np.argsort(2 * until + (kept <= read)[inputs:-1], kind="stable").tolist()
+    places, free, start, most = [0] * count, [], 0, inputs
+    for position, released in enumerate(np.bincount(until, minlength=count)[:count].tolist()):
+        if released:
+            free += [places[each] for each in order[start : start + released]]
+            start += released
+        if not free:
+            free.append(most)
+            most += 1
+        places[position] = free.pop()
+    return np.array([*range(inputs), *places, 0], dtype=np.int64)
 
 
 def _index(graph: Expressions, value: Any) -> int:
     return value.index if isinstance(value, Scalar) else graph.make("constant", (), float(value)).index
 
 
-def _schedule(nodes: list, results: list[list[int]], inputs: set[int]) -> tuple[list[int], list[int]]:
+def _schedule(nodes: list, results: list[list[int]], inputs: list[int]) -> tuple[list[int], list[int]]:
     """Operations in an order that puts operands first and close, and where each phase ends."""
-    order, ends, done = [], [], set(inputs)
+    order, ends, done = [], [], bytearray(len(nodes))
+    for index in inputs:
+        done[index] = 1
     for outputs in results:
-        for output in outputs:
-            stack = [output]
-            while stack:
-                index = stack[-1]
-                if index in done:
-                    stack.pop()
-                    continue
-                missing = [operand for operand in nodes[index][1] if operand not in done]
+        stack = outputs[::-1]
+        while stack:
+            index = stack.pop()
+            if index < 0:  # its operands are done
+                order.append(~index)
+                done[~index] = 1
+            elif not done[index]:
+                missing = [operand for operand in nodes[index][1] if not done[operand]]
                 if missing:
+                    stack.append(~index)
                     stack += missing[::-1]
                 else:
                     order.append(index)
-                    done.add(index)
-                    stack.pop()
+                    done[index] = 1
         ends.append(len(order))
     return order, ends
 
 
 def _fused(nodes: list, order: list[int], ends: list[int], results: list[list[int]]) -> tuple[list, list, list]:
     """Products that only one sum in the same phase reads, as one instruction with it."""
-    uses: dict[int, int] = {}
-    for index in order:
-        for operand in nodes[index][1]:
-            uses[operand] = uses.get(operand, 0) + 1
-    for outputs in results:
-        for index in outputs:
-            uses[index] = uses.get(index, 0) + 2  # an output is kept
-    phase_of = {}
-    for phase, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
-        phase_of.update(dict.fromkeys(order[start:end], phase))
-    nodes, gone = list(nodes), set()
+    read = [*itertools.chain.from_iterable(nodes[index][1] for index in order)]
+    counts = np.bincount(np.array(read, dtype=np.int64), minlength=len(nodes))
+    counts[[*itertools.chain(*results)]] += 2  # an output is kept
+    phase = np.full(len(nodes), -1)
+    phase[order] = np.searchsorted(ends, np.arange(len(order)), side="right")
+    uses, phase_of = counts.tolist(), phase.tolist()
+    nodes, gone = list(nodes), bytearray(len(nodes))
     for index in order:
         operation, operands, _ = nodes[index]
         if operation not in ("add", "sub"):
@@ -123,17 +147,19 @@ def _fused(nodes: list, order: list[int], ends: list[int], results: list[list[in
         choices = ((1, 0), (0, 1)) if operation == "add" else ((1, 0),)
         for product, rest in choices:
             one, other = operands[product], operands[rest]
-            kind, factors, constant = nodes[one]
-            if uses[one] != 1 or phase_of.get(one) != phase_of[index] or kind not in ("mul", "mul_c"):
+            if uses[one] != 1 or phase_of[one] != phase_of[index]:
                 continue
+            kind, factors, constant = nodes[one]
             if kind == "mul":
                 nodes[index] = ("madd" if operation == "add" else "nmadd", (*factors, other), 0.0)
-            else:
+            elif kind == "mul_c":
                 nodes[index] = ("madd_c", (*factors, other), constant if operation == "add" else -constant)
-            gone.add(one)
+            else:
+                continue
+            gone[one] = 1
             break
     kept, new_ends = [], []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
-        kept += [index for index in order[start:end] if index not in gone]
+        kept += [index for index in order[start:end] if not gone[index]]
         new_ends.append(len(kept))
     return kept, new_ends, nodes

@@ -1,0 +1,328 @@
+"""What a GPU is worth: control steps a second with and without gradients, training time, memory, tests.
+
+    python recipes/gpu.py [parts=[speed]] [systems=[swimmer6]] [batches=[1024]]
+
+Parts, each written to metrics.json as it ends, so that a run that is cut off keeps what it has:
+
+- `tests`: the tests that need a GPU.
+- `speed`: control steps a second of rollouts, forward and with the gradient in start states and actions, by system,
+  batch and way: `torch` (folded, by torch operations), `native` (state maths in CUDA kernels, steps as CUDA graphs),
+  `compiled` (the network through torch.compile too), and these with products in TF32 or bfloat16. With the peak memory
+  of each, and the error of a step against float64.
+- `parts`: where the time of a step and its gradient goes: kernels before and after the network, the network by torch
+  and as torch.compile makes it.
+- `cores`: our native executor on this machine's processor.
+- `training`: recipes/forward_model.py with its data, training and evaluation.
+- `jraph`: the same network alone in jraph under jax.jit, on the GPU that JAX finds.
+
+Random weights, normalisers of a short collection. Takes about five minutes. Results: docs/results/gpu.md.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import re
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torch import Tensor
+from tqdm import tqdm
+
+from _common import clean_exit, finish_run, open_run, with_help
+from _common.gpu_parts import StepParts
+from torchrl_gn.atomic import write_json
+from torchrl_gn.cache import keep_inductor_private
+from torchrl_gn.data import collect_trajectories, trajectory_buffer
+from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor, specialize
+from torchrl_gn.dynamics.executors.cuda import CudaExecutor
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.processor import usable_cores
+from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.training.checkpoint import package_versions
+
+ROOT = Path(__file__).parent.parent
+
+
+def load(name: str) -> Scene:
+    """A scene by name; humanoid is dm_control's."""
+    if name != "humanoid":
+        return load_scene(name)
+    import dm_control.suite
+
+    return load_scene(str(Path(cast(str, dm_control.suite.__file__)).parent / "humanoid.xml"))
+
+
+def make_model(cfg: DictConfig, name: str) -> tuple[Scene, ForwardModel, TensorDict]:
+    """Random weights with the normalisers of a short collection, and its transitions."""
+    scene = load(name)
+    trajectories = collect_trajectories(scene, 32, 32, cfg.seed)
+    transitions = cast(TensorDict, trajectory_buffer(trajectories, batch_size=1024, seed=cfg.seed).sample())
+    torch.manual_seed(cfg.seed)
+    model = ForwardModel.for_scene(scene, hidden=cfg.hidden)
+    ForwardModelLoss(model.bind(scene)).fit_normalizers(transitions)
+    return scene, model.to(cfg.device).requires_grad_(False), transitions
+
+
+@contextmanager
+def tf32(on: bool) -> Iterator[None]:
+    """Let float32 products round their factors to TF32."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if on else "highest")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def seconds(run: Callable[[], object], repeats: int, device: str) -> float:
+    """Median seconds of a call, once it is warm."""
+    found = []
+    for turn in range(repeats + 1):
+        start = time.perf_counter()
+        run()
+        if device == "cuda":
+            torch.cuda.synchronize()
+        if turn:
+            found.append(time.perf_counter() - start)
+        if sum(found) > 1:  # enough of what is slow
+            break
+    return statistics.median(found)
+
+
+def draw(transitions: TensorDict, batch: int, steps: int, device: str) -> tuple[Tensor, Tensor]:
+    """States ``[B, N, 13]`` and actions ``[B, T, A]`` of the collection."""
+    rows = torch.arange(batch) % len(transitions)
+    several = (torch.arange(batch)[:, None] + torch.arange(steps)) % len(transitions)
+    return transitions["state"][rows].to(device), transitions["action"][several].to(device)
+
+
+def pull(predictor: SpecializedPredictor, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
+    """Gradient of a rollout's states in its start and its actions."""
+    leaves = state.detach().requires_grad_(), actions.detach().requires_grad_()
+    return torch.autograd.grad(predictor.rollout(*leaves)[0].sum(), leaves)
+
+
+def measure_speed(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
+    """Control steps a second by system, way, batch."""
+    out: dict[str, Any] = {}
+    for name in cfg.systems:
+        scene, model, transitions = make_model(cfg, name)
+        bound = model.bind(scene)
+        exact = specialize(bound, executor="eager", dtype=torch.float64)
+        state, actions = draw(transitions, 256, 1, cfg.device)
+        wanted = exact.step(state.double(), actions[:, 0].double())[0] - state
+        # Products of another dtype have kernels of their own, some seconds to compile.
+        ways: dict[str, tuple[str, torch.dtype | None, bool]] = {
+            "torch": ("eager", None, False),
+            "native": ("native", None, False),
+            "native, tf32": ("native", None, True),
+            "native, bfloat16": ("native", torch.bfloat16, True),
+            "compiled": ("compiled", None, False),
+            "compiled, tf32": ("compiled", None, True),
+            "compiled, bfloat16": ("compiled", torch.bfloat16, True),
+        }
+        if cfg.device == "cpu":
+            ways = {"torch": ways["torch"], "native": ways["native"]}
+        for way, (executor, dtype, rounded) in ways.items():
+            start = time.perf_counter()
+            predictor = specialize(bound, executor=executor, dtype=dtype)
+            key = f"{name}/{way}"
+            with tf32(rounded):
+                after = predictor.step(state, actions[:, 0])[0].double() - state
+                out[f"{key}/error"] = float((after - wanted).norm() / wanted.norm())
+                pull(predictor, state, actions)
+                out[f"{key}/first_seconds"] = time.perf_counter() - start
+                out[f"{key}/reason"] = predictor.reason
+                for batch in cfg.batches:
+                    if way == "torch" and batch > cfg.most_by_torch:
+                        continue
+                    given = draw(transitions, batch, cfg.steps, cfg.device)
+                    works: dict[str, Callable[[], object]] = {
+                        "forward": functools.partial(predictor.rollout, *given),
+                        "gradient": functools.partial(pull, predictor, *given),
+                    }
+                    for work, run in works.items():
+                        if cfg.device == "cuda":
+                            torch.cuda.empty_cache()
+                            torch.cuda.reset_peak_memory_stats()
+                        try:
+                            took = seconds(run, cfg.repeats, cfg.device)
+                        except torch.OutOfMemoryError:
+                            out[f"{key}/{batch}/{work}"] = None
+                            continue
+                        out[f"{key}/{batch}/{work}"] = batch * cfg.steps / took
+                        if cfg.device == "cuda":
+                            out[f"{key}/{batch}/{work}_gib"] = torch.cuda.max_memory_allocated() / 2**30
+                        tqdm.write(f"{key:28} {batch:6} {work:9} {batch * cfg.steps / took:14,.0f} steps/s")
+            del predictor
+            keep(out)
+    return out
+
+
+def measure_parts(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
+    """Milliseconds of the parts of one step and its gradient at the largest batch."""
+    out: dict[str, Any] = {}
+    for name in cfg.systems[:2] if cfg.device == "cuda" else ():
+        for work, run in parts_of(cfg, name).items():
+            with tf32(work.endswith("tf32")):
+                try:
+                    took = seconds(run, cfg.repeats, cfg.device)
+                except Exception as error:  # of a compiler that is not there
+                    out[f"{name}/{work}"] = f"{type(error).__name__}: {error}"[:300]
+                    continue
+            out[f"{name}/{work}"] = took * 1e3
+            tqdm.write(f"{name:12} {work:36} {took * 1e3:10.3f} ms")
+        keep(out)
+    return out
+
+
+def parts_of(cfg: DictConfig, name: str) -> dict[str, Callable[[], object]]:
+    """Parts of a step by name: kernels, and the network by torch and compiled."""
+    scene, model, transitions = make_model(cfg, name)
+    predictor = specialize(model.bind(scene))
+    executor, program = predictor.executor, predictor.program()
+    if not isinstance(executor, CudaExecutor) or executor.reason is not None:
+        return {}
+    state, actions = draw(transitions, max(cfg.batches), 1, cfg.device)
+    parts = StepParts(executor, program, state, actions[:, 0].contiguous())
+    works: dict[str, Callable[[], object]] = {
+        "inputs": parts.inputs,
+        "result": parts.result,
+        "inputs and gradient": parts.inputs_gradient,
+        "result and gradient": parts.result_gradient,
+    }
+    keep_inductor_private()
+    networks = {"network": parts.network, "network compiled": torch.compile(parts.network, dynamic=False)}
+    for suffix, (kind, network) in itertools.product(("", ", tf32"), networks.items()):
+        works[f"{kind}{suffix}"] = functools.partial(parts.forward, network)
+        works[f"{kind} and gradient{suffix}"] = functools.partial(parts.network_gradient, network)
+    return works
+
+
+def measure_cores(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
+    """Control steps a second of the native executor on the processor."""
+    out: dict[str, Any] = {"threads": torch.get_num_threads(), "cores": usable_cores()}
+    for name in cfg.systems:
+        scene, model, transitions = make_model(cfg, name)
+        predictor = specialize(cast(BoundPredictor, model.cpu().bind(scene)))
+        given = draw(transitions, cfg.cores_batch, cfg.steps, "cpu")
+        count = cfg.cores_batch * cfg.steps
+        out[f"{name}/forward"] = count / seconds(functools.partial(predictor.rollout, *given), cfg.repeats, "cpu")
+        out[f"{name}/gradient"] = count / seconds(functools.partial(pull, predictor, *given), cfg.repeats, "cpu")
+        out[f"{name}/reason"] = predictor.reason
+        tqdm.write(f"{name:12} cores {out[f'{name}/forward']:14,.0f} {out[f'{name}/gradient']:14,.0f} steps/s")
+        keep(out)
+    return out
+
+
+def measure_training(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) -> dict[str, Any]:
+    """Seconds and errors of recipes/forward_model.py, a run for each set of options."""
+    out: dict[str, Any] = {}
+    for index, options in enumerate(cfg.training):
+        place = folder / f"training{index}"
+        command = [sys.executable, str(ROOT / "recipes/forward_model.py"), f"device={cfg.device}", f"run_dir={place}"]
+        command += [f"data.folder={folder / 'data'}", f"seed={cfg.seed}", *options.split()]
+        start = time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+        out[f"{options}/whole_seconds"] = time.perf_counter() - start
+        if done.returncode:
+            out[f"{options}/failed"] = (done.stdout + done.stderr)[-2000:]
+        else:
+            metrics = json.loads((place / "metrics.json").read_text())
+            out |= {f"{options}/{key}": value for key, value in metrics.items() if isinstance(value, (int, float))}
+            tqdm.write(done.stdout)
+        keep(out)
+    return out
+
+
+def measure_jraph(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
+    """Control steps a second of the network alone in jraph, by batch."""
+    try:
+        from _common.speed_baselines import JraphBaseline
+    except ImportError as error:
+        return {"failed": str(error)}
+    out: dict[str, Any] = {}
+    for name, batch in itertools.product(cfg.systems[:1], cfg.batches[-2:]):
+        scene, model, transitions = make_model(cfg, name)
+        state, actions = draw(transitions, batch, 1, "cpu")
+        try:
+            jraph = JraphBaseline(model.cpu(), scene, usable_cores())
+            runs = {"forward": jraph.step(state, actions[:, 0]), "gradient": jraph.gradient(state, actions[:, 0])}
+        except Exception as error:
+            out[f"{name}/{batch}/failed"] = f"{type(error).__name__}: {error}"[:300]
+            continue
+        for work, run in runs.items():
+            assert run is not None
+            out[f"{name}/{batch}/{work}"] = batch / seconds(run, cfg.repeats, "cpu")
+        keep(out)
+    return out
+
+
+def run_tests(cfg: DictConfig) -> dict[str, Any]:
+    """Outcome of the tests that need a GPU."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", *cfg.test_files]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    lines = done.stdout.strip().splitlines()
+    return {"passed": done.returncode == 0, "last": lines[-1] if lines else "", "output": done.stdout[-6000:]}
+
+
+def machine(cfg: DictConfig) -> dict[str, Any]:
+    """Names and versions."""
+    out: dict[str, Any] = {"cores": usable_cores(), **package_versions()}
+    if cfg.device == "cuda":
+        properties = torch.cuda.get_device_properties(0)
+        out |= {"gpu": properties.name, "memory_gib": properties.total_memory / 2**30, "cuda": torch.version.cuda}
+    return out
+
+
+@with_help
+@hydra.main(config_path="config", config_name="gpu", version_base="1.3")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    if cfg.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device=cuda needs a GPU and a torch built for it; device=cpu tries the script.")
+    run, tracker = open_run(cfg, "gpu")
+    metrics: dict[str, Any] = {f"machine/{key}": value for key, value in machine(cfg).items()}
+    works: dict[str, Callable[[Callable[[dict], None]], dict[str, Any]]] = {
+        "tests": lambda keep: run_tests(cfg),
+        "speed": lambda keep: measure_speed(cfg, keep),
+        "parts": lambda keep: measure_parts(cfg, keep),
+        "cores": lambda keep: measure_cores(cfg, keep),
+        "training": lambda keep: measure_training(cfg, keep, run.path),
+        "jraph": lambda keep: measure_jraph(cfg, keep),
+    }
+    if unknown := [part for part in cfg.parts if part not in works]:
+        raise ValueError(f"parts={unknown} are not known; use any of {list(works)}.")
+    for part in cfg.parts:
+        start = time.perf_counter()
+
+        def keep(found: dict[str, Any], part: str = part) -> None:
+            metrics.update({f"{part}/{key}": value for key, value in found.items()})
+            write_json(run.path / "parts.json", metrics)
+
+        try:
+            keep(works[part](keep))
+        except Exception as error:  # the other parts are measured
+            metrics[f"{part}/failed"] = f"{type(error).__name__}: {error}"[:2000]
+            tqdm.write(f"{part} failed: {metrics[f'{part}/failed']}")
+        keep({"seconds": time.perf_counter() - start})
+    numbers = {
+        re.sub(r"[^\w/.]+", "_", key): value for key, value in metrics.items() if isinstance(value, (int, float))
+    }
+    finish_run(cfg, run, tracker, numbers, files=[run.path / "parts.json"])
+
+
+if __name__ == "__main__":
+    main()

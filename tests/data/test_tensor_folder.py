@@ -1,0 +1,189 @@
+"""Folders of memory-mapped TensorDicts: tensors are read, nothing runs, nothing is written."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import LazyStackedTensorDict, NonTensorData, TensorDict
+
+from torchrl_gn.data import open_tensors
+
+GENERATOR = torch.Generator().manual_seed(0)
+DTYPES = [
+    torch.float64,
+    torch.float32,
+    torch.float16,
+    torch.bfloat16,
+    torch.int64,
+    torch.int32,
+    torch.uint8,
+    torch.bool,
+]
+
+
+class Planted:
+    """Code that a pickle runs when it is read."""
+
+    def __init__(self, file: Path):
+        self.file = file
+
+    def __reduce__(self):
+        return Path.touch, (self.file,)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A folder of two tensors, one of them in a folder of its own."""
+    tensors = {"state": torch.rand(4, 3, generator=GENERATOR), "inner": {"action": torch.arange(8.0).view(4, 2)}}
+    TensorDict(tensors, [4]).memmap(str(tmp_path / "d"))
+    return tmp_path / "d"
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {file: file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+def edit(file: Path, **changes) -> Path:
+    """Change entries of a layout; None takes one out."""
+    layout = json.loads(file.read_text()) | changes
+    file.write_text(json.dumps({name: entry for name, entry in layout.items() if entry is not None}))
+    return file
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_tensors_are_as_they_were_written(tmp_path, dtype):
+    numbers = (50 * torch.rand(5, 2, 3, generator=GENERATOR, dtype=torch.float64)).to(dtype)
+    of = {"a": numbers, "b": {"c-1": numbers[:, 0], "d": {"e.f": numbers[..., 0].clone()}}, "none": numbers[:, :0]}
+    written = TensorDict(of, [5])
+    written.memmap(str(tmp_path))
+    found = open_tensors(tmp_path)
+    assert found.batch_size == written.batch_size
+    assert set(found.keys(True, True)) == set(written.keys(True, True))
+    for key in written.keys(True, True):
+        assert found[key].dtype == dtype and torch.equal(found[key], written[key])
+
+
+def test_files_stay_as_they_are(folder):
+    before = contents(folder)
+    found = open_tensors(folder)
+    found["state"].zero_()
+    found["inner", "action"].fill_(torch.nan)
+    assert contents(folder) == before and open_tensors(folder)["state"].any()
+
+
+def test_files_that_cannot_be_written_are_read(folder):
+    for file in contents(folder):
+        file.chmod(0o444)
+    assert open_tensors(folder)["state"].shape == (4, 3)
+
+
+@pytest.mark.parametrize("place", ["note", ("inner", "note")])
+def test_pickled_code_does_not_run(folder, tmp_path, place):
+    data = TensorDict.load_memmap(folder).clone()
+    data.set(place, NonTensorData(Planted(tmp_path / "ran"), batch_size=[4]))
+    data.memmap(str(tmp_path / "e"))
+    assert list((tmp_path / "e").rglob("*.pickle"))
+    with pytest.raises(ValueError, match=r"meta.json: 'note' is of type 'NonTensorData', and only tensors are read"):
+        open_tensors(tmp_path / "e")
+    # Nor if it says to be a TensorDict.
+    at = (tmp_path / "e").joinpath(*([place] if isinstance(place, str) else place))
+    edit(at.parent / "meta.json", note={"type": "TensorDict"})
+    with pytest.raises(ValueError, match=r"note/meta.json: describes <class 'tensordict.tensorclass.NonTensorData'>"):
+        open_tensors(tmp_path / "e")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_what_is_not_one_tensordict_is_refused(folder, tmp_path):
+    LazyStackedTensorDict(*TensorDict.load_memmap(folder).clone().unbind(0)).memmap(str(tmp_path / "lazy"))
+    with pytest.raises(ValueError, match="describes .*LazyStackedTensorDict"):
+        open_tensors(tmp_path / "lazy")
+    for nothing in (tmp_path, tmp_path / "nowhere", folder / "state.memmap"):
+        with pytest.raises(ValueError, match="no such file, so the folder holds no tensors"):
+            open_tensors(nothing)
+
+
+@pytest.mark.parametrize("size", [0, 5, 47, 49, 4096])
+def test_a_file_of_another_length_is_refused_and_kept(folder, size):
+    os.truncate(folder / "state.memmap", size)
+    before = contents(folder)
+    with pytest.raises(ValueError, match=f"state.memmap: {size} bytes, should be 48: truncated or changed"):
+        open_tensors(folder)
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("made", [lambda _: None, os.mkdir, os.mkfifo], ids=["nothing", "folder", "pipe"])
+def test_a_missing_file_is_refused(folder, made):
+    (folder / "state.memmap").unlink()
+    made(folder / "state.memmap")
+    with pytest.raises(ValueError, match="state.memmap: missing"):
+        open_tensors(folder)
+
+
+PLAIN = {"shape": [4, 3], "dtype": "torch.float32"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"state": PLAIN | {"shape": [4, 2**40, 2**40]}}, "'state' is no plain tensor"),
+        ({"state": PLAIN | {"shape": [4, 2**40]}}, "48 bytes, should be 17592186044416"),
+        ({"state": PLAIN | {"shape": [4, 0, 2**62]}}, "'state' is no plain tensor"),
+        ({"state": PLAIN | {"shape": [4, -3]}}, "'state' is no plain tensor"),
+        ({"state": PLAIN | {"shape": [4, True]}}, "'state' is no plain tensor"),
+        ({"state": PLAIN | {"shape": [4, 3.0]}}, "'state' is no plain tensor"),
+        ({"state": PLAIN | {"shape": [3, 4]}}, r"'state' is no plain tensor of real numbers \[4, '...'\]"),
+        ({"state": PLAIN | {"shape": [4, *(1 for _ in range(100))]}}, "'state' is no plain tensor"),
+        ({"state": {"shape": [4, 3]}}, "it has dtype None"),
+        ({"state": PLAIN | {"dtype": "torch.complex64"}}, "it has dtype 'torch.complex64'"),
+        ({"state": PLAIN | {"dtype": ["torch.float32"]}}, "'state' is no plain tensor"),
+        ({"state": PLAIN | {"is_nested": True}}, "'state' is no plain tensor"),
+        ({"state": PLAIN | {"dtype": "torch.bool", "shape": [4, 12]}}, "other numbers than false and true"),
+        ({"../d/state": PLAIN}, "'../d/state' is no name of a tensor"),
+        ({"..": {"type": "TensorDict"}}, "'..' is no name of a tensor"),
+        ({"/etc": {"type": "TensorDict"}}, "'/etc' is no name of a tensor"),
+        ({"shape": None}, "None is no batch size"),
+        ({"shape": 4}, "4 is no batch size"),
+        ({"_type": "os.system"}, "describes os.system"),
+    ],
+)
+def test_a_layout_that_cannot_be_is_refused(folder, changes, message):
+    edit(folder / "meta.json", **changes)
+    with pytest.raises(ValueError, match=message):
+        open_tensors(folder)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", "[" * 100_000, "\xff"])
+def test_a_damaged_layout_is_refused(folder, text):
+    (folder / "inner" / "meta.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match="inner/meta.json"):
+        open_tensors(folder)
+
+
+def test_a_layout_of_megabytes_is_refused(folder):
+    file = folder / "meta.json"
+    file.write_text(file.read_text() + " " * 2**20)
+    with pytest.raises(ValueError, match="bytes are too many for a description of tensors"):
+        open_tensors(folder)
+
+
+def test_folders_without_end_are_refused(folder):
+    edit(folder / "meta.json", again={"type": "TensorDict"})
+    (folder / "again").symlink_to(folder)
+    with pytest.raises(ValueError, match="again: a link, not a folder"):
+        open_tensors(folder)
+
+
+def test_too_many_folders_in_each_other_are_refused(folder):
+    for _ in range(20):
+        edit(folder / "meta.json", again={"type": "TensorDict"})
+        folder = folder / "again"
+        TensorDict({}, [4]).memmap(str(folder))
+    assert open_tensors(folder.parents[19]).shape == (4,)
+    edit(folder / "meta.json", again={"type": "TensorDict"})
+    TensorDict({}, [4]).memmap(str(folder / "again"))
+    with pytest.raises(ValueError, match="more than 20 folders in each other"):
+        open_tensors(folder.parents[19])

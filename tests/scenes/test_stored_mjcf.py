@@ -1,0 +1,59 @@
+"""What cannot be read again from a description is refused where a scene is loaded; the rest comes back."""
+
+from __future__ import annotations
+
+import pytest
+
+from torchrl_gn.scenes import SceneError, load_scene, scene_from_description
+from torchrl_gn.scenes.stored_mjcf import packed, unpacked
+
+BALL = '<body><joint/><geom size=".1"/></body>'
+
+
+def model(inside: str, before: str = "") -> str:
+    return f"<mujoco>{before}<worldbody>{inside}{BALL}</worldbody></mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (model(f'<replicate count="100"><replicate count="100">{BALL}</replicate></replicate>'), r"3\.01e\+04 times"),
+        (model("", '<option iterations="1000000"/>'), r"iterations=1e\+06 of <option> is too much"),
+        (
+            model("", '<compiler><lengthrange inttotal="10" timestep="0.00001"/></compiler>'),
+            "inttotal=10 of <lengthrange> is too much for its timestep=1e-05",
+        ),
+    ],
+)
+def test_too_much_is_refused_before_anything_is_trained(text, message):
+    with pytest.raises(SceneError, match=message):
+        load_scene(text)
+
+
+@pytest.mark.parametrize("step", ["0", "nan", "inf", "-0.002", "1e-12"])
+def test_physics_steps_that_nothing_can_be_simulated_with(step):
+    with pytest.raises(
+        SceneError, match=rf"physics step of scene 'name' is {float(step):g} s, .* set <option timestep="
+    ):
+        load_scene(model("", f'<option timestep="{step}"/>'), name="name")
+
+
+def test_a_control_step_of_too_many_physics_steps():
+    text = model("", '<option timestep="0.00001"/>')
+    assert load_scene(text).substeps == 2000
+    with pytest.raises(SceneError, match="a control step of 1 s may take at most 10000"):
+        load_scene(text, timestep=1)
+
+
+def test_copies_and_comments_that_only_mujoco_reads_come_back():
+    text = model(f'<!-- a -- b --><replicate count="20" offset="1 0 0">{BALL}</replicate>')
+    scene = load_scene(text)
+    assert scene.num_nodes == 22
+    assert scene_from_description(scene.description()).fingerprint() == scene.fingerprint()
+
+
+def test_files_are_unpacked_as_they_were_and_no_further_than_their_size():
+    files = {"a": b"text", "b": bytes(range(256)) * 99, "c": b""}
+    assert unpacked({name: packed(content) for name, content in files.items()}) == files
+    with pytest.raises(SceneError, match="'b', are unpacked to too much"):
+        unpacked({"a": packed(b"0" * 50_000_000), "b": packed(b"0" * 50_000_000)})

@@ -1,0 +1,67 @@
+"""Numbers of a run in one file, which goes on whatever a crash left of it."""
+
+from __future__ import annotations
+
+import csv
+import warnings
+
+import pytest
+
+from torchrl_gn.training.csv_log import CsvLog
+
+
+def rows(path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def path(tmp_path):
+    log = CsvLog(tmp_path / "numbers.csv")
+    for step in range(5):
+        log.log({"loss": step / 2, "a,b": step}, step)
+    return log.path
+
+
+def test_a_whole_file_goes_on(path):
+    before = path.read_bytes()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        log = CsvLog(path)
+    assert path.read_bytes() == before
+    log.log({"loss": 9}, 3)
+    assert [(row["step"], row["loss"]) for row in rows(path)] == [
+        ("0", "0.0"),
+        ("1", "0.5"),
+        ("2", "1.0"),
+        ("3", "9.0"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("damage", "kept"),
+    [
+        (lambda data: data[:-4], 4),  # a cut row
+        (lambda data: data.replace(b"1.5", b"1.\0"), 4),
+        (lambda data: data + b"\0" * 512, 5),  # what some file systems leave of the last block
+        (lambda data: data.replace(b"2,1.0,2.0", b"2,1.0"), 4),
+        (lambda data: data.replace(b"2,1.0,2.0", b"2,one,2.0"), 4),
+        (lambda data: data.replace(b"2,1.0,2.0", b"\xff,1.0,2.0"), 4),
+        (lambda data: b"\0" * len(data), 0),
+        (lambda data: data[10:], 0),  # without its header
+    ],
+)
+def test_damaged_rows_are_left_out_and_said(path, damage, kept):
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.warns(UserWarning, match=r"numbers\.csv: \d+ damaged rows are left out"):
+        log = CsvLog(path)
+    assert len(rows(path)) == kept
+    log.log({"loss": 1}, 7)
+    assert rows(path)[-1]["step"] == "7" and len(rows(path)) == kept + 1
+    CsvLog(path)
+
+
+def test_an_empty_file_begins_anew(tmp_path):
+    (tmp_path / "numbers.csv").touch()
+    CsvLog(tmp_path / "numbers.csv").log({"loss": 1}, 0)
+    assert rows(tmp_path / "numbers.csv") == [{"step": "0", "loss": "1.0"}]

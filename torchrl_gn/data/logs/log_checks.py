@@ -1,0 +1,148 @@
+"""Find what a log's numbers contradict: units, signs, the order of its rows."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchrl_gn.data.logs.robot_log import RobotLog, short_way, unbroken
+
+_WINDOW = 16  # rows over which velocities are added up: noise and lags of filters matter little
+_FEWEST = 20  # windows that tell something
+_CLEAR = 0.8  # correlation from which on velocities belong to the angles, whatever their unit
+_DOUBTFUL, _IMPOSSIBLE = 1.5, 5.0  # factors between velocities and changes that are warned of, and refused
+_LARGE = 0.05  # rad, standard deviation of an angle that is no noise
+_SLOWEST, _FASTEST = 1.0, 1e-5  # seconds between rows that are likely another unit
+_UNITS = {
+    180 / np.pi: "velocities in degrees/s",
+    np.pi / 180: "angles in degrees",
+    1e3: "times in milliseconds",
+    1e6: "times in microseconds",
+    1e9: "times in nanoseconds",
+}
+
+
+class LogContentWarning(UserWarning):
+    """A log's numbers are unlikely: another unit, say."""
+
+
+def gain_and_correlation(change: np.ndarray, explained: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Slope ``[J]`` of changes that velocities explain over the changes ``[n, J]``, and their correlation."""
+    both, own = (change * explained).sum(0), np.square(change).sum(0)
+    correlation = both / np.maximum(np.sqrt(own * np.square(explained).sum(0)), 1e-30)
+    return both / np.maximum(own, 1e-30), correlation
+
+
+def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[str]) -> None:
+    """Refuse or warn of velocities of the wrong sign or unit; ``what`` names each.
+
+    Raises:
+        ValueError: if they are of the opposite sign, or five times too large or too small.
+    """
+    clear = np.abs(correlation) > _CLEAR
+    if opposite := np.flatnonzero(clear & (gain < 0)).tolist():
+        first = opposite[0]
+        raise ValueError(
+            f"velocities of {', '.join(what[index] for index in opposite)} have the opposite sign of the changes"
+            f" (correlation {correlation[first]:.2f}): turn the sign of one, or leave the velocities out"
+        )
+    size = np.abs(np.log(np.where(clear, np.maximum(gain, 1e-30), 1)))
+    worst = int(size.argmax())
+    if size[worst] < np.log(_DOUBTFUL):
+        return
+    text = (
+        f"velocities of {what[worst]} are {gain[worst]:.3g} times the changes over the time step"
+        f" (correlation {correlation[worst]:.2f}){_unit(gain[worst])}"
+    )
+    if size[worst] > np.log(_IMPOSSIBLE):
+        raise ValueError(f"{text}. Give all in SI units, or leave the velocities out")
+    warnings.warn(f"{text}. Are units and time step right?", LogContentWarning, stacklevel=2)
+
+
+def check_timestep(timestep: float) -> None:
+    """Warn of a time between rows, in seconds, that no robot's log has."""
+    if not _FASTEST <= timestep < _SLOWEST:
+        warnings.warn(
+            f"The log has {timestep:g} s between rows: are its times in another unit than seconds?",
+            LogContentWarning,
+            stacklevel=2,
+        )
+
+
+def check_robot_log(log: RobotLog, *, degrees: bool, measured: bool) -> None:
+    """Refuse or warn of a log whose numbers contradict each other.
+
+    Args:
+        degrees: whether the log was in degrees before.
+        measured: whether velocities are the file's own, and no differences of angles.
+
+    Raises:
+        ValueError: if rows are out of order, or of :func:`check_velocities`.
+    """
+    inside = log.inside & np.isfinite(log.steps)
+    back = int((inside & (log.steps <= 0)).sum())
+    if back > 0.1 * max(1, inside.sum()):
+        raise ValueError(
+            f"{back:,} of {int(inside.sum()):,} rows are not later than the row before: sort them by time, or say where"
+            " episodes begin"
+        )
+    check_timestep(log.timestep)
+    parts = unbroken(log, 50.0)
+    _check_order(log, inside & ~log.gaps)
+    _check_degrees(log, degrees)
+    change, explained = [], []
+    for part in parts if measured else ():
+        count = (part.stop - part.start - 1) // _WINDOW * _WINDOW
+        rows = slice(part.start, part.start + count + 1)
+        if not count:
+            continue
+        steps = log.steps[rows.start : rows.stop - 1, None]
+        mean = (log.velocity[rows][1:] + log.velocity[rows][:-1]) / 2 * steps
+        both = short_way(np.diff(log.angle[rows], axis=0)), mean
+        for kept, each in zip((change, explained), both, strict=True):
+            kept.append(each.reshape(-1, _WINDOW, log.num_joints).sum(1))
+    if sum(map(len, change)) >= _FEWEST:
+        found = gain_and_correlation(np.concatenate(change), np.concatenate(explained))
+        check_velocities(*found, [f"joint {joint}" for joint in range(log.num_joints)])
+
+
+def _check_order(log: RobotLog, inside: np.ndarray) -> None:
+    """Raise ValueError for angles that jump about as if rows were shuffled, which velocities do not explain."""
+    good = inside & log.finite[1:] & log.finite[:-1]
+    if good.sum() < _FEWEST:
+        return
+    change = short_way(np.diff(log.angle, axis=0)[good])
+    slow = np.abs((log.velocity[1:] + log.velocity[:-1])[good] / 2 * log.steps[good, None])
+    spread = np.minimum(log.angle[log.finite].std(0), np.pi / np.sqrt(3))  # that of an angle anywhere in a turn
+    moves = spread > _LARGE
+    # Half the squared change over the variance: 1 if rows are independent, near 0 of a motion that is followed.
+    ratio = np.square(change).mean(0) / np.maximum(2 * np.square(spread), 1e-30)
+    shuffled = moves & (ratio > 0.5) & (np.median(np.abs(change), axis=0) > 3 * np.median(slow, axis=0))
+    if moves.any() and shuffled.sum() > 0.5 * moves.sum():
+        joint = int(np.flatnonzero(shuffled)[0])
+        raise ValueError(
+            f"the angle of joint {joint} changes by {np.median(np.abs(change[:, joint])):.2g} rad from row to row, but"
+            f" velocities say {np.median(slow[:, joint]):.2g}: its rows are not in the order of time, or angles not in"
+            " radians"
+        )
+
+
+def _check_degrees(log: RobotLog, degrees: bool) -> None:
+    farthest = np.nanmax(np.where(np.isfinite(log.angle), np.abs(log.angle), 0), axis=0)
+    usual = float(np.median(farthest))
+    if not degrees and usual > 4 * np.pi:
+        hint = f"Angles reach {usual:.3g} rad, {usual / (2 * np.pi):.2g} turns: if they are degrees, give degrees=True."
+    elif degrees and 0 < farthest.max() < np.deg2rad(2 * np.pi):
+        hint = f"Angles reach {np.rad2deg(farthest.max()):.3g} degrees: if they are radians, leave out degrees=True."
+    else:
+        return
+    warnings.warn(hint, LogContentWarning, stacklevel=2)
+
+
+def _unit(gain: float) -> str:
+    for known, unit in _UNITS.items():
+        if 0.9 < gain / known < 1.1:
+            return f", as of {unit}"
+    return ""

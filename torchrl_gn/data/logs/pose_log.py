@@ -1,0 +1,218 @@
+"""Read logs of body poses, as motion capture writes them, and find the frame and order of their numbers."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+
+from torchrl_gn.data.dataset_files import DatasetError
+from torchrl_gn.data.logs.log_checks import check_timestep, check_velocities, gain_and_correlation
+from torchrl_gn.maths import quaternion
+
+Order = Literal["wxyz", "xyzw"]
+Frame = Literal["world", "body"]
+
+_NORM = 0.01  # by which quaternions may miss unit length, as rounded ones do
+_EVEN = 0.01  # of a step, tolerance for rounded time stamps
+_OTHER = 3.0  # times closer that another reading must be to the angular velocities
+_FEWEST = 20  # rows whose velocities tell something
+_STILL = 1e-3  # rad/s below which angular velocities tell no reading
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PoseLog:
+    """Poses and velocities of bodies, ``R`` rows of ``B`` bodies, episode after episode."""
+
+    state: np.ndarray  # [R, B, 13] position, quaternion w-first, linear and angular velocity; SI, world frame
+    length: np.ndarray  # [episodes] rows of each; their sum is R
+    timestep: float  # between rows, seconds
+    action: np.ndarray  # [R, A] given in each row's state; [R, 0] of bodies that nothing drives
+
+    def __repr__(self) -> str:
+        sizes = {"episodes": len(self.length), "rows": len(self.state), "bodies": self.state.shape[1]}
+        sizes |= {"actions": self.action.shape[1], "timestep": float(f"{self.timestep:.4g}")}
+        return f"PoseLog({', '.join(f'{name}={value}' for name, value in sizes.items())})"
+
+
+def load_pose_log(
+    path: str | os.PathLike, *, timestep: float | None = None, order: Order = "wxyz", frame: Frame = "world"
+) -> PoseLog:
+    """Read a log of body poses.
+
+    An ``.npz`` of ``position`` (m) and ``quaternion``, and optionally ``velocity`` (m/s, world frame) and
+    ``angular_velocity`` (rad/s), or of ``state``, all of these side by side. Each is ``[R, B, k]``, or ``[R, k]`` of
+    one body, with ``length`` ``[episodes]`` (rows of each; default: one episode); or padded, ``[episodes, T, B, k]``,
+    with ``length``. Optionally ``action`` ``[R, A]`` likewise, and ``timestep``, ``dt`` or ``time`` ``[R]`` (seconds).
+
+    Velocities that are not there are backward differences, which lose the first row of each episode.
+
+    Args:
+        timestep: time between rows, seconds, if the file does not have it.
+        order: of quaternions, w first (MuJoCo) or last (ROS, SciPy).
+        frame: of angular velocities, the world's or the body's (MuJoCo's free joints, gyroscopes).
+
+    Raises:
+        DatasetError: if the file is missing or incomplete, numbers are not finite, quaternions have no unit length,
+            time stamps are uneven, angular velocities show another ``order`` or ``frame``, or velocities another sign
+            or unit than the changes of positions. LogContentWarning where numbers are only unlikely.
+    """
+    path = Path(path)
+    if order not in get_args(Order) or frame not in get_args(Frame):
+        raise ValueError(f"order={order!r} must be one of {get_args(Order)}, frame={frame!r} one of {get_args(Frame)}.")
+    if not path.exists() or path.suffix != ".npz":
+        raise DatasetError(f"No log of poses at {path}: it must be an .npz file.")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return _log({name: file[name] for name in file.files}, timestep, order, frame)
+    except (ValueError, OSError, EOFError, BadZipFile) as error:
+        raise DatasetError(f"{path} cannot be read as a log of poses: {error}") from error
+
+
+def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, frame: Frame) -> PoseLog:
+    rows, length = _rows(arrays)
+    missing = {"position", "quaternion"} - rows.keys()
+    if missing:
+        raise ValueError(f"it lacks {sorted(missing)}, or state; it has {sorted(arrays)}.")
+    timestep = _timestep(arrays, rows.get("time"), length, timestep)
+    begins = np.cumsum(length) - length
+    for name, values in rows.items():
+        bad = ~np.isfinite(values).reshape(len(values), -1).all(1)
+        if bad.any():
+            where = _place(int(bad.argmax()), begins)
+            raise ValueError(f"{name} is not finite at {where}; end the episode there by length, or leave it out.")
+    norm = np.linalg.norm(rows["quaternion"], axis=-1)
+    if (off := np.abs(norm - 1).max(1)).max() > _NORM:
+        row = int(off.argmax())
+        raise ValueError(
+            f"quaternions must have unit length, at {_place(row, begins)} it is {norm[row].max():.3g}: are its columns"
+            " a position, a quaternion, a velocity and an angular velocity?"
+        )
+    turns = rows["quaternion"] / norm[..., None]
+    inside = np.ones(len(turns), dtype=bool)
+    inside[begins] = False
+    if "angular_velocity" in rows:
+        _check_reading(turns, rows["angular_velocity"], inside, timestep, order, frame)
+    first = _w_first(turns, order)
+    position, kept = rows["position"], np.ones(len(turns), dtype=bool)
+    velocity, spin = rows.get("velocity"), rows.get("angular_velocity")
+    check_timestep(timestep)
+    if velocity is not None:
+        _check_velocity(position, velocity, inside, timestep)
+    if velocity is None or spin is None:
+        kept, length = inside, length - 1
+    if velocity is None:
+        velocity = np.diff(position, axis=0, prepend=position[:1]) / timestep
+    if spin is None:
+        spin = np.concatenate((np.zeros_like(position[:1]), _spins(first, timestep, "world")))
+    elif frame == "body":
+        spin = quaternion.rotate(first, torch.from_numpy(spin)).numpy()
+    if (length < 2).any():
+        raise ValueError(f"episode {int(np.argmin(length))} has too few rows for a step.")
+    state = np.concatenate((position, first.numpy(), velocity, spin), -1)
+    action = rows.get("action", np.zeros((len(state), 0)))
+    return PoseLog(state[kept], length, timestep, action[kept].reshape(kept.sum(), -1))
+
+
+def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Arrays ``[R, B, k]`` (time ``[R]``, action ``[R, A]``) without padding, and rows of each episode."""
+    sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
+    found = {name: arrays[name] for name in (*sizes, "state", "action", "time") if name in arrays}
+    if "state" in found:
+        state = found.pop("state")
+        if state.shape[-1] != 13 or found.keys() & sizes.keys():
+            raise ValueError(f"state {state.shape} must be [..., 13], and the only array of poses.")
+        found |= dict(zip(sizes, np.split(state, (3, 7, 10), -1), strict=True))
+    if "position" not in found:
+        return found, np.zeros(0, dtype=np.int64)
+    length = arrays.get("length")
+    head = found["position"].shape[:2]
+    # Padded episodes are known by their lengths, one for each and none longer than the padding.
+    lengths = np.atleast_1d(head[0] if length is None else length).astype(np.int64)
+    padded = length is not None and found["position"].ndim > 2 and lengths.shape == head[:1]
+    padded = padded and bool(lengths.max() <= head[1]) and int(lengths.sum()) != head[0]
+    if not padded and lengths.sum() != len(found["position"]):
+        raise ValueError(f"length adds up to {lengths.sum()} rows, but there are {len(found['position'])}.")
+    rows = {}
+    for name, values in found.items():
+        if len(values) != head[0] or (padded and values.shape[:2] != head):
+            raise ValueError(f"{name} {values.shape} does not fit position {found['position'].shape}.")
+        flat = np.concatenate([values[i, :n] for i, n in enumerate(lengths)]) if padded else values
+        flat = flat.astype(np.float64)
+        if name in sizes:
+            flat = flat[:, None] if flat.ndim == 2 else flat
+            if flat.ndim != 3 or flat.shape[2] != sizes[name]:
+                raise ValueError(f"{name} {values.shape} must end with {sizes[name]} numbers of each body.")
+        rows[name] = flat
+    if len({rows[name].shape[1] for name in sizes if name in rows}) > 1:
+        raise ValueError(
+            f"arrays have different numbers of bodies: { {n: rows[n].shape for n in sizes if n in rows} }."
+        )
+    return rows, lengths
+
+
+def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np.ndarray, given: float | None) -> float:
+    said = {"timestep=": given} | {name: float(arrays[name]) for name in ("timestep", "dt") if name in arrays}
+    if time is not None:
+        steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)
+        usual = float(np.median(steps))
+        if not (np.abs(steps - usual) <= _EVEN * abs(usual)).all():
+            raise ValueError(f"times are not even: steps of {steps.min():g} to {steps.max():g} s; resample it first.")
+        said["time"] = usual
+    known = {name: value for name, value in said.items() if value is not None}
+    if not known or not all(0 < value < np.inf for value in known.values()):
+        raise ValueError("it does not say its time step; give timestep=SECONDS.")
+    if max(known.values()) > (1 + _EVEN) * min(known.values()):
+        raise ValueError(f"its time steps differ, in seconds: {known}; leave out what is wrong.")
+    return next(iter(known.values()))
+
+
+def _check_reading(
+    turns: np.ndarray, spin: np.ndarray, inside: np.ndarray, timestep: float, order: Order, frame: Frame
+) -> None:
+    """Compare angular velocities with differences of the rotations in every order and frame."""
+    middle = ((spin[1:] + spin[:-1]) / 2)[inside[1:]]
+    if np.abs(middle).max(initial=0) < _STILL:
+        return
+    off = {}
+    for other in get_args(Order):
+        for where in get_args(Frame):
+            found = _spins(_w_first(turns, other), timestep, where)[inside[1:]]
+            off[other, where] = float(np.median(np.linalg.norm(found - middle, axis=-1)))
+    best = min(off, key=off.__getitem__)
+    if off[order, frame] > _OTHER * off[best] and off[order, frame] > _STILL:
+        raise ValueError(
+            f"angular velocities are {off[order, frame]:.2g} rad/s off the rotations' differences as order={order!r},"
+            f" frame={frame!r}, but {off[best]:.2g} as order={best[0]!r}, frame={best[1]!r}: give these."
+        )
+
+
+def _check_velocity(position: np.ndarray, velocity: np.ndarray, inside: np.ndarray, timestep: float) -> None:
+    """Compare linear velocities with the changes of the positions, body by body."""
+    within = inside[1:]
+    if within.sum() < _FEWEST:
+        return
+    change = np.moveaxis(np.diff(position, axis=0)[within], 1, -1).reshape(-1, position.shape[1])  # [rows * 3, B]
+    mean = np.moveaxis(((velocity[1:] + velocity[:-1]) / 2)[within] * timestep, 1, -1).reshape(change.shape)
+    check_velocities(*gain_and_correlation(change, mean), [f"body {body}" for body in range(change.shape[1])])
+
+
+def _w_first(turns: np.ndarray, order: Order) -> torch.Tensor:
+    return torch.from_numpy(turns if order == "wxyz" else np.roll(turns, 1, axis=-1))
+
+
+def _spins(turns: torch.Tensor, timestep: float, frame: Frame) -> np.ndarray:
+    """Angular velocities ``[R - 1, B, 3]`` between rows, by differences."""
+    back = quaternion.conjugate(turns[:-1])
+    change = quaternion.product(turns[1:], back) if frame == "world" else quaternion.product(back, turns[1:])
+    return quaternion.log(change).numpy() / timestep
+
+
+def _place(row: int, begins: np.ndarray) -> str:
+    episode = int(np.searchsorted(begins, row, side="right")) - 1
+    return f"row {row - begins[episode]} of episode {episode}"

@@ -1,0 +1,106 @@
+"""Read folders of memory-mapped TensorDicts: tensors alone, without pickle, and without writing to them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+_DTYPES = {
+    str(dtype): dtype
+    for dtype in (
+        *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
+        *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool),
+    )
+}
+_LAYOUT = "meta.json"
+_LARGEST = 2**20  # bytes of a layout, which has a line for each tensor
+_DEEPEST = 20  # folders in folders, and dimensions
+
+
+def open_tensors(folder: str | os.PathLike) -> TensorDict:
+    """Map the tensors of a folder that ``TensorDict.memmap`` wrote, copy-on-write: its files never change.
+
+    ``TensorDict.load_memmap`` would run the code of pickles beside them, and lengthen files that are too short.
+
+    Raises:
+        ValueError: if the folder holds anything but tensors, or a file is missing, or not as long as its tensor.
+    """
+    folder = Path(folder)
+    _, batch = _layout(folder)
+    return TensorDict(dict(_tensors(folder, batch, ())), batch_size=batch)
+
+
+def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Tensor]]:
+    """Names and tensors of a folder and those in it."""
+    if len(path) > _DEEPEST:
+        raise ValueError(f"{folder}: more than {_DEEPEST} folders in each other.")
+    for name, entry in _layout(folder)[0].items():
+        what = f"{folder / _LAYOUT}: {name!r}"
+        if not re.fullmatch(r"\w[\w.-]*", name):
+            raise ValueError(f"{what} is no name of a tensor: letters, digits, '_', '-' and '.' make one.")
+        if "type" in entry:
+            if entry["type"] != "TensorDict":
+                raise ValueError(f"{what} is of type {entry['type']!r}, and only tensors are read: leave it out.")
+            if (folder / name).is_symlink():  # which could lead to itself
+                raise ValueError(f"{folder / name}: a link, not a folder.")
+            yield from _tensors(folder / name, batch, (*path, name))
+            continue
+        dtype, shape = _DTYPES.get(str(entry.get("dtype"))), _shape(entry)
+        if dtype is None or shape is None or shape[: len(batch)] != batch or entry.get("is_nested"):
+            described = f"dtype {entry.get('dtype')!r} and shape {entry.get('shape')!r}"
+            raise ValueError(f"{what} is no plain tensor of real numbers {[*batch, '...']}: it has {described}.")
+        yield (*path, name), _mapped(folder / f"{name}.memmap", shape, dtype)
+
+
+def _layout(folder: Path) -> tuple[dict[str, dict], list[int]]:
+    """What a folder says of its tensors and folders, by name, and its batch size."""
+    file = folder / _LAYOUT
+    if not file.is_file():
+        raise ValueError(f"{file}: no such file, so the folder holds no tensors that TensorDict.memmap wrote.")
+    if (size := file.stat().st_size) > _LARGEST:
+        raise ValueError(f"{file}: {size} bytes are too many for a description of tensors.")
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file}: damaged ({error}).") from error
+    kind = found.get("_type") if isinstance(found, dict) else type(found).__name__
+    if kind != str(TensorDict):
+        raise ValueError(f"{file}: describes {kind}, but only tensors in a TensorDict are read: leave it out.")
+    if (batch := _shape(found)) is None:
+        raise ValueError(f"{file}: damaged ({found.get('shape')!r} is no batch size).")
+    return {name: entry for name, entry in found.items() if isinstance(entry, dict)}, batch
+
+
+def _shape(entry: dict[str, Any]) -> list[int] | None:
+    """The shape that an entry has, if it can be one."""
+    shape = entry.get("shape")
+    if not isinstance(shape, list) or not all(type(size) is int and size >= 0 for size in shape):
+        return None
+    # Strides are products of sizes, also of a tensor without numbers.
+    return shape if math.prod(max(size, 1) for size in shape) < 2**60 and len(shape) <= _DEEPEST else None
+
+
+def _mapped(file: Path, shape: list[int], dtype: torch.dtype) -> Tensor:
+    count = math.prod(shape)
+    if not count:  # a scene without actuators
+        return torch.empty(shape, dtype=dtype)
+    if not file.is_file():
+        raise ValueError(f"{file}: missing.")
+    size, wanted = file.stat().st_size, count * dtype.itemsize
+    if size != wanted:
+        raise ValueError(f"{file}: {size} bytes, should be {wanted}: truncated or changed.")
+    if dtype != torch.bool:
+        return torch.from_file(str(file), shared=False, size=count, dtype=dtype).view(shape)
+    values = torch.from_file(str(file), shared=False, size=count, dtype=torch.uint8).view(shape)
+    if bool((values > 1).any()):
+        raise ValueError(f"{file}: holds other numbers than false and true.")
+    return values.view(torch.bool)

@@ -1,0 +1,61 @@
+"""Controls of motors that follow random slow joint paths, as a controller of torques would give them."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.data.holding import MotorLaws
+from torchrl_gn.data.servo_targets import position_targets
+from torchrl_gn.data.simulate import Simulator
+
+_BANDWIDTH = 0.2  # of the controller, in radians a control step; it is critically damped
+
+
+def tracking_controls(
+    simulator: Simulator,
+    physics: np.ndarray,
+    variant: np.ndarray,
+    controls: np.ndarray,
+    disturbance: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    width: np.ndarray,
+    speed: np.ndarray,
+    knot_interval: float,
+) -> np.ndarray | None:
+    """Controls ``[n, T, A]`` whose motors follow paths from states ``[n, S]`` on by inverse dynamics.
+
+    None if the motors cannot move each joint of their robots by itself. Others keep their ``controls``.
+
+    Args:
+        disturbance: ``[n, T, A]``, added to the motors' controls before these are clipped.
+        width: ``[n, 1]`` of the paths, as a share of the joints' ranges (or 2 pi).
+        speed: ``[n, 1]`` of the paths, as a share of pi rad/s or 1 m/s.
+    """
+    scene, steps = simulator.scene, controls.shape[1]
+    laws = MotorLaws(scene.model)
+    if not len(physics) or (joints := laws.driven_joints(physics[0])) is None:
+        return None
+    model, here = scene.model, 1 + scene.model.jnt_qposadr[joints]
+    limited = model.jnt_limited[joints] != 0
+    low = np.where(limited, model.jnt_range[joints, 0], -math.pi)
+    high = np.where(limited, model.jnt_range[joints, 1], math.pi)
+    slide = model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    fastest = speed * np.where(slide, 1.0, math.pi) * scene.timestep
+    width = np.broadcast_to(width, fastest.shape)
+    path = position_targets(physics[:, here], low, high, width, fastest, steps, knot_interval, rng)
+    dofs, frequency = model.jnt_dofadr[joints], _BANDWIDTH / scene.timestep
+    at_rate = 1 + model.nq + dofs
+    controls, state = controls.copy(), physics.copy()
+    for step in range(steps):
+        wanted = frequency**2 * (path[:, step] - state[:, here]) - 2 * frequency * state[:, at_rate]
+        for row in np.flatnonzero(np.isfinite(state).all(1)):
+            own = simulator.scenes[variant[row]].model
+            controls[row, step, laws.motors] = laws.controls(own, state[row], dofs, wanted[row])
+        controls[:, step] += np.where(laws.mask, disturbance[:, step], 0.0)
+        controls[:, step] = np.clip(controls[:, step], scene.action_low, scene.action_high)
+        state, _ = simulator.step(state, controls[:, step], variant)
+    return controls

@@ -1,0 +1,289 @@
+"""Run a step program on an NVIDIA GPU: state maths in CUDA kernels, the network by torch, steps as CUDA graphs."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from torchrl_gn.cache import keep_inductor_private
+from torchrl_gn.dynamics.executors import eager
+from torchrl_gn.dynamics.executors.compiled import recompile_limits
+from torchrl_gn.dynamics.executors.cuda.graphs import StepGraph
+from torchrl_gn.dynamics.executors.cuda.nvrtc import NoCudaCompilerError, check_compiler
+from torchrl_gn.dynamics.executors.cuda.source import Layout
+from torchrl_gn.dynamics.executors.cuda.state_kernels import NetworkInputs, StateKernels, StepResult, kernel_types
+from torchrl_gn.dynamics.executors.native.executor import list_layers
+from torchrl_gn.dynamics.executors.native.samples import ParameterInputs
+from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
+from torchrl_gn.dynamics.executors.native.trace import UntraceableError
+from torchrl_gn.dynamics.program import StepProgram
+from torchrl_gn.networks.core import FoldedCore, ListedCore
+from torchrl_gn.networks.folded_gn_core import FoldedGNCore
+from torchrl_gn.networks.graph import Graph
+from torchrl_gn.networks.tensor_tree import copy_of, leaves, rebuild, skeleton
+
+_DTYPES = (torch.float32, torch.float64)  # of states and actions
+_MOST_GRAPHS = 8  # each keeps the memory of its steps
+
+
+class CudaExecutor:
+    """Run the step on a GPU; by torch operations what it cannot: ``reason`` says why.
+
+    State maths in float64 kernels, one thread a sample, compiled at the first call of a scene (seconds to minutes,
+    kept in the user's cache); the network by torch in the program's dtype. Differentiable once, in state, action and
+    weights. For one thread at a time: recorded steps share their memory.
+
+    Args:
+        program: one of those that it is to run.
+        change: whether :meth:`delta` is to run by kernels, instead of :meth:`step` and :meth:`rollout`.
+        graphs: whether to record steps as CUDA graphs, one for each number of samples: for programs whose tensors stay
+            where they are.
+        compiles: whether the network goes through ``torch.compile``.
+    """
+
+    fixed_batch = False
+
+    def __init__(
+        self,
+        program: StepProgram,
+        *,
+        change: bool = False,
+        graphs: bool = True,
+        compiles: bool = False,
+        make: Callable[..., Any] | None = None,
+    ) -> None:
+        self.change, self.graphs, self.compiles, self.reason = change, graphs, compiles, None
+        self._compiled: _CompiledNetwork | None = None
+        self._recorded: OrderedDict[tuple, StepGraph] = OrderedDict()
+        plain = moved(program, "cpu")
+        layers, self.reason = list_layers(plain)
+        if layers is None:
+            return
+        core, last = plain.core, layers.layers[-1]
+        assert isinstance(core, ListedCore)
+        predicted = torch.arange(layers.nodes[0])[core.predicted].numpy()
+        width = last.count * len(last.weight) // max(len(predicted), 1)
+        shape = program.reference.shape
+        self.parameters = ParameterInputs.of(plain)
+        try:
+            if make is None:
+                check_compiler()
+            maths = StateMaths(
+                plain, np.zeros(shape), np.zeros(shape, dtype=bool), predicted, width, self.parameters, change
+            )
+        except (NoCudaCompilerError, UntraceableError) as error:
+            self.reason = str(error)
+            return
+        self._inputs = layers.nodes, layers.edges
+        layout = Layout(
+            state=maths.is_constant.size,
+            result=maths.result_size,
+            actions=maths.actions,
+            node_inputs=layers.nodes[0] * layers.nodes[1],
+            node_width=layers.nodes[1],
+            edge_width=layers.edges[1],
+            output_width=width,
+        )
+        self._kernels = StateKernels(maths, layout, **({} if make is None else {"make": make}))
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_recorded": OrderedDict(), "_compiled": None}  # a copy makes its own
+
+    def pack(self, program: StepProgram) -> StepProgram:
+        return program
+
+    def step(
+        self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        if self.change or not self._runs(program, state, action):
+            return eager.step(program, state, action, hidden)
+        flat_state, flat_action = _flat(state, 2), _flat(action, 1)
+        if self._records(program):
+            after = _Rollout.apply(self, program, flat_state, flat_action.unsqueeze(1))[:, 1]
+        else:
+            after = self._step(program, flat_state, flat_action)
+        return after.view(state.shape), None
+
+    def rollout(
+        self, program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        if self.change or not self._runs(program, state, actions):
+            return eager.rollout(program, state, actions, hidden)
+        flat_state, flat_actions = _flat(state, 2), _flat(actions, 2)
+        if self._records(program):
+            states = _Rollout.apply(self, program, flat_state, flat_actions)
+        else:
+            found = [flat_state]
+            for action in flat_actions.unbind(1):
+                found.append(self._step(program, found[-1], action.contiguous()))
+            states = torch.stack(found, 1)
+        return states.view(*state.shape[:-2], *states.shape[1:]), None
+
+    def delta(
+        self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
+    ) -> tuple[Tensor, Graph | None]:
+        """Predicted change ``[*B, N, 12]``, as :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
+        if not self.change or not self._runs(program, state, action):
+            return eager.delta(program, state, action, hidden)
+        change = self._step(program, _flat(state, 2), _flat(action, 1))
+        return change.view(*state.shape[:-1], -1), None
+
+    def _runs(self, program: StepProgram, state: Tensor, actions: Tensor) -> bool:
+        """Whether the kernels compute this call."""
+        return (
+            self.reason is None
+            and state.dtype in _DTYPES
+            and actions.dtype in _DTYPES
+            and state.device == actions.device == program.movable.device
+            and not torch.compiler.is_compiling()
+            and not torch._C._are_functorch_transforms_active()
+            and forward_ad._current_level < 0
+        )
+
+    def _records(self, program: StepProgram) -> bool:
+        """Whether steps are recorded: not of what samples bring, nor inside of another recording."""
+        return (
+            self.graphs
+            and program.movable.is_cuda
+            and not len(self.parameters)
+            and not torch.cuda.is_current_stream_capturing()
+            and not any(leaf.requires_grad for _, leaf in leaves(program.core) if isinstance(leaf, Tensor))
+        )
+
+    def _step(self, program: StepProgram, state: Tensor, action: Tensor) -> Tensor:
+        """Result of contiguous states ``[B, N, C]`` and actions ``[B, A]``."""
+        gradient = torch.is_grad_enabled() and any(
+            leaf.requires_grad for leaf in (state, action, *(each for _, each in leaves(program.core)))
+        )
+        types = kernel_types(state, action, program.dtype)
+        self._kernels.prepare(types, state.device, gradient=gradient)
+        numbers = self.parameters.numbers(program)
+        nodes, edges = NetworkInputs.apply(self._kernels, self._inputs, program.dtype, state, action, numbers)
+        output = self.network(program, nodes, edges)
+        return StepResult.apply(self._kernels, state, action, numbers, output)
+
+    def network(self, program: StepProgram, nodes: Tensor, edges: Tensor) -> Tensor:
+        """The network's output ``[P, B, F_out]`` of its inputs ``[N, B, F_n]`` and ``[E, B, F_e]``."""
+        if not self.compiles:
+            return predict(program.core, program.edge_index, nodes, edges)
+        if self._compiled is None:
+            self._compiled = _CompiledNetwork(program)
+        return self._compiled(program, nodes, edges)
+
+    def recorded(self, program: StepProgram, kind: str, state: Tensor, action: Tensor) -> StepGraph:
+        """The graph of a step (``"after"``) or its gradient (``"pull"``) for this number of samples."""
+        tensors = [leaf for _, leaf in leaves(program) if isinstance(leaf, Tensor)]
+        places = tuple(tensor.data_ptr() for tensor in tensors)
+        settings = torch.backends.cuda.matmul.allow_tf32
+        key = (kind, len(state), state.dtype, action.dtype, program.dtype, settings, *places)
+        if (found := self._recorded.get(key)) is None:
+            function = self._advance if kind == "after" else self._pull
+            inputs = [torch.zeros_like(each, memory_format=torch.contiguous_format) for each in (state, action)]
+            inputs[0].copy_(program.reference)
+            if kind == "pull":
+                inputs.append(torch.zeros_like(inputs[0]))
+            found = self._recorded[key] = StepGraph(lambda *given: function(program, *given), inputs)
+            if len(self._recorded) > _MOST_GRAPHS:
+                self._recorded.popitem(last=False)
+        self._recorded.move_to_end(key)
+        return found
+
+    def _advance(self, program: StepProgram, state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+        with torch.no_grad():
+            after = self._step(program, state, action)
+            state.copy_(after)  # for the next step
+        return (after,)
+
+    def _pull(self, program: StepProgram, state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, ...]:
+        with torch.enable_grad():
+            inputs = state.detach().requires_grad_(), action.detach().requires_grad_()
+            after = self._step(program, *inputs)
+            return torch.autograd.grad(after, inputs, gradient)
+
+
+class _Rollout(torch.autograd.Function):
+    """States ``[B, T + 1, N, C]`` by recorded steps; the gradient computes each step again."""
+
+    @staticmethod
+    def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, executor: CudaExecutor, program: StepProgram, state: Tensor, actions: Tensor
+    ) -> Tensor:
+        count, steps = actions.shape[:2]
+        states = state.new_empty(count, steps + 1, *state.shape[1:])
+        states[:, 0] = state
+        ctx.pull = None
+        if count and steps:
+            if any(ctx.needs_input_grad):  # recorded here: not by autograd's threads
+                ctx.pull = executor.recorded(program, "pull", state, actions[:, 0])
+            step = executor.recorded(program, "after", state, actions[:, 0])
+            step.inputs[0].copy_(state)
+            for t in range(steps):
+                step.inputs[1].copy_(actions[:, t])
+                step.replay()
+                states[:, t + 1] = step.outputs[0]
+        ctx.save_for_backward(states, actions)
+        return states
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradients: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
+        states, actions = ctx.saved_tensors
+        of_actions, gradient = torch.zeros_like(actions), gradients[:, -1].contiguous()
+        if (pull := ctx.pull) is not None:
+            for t in reversed(range(actions.shape[1])):
+                for static, given in zip(pull.inputs, (states[:, t], actions[:, t], gradient), strict=True):
+                    static.copy_(given)
+                pull.replay()
+                of_actions[:, t] = pull.outputs[1]
+                gradient = pull.outputs[0] + gradients[:, t]
+        return None, None, gradient, of_actions
+
+
+def moved(program: StepProgram, device: torch.device | str) -> StepProgram:
+    """The program on another device, detached."""
+    found: dict[int, Any] = {}  # what is the same stays the same
+
+    def there(leaf: Any) -> Any:
+        if id(leaf) not in found:
+            found[id(leaf)] = leaf.detach().to(device) if isinstance(leaf, Tensor) else copy_of(leaf).to(device)
+        return found[id(leaf)]
+
+    return rebuild(skeleton(program), (there(leaf) for _, leaf in leaves(program)))
+
+
+def predict(core: FoldedCore, edge_index: Tensor, nodes: Tensor, edges: Tensor) -> Tensor:
+    """The network's output ``[P, B, F_out]`` of inputs ``[N, B, F_n]`` and ``[E, B, F_e]``, by torch operations."""
+    empty = nodes.new_empty(nodes.shape[1], 0)
+    if isinstance(core, FoldedGNCore):
+        return core(nodes, edges, empty.unsqueeze(0)).contiguous()
+    full = core.predict(Graph(nodes.transpose(0, 1), edges.transpose(0, 1), empty, edge_index))
+    return full[:, cast(ListedCore, core).predicted].transpose(0, 1).contiguous()
+
+
+class _CompiledNetwork:
+    """The network through ``torch.compile``, as a function of its tensors; compiled for every number of samples."""
+
+    def __init__(self, program: StepProgram) -> None:
+        of = skeleton(program.core)
+
+        def run(nodes: Tensor, edges: Tensor, edge_index: Tensor, *tensors: Tensor) -> Tensor:
+            return predict(rebuild(of, iter(tensors)), edge_index, nodes, edges)
+
+        keep_inductor_private()
+        self._run = torch.compile(run, fullgraph=True, dynamic=False, **recompile_limits())
+
+    def __call__(self, program: StepProgram, nodes: Tensor, edges: Tensor) -> Tensor:
+        return self._run(nodes, edges, program.edge_index, *(cast(Tensor, leaf) for _, leaf in leaves(program.core)))
+
+
+def _flat(tensor: Tensor, dims: int) -> Tensor:
+    """One batch dimension before the last ``dims``."""
+    batch = tensor.shape[: tensor.ndim - dims]
+    return tensor.reshape(math.prod(batch), *tensor.shape[tensor.ndim - dims :]).contiguous()

@@ -1,0 +1,101 @@
+"""State maths on a GPU as two differentiable functions, before and after the network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics.executors.cuda.nvrtc import Kernel, compile_together
+from torchrl_gn.dynamics.executors.cuda.source import KERNELS, KernelTypes, Layout, kernel_sources
+from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
+
+Launch = Callable[..., None]  # as Kernel's
+
+_TYPES = {torch.float32: "float", torch.float64: "double", torch.bfloat16: "bfloat16"}
+
+
+class StateKernels:
+    """Kernels of one state maths, by the dtypes of state, action and network."""
+
+    def __init__(self, maths: StateMaths, layout: Layout, *, make: Callable[[str, str], Launch] = Kernel) -> None:
+        self.maths, self.layout, self._make = maths, layout, make
+        self._kernels: dict[tuple[str, KernelTypes], tuple[list[Launch], int]] = {}
+
+    def kernels(self, name: str, types: KernelTypes) -> tuple[list[Launch], int]:
+        """Those of :data:`KERNELS` of one name, to be run in turn, and the registers of their scratch."""
+        if (found := self._kernels.get((name, types))) is None:
+            sources, registers = kernel_sources(name, self.maths, self.layout, types)
+            found = self._kernels[name, types] = [self._make(name, source) for source in sources], registers
+        return found
+
+    def prepare(self, types: KernelTypes, device: torch.device, *, gradient: bool) -> None:
+        """Compile the kernels of a step, and of its gradient, that are not yet."""
+        names = KERNELS[: 4 if gradient else 2]
+        if device.type == "cuda" and any((name, types) not in self._kernels for name in names):
+            compile_together([cast(Kernel, each) for name in names for each in self.kernels(name, types)[0]], device)
+
+    def launch(self, name: str, types: KernelTypes, count: int, numbers: Tensor, *tensors: Tensor) -> None:
+        if not count:
+            return
+        (kernels, registers), stride = self.kernels(name, types), 0 if len(numbers) == 1 else numbers.shape[1]
+        scratch = numbers.new_empty(registers, count)
+        for kernel in kernels:
+            kernel(count, count, stride, scratch, *tensors)
+
+
+def kernel_types(state: Tensor, action: Tensor, network: torch.dtype) -> KernelTypes:
+    """Types of the kernels for these tensors; KeyError for other dtypes."""
+    return KernelTypes(_TYPES[state.dtype], _TYPES[action.dtype], _TYPES[network])
+
+
+class NetworkInputs(torch.autograd.Function):
+    """Network inputs ``[N, B, F_n]`` and ``[E, B, F_e]`` of states ``[B, N, C]`` and actions ``[B, A]``."""
+
+    @staticmethod
+    def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, kernels: StateKernels, shapes: Any, dtype: torch.dtype, state: Tensor, action: Tensor, numbers: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        ctx.kernels, ctx.types = kernels, kernel_types(state, action, dtype)
+        (nodes, node_width), (edges, edge_width) = shapes
+        of_nodes = state.new_empty(nodes, len(state), node_width, dtype=dtype)
+        of_edges = state.new_empty(edges, len(state), edge_width, dtype=dtype)
+        out = of_nodes, of_edges
+        kernels.launch("inputs", ctx.types, len(state), numbers, state, action, numbers, *out)
+        ctx.save_for_backward(state, action, numbers)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
+        state, action, numbers = ctx.saved_tensors
+        found = torch.empty_like(state), torch.empty_like(action)
+        inputs = state, action, numbers, *(each.contiguous() for each in gradients), *found
+        ctx.kernels.launch("inputs_adjoint", ctx.types, len(state), numbers, *inputs)
+        return None, None, None, *found, None
+
+
+class StepResult(torch.autograd.Function):
+    """Next states (or changes) of states ``[B, N, C]``, actions ``[B, A]`` and the network's output ``[P, B, F]``."""
+
+    @staticmethod
+    def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, kernels: StateKernels, state: Tensor, action: Tensor, numbers: Tensor, output: Tensor
+    ) -> Tensor:
+        ctx.kernels, ctx.types = kernels, kernel_types(state, action, output.dtype)
+        out = state.new_empty(len(state), state.shape[1], kernels.layout.result // state.shape[1])
+        kernels.launch("result", ctx.types, len(state), numbers, state, action, numbers, output, out)
+        ctx.save_for_backward(state, action, numbers, output)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
+        state, action, numbers, output = ctx.saved_tensors
+        found = torch.empty_like(output), torch.empty_like(state), torch.empty_like(action)
+        inputs = state, action, numbers, output, gradient.contiguous(), *found
+        ctx.kernels.launch("result_adjoint", ctx.types, len(state), numbers, *inputs)
+        of_output, of_state, of_action = found
+        return None, of_state, of_action, None, of_output

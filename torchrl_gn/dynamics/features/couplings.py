@@ -1,0 +1,184 @@
+"""Violations of constraints between joints or tendons as features of the edges of the joints that they couple."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.dynamics.tendon_states import TendonStates
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.couplings import coupled_joints, couplings
+from torchrl_gn.scenes.tendons import tendon_joints, tendon_scales
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
+
+_NEAR_ANGLE, _NEAR_PLACE = 0.02, 0.002  # rad and metres: up to these violations two features vary
+_STEP = 0.02  # seconds
+_OF_TENDON = 0.1  # the same as a share of what 0.1 rad or 2 cm of its joints change a tendon
+_SIZE = 5
+
+
+@dataclass(frozen=True)
+class Couplings(Feature):
+    """Violation and rate of each constraint between joints or tendons at the joints that it moves.
+
+    Such as a gripper's fingers that mirror each other: the force on each depends on a coordinate far from it. Paper: it
+    sees no constraints.
+
+    Not by default: it was worth nothing where it was measured.
+    """
+
+    part: ClassVar[Literal["nodes", "edges"]] = "edges"
+
+    per_joint: int = 1  # most couplings at one edge
+
+    @staticmethod
+    def suits(scene: object) -> bool:
+        """Whether a scene has active equality constraints of joints or tendons."""
+        return isinstance(scene, Scene) and bool(scene.model.neq and couplings(scene)[0])
+
+    def resolved(self, scene: Scene) -> Couplings:
+        return replace(self, per_joint=_per_joint(scene))
+
+    def size(self, layout: StateLayout) -> int:
+        return _SIZE * self.per_joint
+
+    def least_scales(self, layout: StateLayout) -> list[float]:
+        # Data lie closer to the constraint than a model's predictions.
+        return [_NEAR_ANGLE, 1.0, 1.0, _NEAR_ANGLE / _STEP, 0.0] * self.per_joint
+
+    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        self.require_bodies(scene, layout)
+        if (there := _per_joint(scene)) > self.per_joint:
+            raise ValueError(
+                f"The model reads {self.per_joint} couplings at each edge, scene {scene.name!r} has {there}: build the"
+                " model with ForwardModel.for_scene."
+            )
+        return _Bound(scene, self.per_joint)
+
+
+def _per_joint(scene: Scene) -> int:
+    joints = [joint for each in couplings(scene)[0] for joint in coupled_joints(scene, each)]
+    return int(np.bincount(joints).max(initial=1)) if joints else 1
+
+
+class _Bound(Float64Buffers):
+    coordinate: Tensor
+    ends: Tensor
+    start: Tensor
+    polynomial: Tensor
+    near: Tensor
+    has_second: Tensor
+    which: Tensor
+    arms: Tensor
+    place: Tensor
+
+    def __init__(self, scene: Scene, per_joint: int) -> None:
+        super().__init__()
+        model, found = scene.model, couplings(scene)[0]
+        self.timestep, self.edges, self.count, self.per_joint = (
+            float(scene.timestep),
+            2 * model.njnt,
+            len(found),
+            per_joint,
+        )
+        if not found:
+            return
+        self.coordinates = JointCoordinates(scene, partly=True)
+        tendons = sorted({end for each in found if each.of_tendons for end in (each.first, each.second) if end >= 0})
+        pulled = [(tendon, joint) for tendon in tendons for joint in tendon_joints(scene, tendon)]
+        self.tendons = TendonStates(scene, tendons, pulled) if tendons else None
+        # Coordinates of all joints, then lengths of tendons, then a 0.
+        nothing, moment = model.njnt + len(tendons), len(pulled) + 1
+        places = [
+            [nothing if end < 0 else model.njnt + tendons.index(end) if each.of_tendons else end for end in ends]
+            for each in found
+            for ends in [(each.first, each.second)]
+        ]
+        starts = [*model.qpos0[model.jnt_qposadr], *model.tendon_length0[tendons], 0.0]
+        slots: list[list[int]] = [[] for _ in range(model.njnt)]
+        which, arms = [], []
+        for index, each in enumerate(found):
+            for joint in coupled_joints(scene, each):
+                slots[joint].append(len(which))
+                which.append(index)
+                # Moment at the joint of either end: 1 of a joint's own, behind those of tendons, before a 0.
+                arms.append(
+                    [
+                        (pulled.index((end, joint)) if (end, joint) in pulled else moment)
+                        if each.of_tendons
+                        else len(pulled)
+                        if end == joint
+                        else moment
+                        for end in (each.first, each.second)
+                    ]
+                )
+        place = np.array([[*some, *[len(which)] * (per_joint - len(some))] for some in slots]).reshape(-1, per_joint)
+        turns = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
+        scales = tendon_scales(model) if tendons else np.zeros(0)
+        self.constants(
+            {
+                "ends": np.array(places).T.copy(),
+                "start": np.array(starts)[np.array(places).T],
+                "polynomial": model.eq_data[[each.equality for each in found], :5].T.copy(),
+                "has_second": np.array([each.second >= 0 for each in found]),
+                "near": np.array(
+                    [
+                        _OF_TENDON * scales[each.first]
+                        if each.of_tendons
+                        else (_NEAR_ANGLE if turns[each.first] else _NEAR_PLACE)
+                        for each in found
+                    ]
+                ),
+                "which": np.array(which),
+                "arms": np.array(arms).T.copy(),
+                "place": place,
+            }
+        )
+
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """Features ``[*B, 2 J, 5 C]`` of the joints' edges.
+
+        Of each coupling at a joint: its violation (rad or metres); that, and the next step's, clipped to 0.02 rad or
+        2 mm, of tendons to what 0.01 rad or 2 mm of their joints change, and scaled to 1; its rate; and how much it
+        grows with the joint's coordinate.
+        """
+        state, matrices = inputs.canonical[:2]
+        assert matrices is not None
+        if not self.count:
+            return state.new_zeros((*state.shape[:-2], self.edges, _SIZE * self.per_joint))
+        joint = inputs.parameters.joint[..., : self.edges : 2, :]
+        joints = self.coordinates.joints(state, matrices, inputs.parameters.joint_pose, joint)
+        place, rate, moment = joints.coordinate, joints.rate, joints.rate[..., :0]
+        if self.tendons is not None:
+            found = self.tendons(state, matrices, joints)
+            place, rate = torch.cat((place, found.length), dim=-1), torch.cat((rate, found.velocity), dim=-1)
+            moment = found.moment
+        place, rate = pad(place, (0, 1)), pad(rate, (0, 1))
+        moment = pad(pad(moment, (0, 1), value=1.0), (0, 1))
+        start, (first, second) = self.start.to(state.dtype), self.ends
+        away = place[..., second] - start[1]
+        constants = self.polynomial.to(state.dtype)
+        value, slope = constants[4] + torch.zeros_like(away), torch.zeros_like(away)
+        for constant in constants[:4].flip(0):
+            value, slope = value * away + constant, slope * away + value
+        slope = torch.where(self.has_second, slope, 0.0)
+        violation = place[..., first] - start[0] - torch.where(self.has_second, value, constants[0])
+        change = rate[..., first] - slope * rate[..., second]
+        near = self.near.to(state.dtype)
+        fine = [(each / near).clamp(-1, 1) for each in (violation, violation + self.timestep * change)]
+        each = torch.stack((violation, *fine, change), dim=-1)[..., self.which, :]
+        arm = moment[..., self.arms[0]] - slope[..., self.which] * moment[..., self.arms[1]]
+        each = torch.cat((each, arm.unsqueeze(-1)), dim=-1)
+        return pad(each, (0, 0, 0, 1))[..., self.place, :].flatten(-2).repeat_interleave(2, dim=-2)

@@ -1,0 +1,135 @@
+"""Where mocap bodies are told to be, seen from the bodies that they lead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.quaternion import turned_by
+from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.constraints import joined_frames
+from torchrl_gn.scenes.mocap import leading_mocaps
+from torchrl_gn.scenes.topology import topology
+from torchrl_gn.scenes.transmissions import find_transmissions
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
+
+_NEAR, _NEAR_ANGLE = 0.01, 0.05  # metres and rad: up to these distances the fine features vary
+_SIZE = 21
+
+
+@dataclass(frozen=True)
+class MocapPoses(Feature):
+    """How far each body is from where a mocap body whose pose is an action tells it to be.
+
+    On the edges of the weld or connect constraint that holds it there. Paper: it has none.
+    """
+
+    part: ClassVar[Literal["nodes", "edges"]] = "edges"
+
+    @staticmethod
+    def suits(scene: object) -> bool:
+        """Whether a scene has poses of mocap bodies as actions."""
+        return isinstance(scene, Scene) and len(scene.mocaps) > 0
+
+    def size(self, layout: StateLayout) -> int:
+        return _SIZE
+
+    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        self.require_bodies(scene, layout)
+        return _Bound(scene)
+
+
+class _Bound(Float64Buffers):
+    pose: Tensor
+    target_place: Tensor
+    target_turn: Tensor
+    node: Tensor
+    place: Tensor
+    turn: Tensor
+    is_weld: Tensor
+    row: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.timestep, self.edges = float(scene.timestep), scene.num_edges
+        model, graph, mocaps = scene.model, topology(scene.model), scene.mocaps
+        led = [each for each in leading_mocaps(model) if each[1] in mocaps.body]
+        self.count = len(led)
+        if not led:
+            return
+        of_pair = find_transmissions(model, graph).equality.tolist()
+        targets, ends = [], []
+        for equality, mocap, _ in led:
+            target, end = sorted(joined_frames(model, graph, equality), key=lambda each: each[0])
+            targets.append(_in_body(model, mocap, *target[1:]))
+            ends.append(end)
+        rows = np.full(len(scene.pairs), len(led))
+        rows[[of_pair.index(equality) for equality, _, _ in led]] = np.arange(len(led))
+        first = scene.num_actions - len(mocaps)
+        at = [mocaps.body.tolist().index(mocap) for _, mocap, _ in led]
+        kinds = model.eq_type[[equality for equality, _, _ in led]]
+        self.constants(
+            {
+                "pose": first + 7 * np.array(at)[:, None] + np.arange(7),
+                "target_place": np.array([place for place, _ in targets]),
+                "target_turn": np.array([turn for _, turn in targets]),
+                "node": np.array([node for node, _, _ in ends]),
+                "place": np.array([place for _, place, _ in ends]),
+                "turn": np.array([turn for _, _, turn in ends]),
+                "is_weld": (kinds == int(mujoco.mjtEq.mjEQ_WELD))[:, None],
+                "row": np.repeat(rows, 2),
+            }
+        )
+
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """Features ``[*B, E, 21]``, 0 on edges without a mocap body, the same in both directions.
+
+        From what the constraint holds to where it is told to be (metres): now, that clipped to 1 cm and scaled to 1,
+        and a step on. The turn between (twice the quaternion's vector, rad if small; 0 of a connect): now, that clipped
+        to 0.05 rad and scaled to 1, and a step on. Last, what is held from the body's origin.
+        """
+        state, matrices = inputs.canonical[:2]
+        if not self.count:
+            return state.new_zeros((*state.shape[:-2], self.edges, _SIZE))
+        assert matrices is not None and inputs.action is not None
+        at, dtype = BODY_STATE.slices, state.dtype
+        pose, body = inputs.action.to(dtype)[..., self.pose], state[..., self.node, :]
+        length = pose[..., 3:].square().sum(-1, keepdim=True)
+        still = torch.eye(4, dtype=dtype, device=state.device)[0]
+        given = torch.where(length > 1e-18, pose[..., 3:] / torch.where(length > 1e-18, length, 1.0).sqrt(), still)
+        frame = quaternion.to_matrix(given).unflatten(-1, (3, 3))
+        target = pose[..., :3] + turned_by(frame, self.target_place.to(dtype))
+        arm = turned_by(matrices[..., self.node, :, :], self.place.to(dtype))
+        gap = target - body[..., at["position"]] - arm
+        spin = body[..., at["angular_velocity"]]
+        moved = gap - self.timestep * (body[..., at["linear_velocity"]] + torch.linalg.cross(spin, arm))
+        wanted = quaternion.product(given, self.target_turn.to(dtype).expand_as(given))
+        orientation = body[..., at["orientation"]]
+        held = quaternion.product(orientation, self.turn.to(dtype).expand_as(orientation))
+        relative = quaternion.product(wanted, quaternion.conjugate(held))
+        turn = torch.where(relative[..., :1] < 0, -2.0, 2.0) * relative[..., 1:]
+        turn, spin = (torch.where(self.is_weld, each, 0.0) for each in (turn, spin))
+        parts = [gap, (gap / _NEAR).clamp(-1, 1), moved]
+        parts += [turn, (turn / _NEAR_ANGLE).clamp(-1, 1), turn - self.timestep * spin, arm]
+        return pad(torch.cat(parts, dim=-1), (0, 0, 0, 1))[..., self.row, :]
+
+
+def _in_body(model: mujoco.MjModel, body: int, place: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A frame of the world in that of a mocap body at its pose in the model."""
+    back, moved, turned = np.empty(4), np.empty(3), np.empty(4)
+    mujoco.mju_negQuat(back, model.body_quat[body])
+    mujoco.mju_rotVecQuat(moved, np.asarray(place, dtype=float) - model.body_pos[body], back)
+    mujoco.mju_mulQuat(turned, back, np.asarray(turn, dtype=float))
+    return moved, turned

@@ -1,0 +1,51 @@
+"""How far MuJoCo itself is certain: the errors of its simulation at half the physics step."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.evaluation.error_table import ErrorTable
+from torchrl_gn.evaluation.errors import HORIZONS, ErrorSums, fixed_components
+from torchrl_gn.scenes import Scene
+
+
+def half_step_errors(
+    scene: Scene, trajectories: TensorDictBase, *, horizons: Sequence[int] = HORIZONS, num_threads: int | None = None
+) -> ErrorTable:
+    """Errors of simulations at half the physics step, relative as those of models.
+
+    Rollouts of robots that fall and stumble are not determined much better than this: where a model's error is
+    near it, the rest is the simulation's own.
+
+    Args:
+        trajectories: ``[M]`` simulated, with ``state`` ``[M, T + 1, N, C]``, ``physics`` ``[M, T + 1, S]`` and
+            ``action`` ``[M, T, A]``.
+
+    Raises:
+        KeyError: if they have no ``physics``, as those of a data set.
+    """
+    model = copy.copy(scene.model)
+    model.opt.timestep /= 2
+    simulator = Simulator(replace(scene, model=model, substeps=2 * scene.substeps), num_threads)
+    state, physics, action = (cast(Tensor, trajectories[key]) for key in ("state", "physics", "action"))
+    horizons, (count, steps) = sorted(horizons), action.shape[:2]
+    predicted = torch.as_tensor(np.flatnonzero(scene.predicted))
+    single, rollouts = (ErrorSums(size, scene.layout, predicted) for size in (1, horizons[-1]))
+    after = simulator.rollout(physics[:, :-1].flatten(0, 1), action.flatten(0, 1).unsqueeze(1))["state"][:, 1]
+    single.add(0, after, state[:, 1:].flatten(0, 1), state[:, :-1].flatten(0, 1))
+    path = simulator.rollout(physics[:, 0], action[:, : horizons[-1]])["state"]
+    for step in range(1, horizons[-1] + 1):
+        rollouts.add(step - 1, path[:, step], state[:, step], state[:, 0])
+    fixed = fixed_components(scene, scene.layout)
+    errors = [single.error("one_step_error", 1, count, steps, fixed)]
+    errors += [rollouts.error(f"rollout_error_{horizon}", horizon, count, horizon, fixed) for horizon in horizons]
+    return ErrorTable({error.name: error for error in errors}, state.new_zeros((0, 1, *state.shape[2:])))

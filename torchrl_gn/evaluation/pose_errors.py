@@ -1,0 +1,56 @@
+"""Errors of predicted poses in metres and radians, as work on contact reports them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.dynamics import BoundPredictor
+from torchrl_gn.maths import quaternion
+
+
+class PoseErrors(NamedTuple):
+    """Errors of each rollout, means over its steps; infinite where it diverged."""
+
+    position: Tensor  # [M] distance, metres
+    rotation: Tensor  # [M] angle, radians
+
+    def to_metrics(self) -> dict[str, float]:
+        """Means and medians over the rollouts by name."""
+        each = {"position": self.position, "rotation": self.rotation}
+        means = {f"{name}_error": value.mean().item() for name, value in each.items()}
+        return means | {f"{name}_error/median": value.median().item() for name, value in each.items()}
+
+
+@torch.no_grad()
+def pose_errors(
+    model: BoundPredictor | Callable[[Tensor, Tensor], Tensor], trajectories: TensorDictBase, *, node: int | None = None
+) -> PoseErrors:
+    """Distance and angle between predicted and true poses of one body, over all steps of rollouts from state 0.
+
+    Args:
+        model: a bound model, or physics: a function of state and action.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``.
+        node: of the body; default: the first that moves, the base of a robot.
+    """
+    state, action = trajectories.get("state"), trajectories.get("action")
+    if isinstance(model, BoundPredictor):
+        predicted = model.rollout(state[:, 0], action)[0][:, 1:]
+        node = int(np.flatnonzero(model.scene.predicted)[0]) if node is None else node
+    elif node is None:
+        raise ValueError("Physics do not say which body is meant: give node=.")
+    else:
+        current, steps = state[:, 0], []
+        for now in action.unbind(1):
+            current = model(current, now)
+            steps.append(current)
+        predicted = torch.stack(steps, 1)
+    predicted, truth = predicted[:, :, node, :7].double(), state[:, 1:, node, :7].double()
+    position = (predicted[..., :3] - truth[..., :3]).norm(dim=-1).mean(1)
+    rotation = quaternion.angle(predicted[..., 3:], truth[..., 3:]).mean(1)
+    return PoseErrors(*(torch.where(error.isfinite(), error, torch.inf) for error in (position, rotation)))

@@ -1,0 +1,98 @@
+"""Signed distances of points from surfaces, and outer normals there."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_TINY = 1e-12  # metres
+
+
+def from_plane(point: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance ``[*B]`` of points ``[*B, 3]`` above the plane z = 0, and normals ``[*B, 3]``."""
+    return point[..., 2], torch.eye(3, dtype=point.dtype, device=point.device)[2].expand_as(point)
+
+
+def from_box(point: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance ``[*B]`` from boxes about the origin with half sizes ``[*B, 3]``, and normals ``[*B, 3]``.
+
+    A box with two half sizes 0 is a segment, one with three a point. Inside, the nearest face counts.
+    """
+    outside = point - torch.minimum(torch.maximum(point, -half), half)
+    far = outside.square().sum(-1)
+    apart = far > _TINY**2
+    length = far.clamp(min=_TINY**2).sqrt()
+    depth = point.abs() - half  # [*B, 3] negative inside
+    x, y, z = depth.unbind(-1)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    of_x = torch.where(torch.maximum(y, z) > x, zero, one)
+    of_y = torch.where(z > y, zero, 1 - of_x)
+    face = torch.stack((of_x, of_y, 1 - of_x - of_y), dim=-1) * torch.where(point < 0, -1.0, 1.0)
+    distance = torch.where(apart, length, depth.amax(-1))
+    normal = torch.where(apart.unsqueeze(-1), outside / length.unsqueeze(-1), face)
+    return distance, normal
+
+
+def from_cylinder(point: Tensor, radius: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance ``[*B]`` from cylinders along z about the origin, of ``radius`` and half length ``[*B]``; normals."""
+    x, y, z = point.unbind(-1)
+    across = (x.square() + y.square() + _TINY**2).sqrt()
+    # A box in the plane of axis and point.
+    flat = torch.stack((across, torch.zeros_like(z), z), dim=-1)
+    distance, normal = from_box(flat, torch.stack((radius, torch.full_like(radius, 1e9), half), dim=-1))
+    outwards = normal[..., 0] / across
+    return distance, torch.stack((outwards * x, outwards * y, normal[..., 2]), dim=-1)
+
+
+def from_ellipsoid(point: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance ``[*B]`` from ellipsoids about the origin with half axes ``[*B, 3]``, and normals.
+
+    Exact on the surface, about spheres and along the axes, elsewhere to first order.
+    """
+    scaled = point / half
+    slope = scaled / half
+    steep = (slope.square().sum(-1) + _TINY**2).sqrt()
+    size = (scaled.square().sum(-1) + _TINY**2).sqrt()
+    return size * (size - 1) / steep, slope / steep.unsqueeze(-1)
+
+
+def from_hull(point: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance ``[*B]`` from a convex hull with outer normals and offsets ``[F, 4]`` of faces, and normals.
+
+    Exact above faces and inside; above edges and corners too small, but of the right sign.
+    """
+    above = point @ faces[:, :3].mT - faces[:, 3]  # [*B, F]
+    distance = above.amax(-1)
+    # On an edge, the mean of its faces' normals.
+    nearest = torch.where(above < distance.unsqueeze(-1), torch.zeros_like(above), torch.ones_like(above))
+    normal = nearest @ faces[:, :3]
+    return distance, normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+
+
+def from_heights(point: Tensor, heights: Tensor, half: Tensor, nowhere: float) -> tuple[Tensor, Tensor]:
+    """Distance ``[*B]`` from the triangle below or above each point, and normals.
+
+    A cell of the grid is two triangles, as MuJoCo has them. Exact above a triangle, not beside ridges and peaks.
+
+    Args:
+        point: ``[*B, 3]`` in the frame of the field.
+        heights: ``[rows, columns]`` along y and x, metres.
+        half: ``[2]`` half sizes along x and y.
+        nowhere: the distance beside the field.
+    """
+    rows, columns = heights.shape
+    last = torch.tensor([columns - 1, rows - 1], dtype=half.dtype, device=half.device)
+    place = (point[..., :2] / half + 1) * 0.5 * last
+    cell = torch.minimum(place.floor().clamp(min=0), last - 1)
+    u, v = (place - cell).unbind(-1)
+    column, row = cell.long().unbind(-1)
+    flat, start = heights.flatten(), row * columns + column
+    low, right, up, far = (flat[start + step] for step in (0, 1, columns, columns + 1))
+    along = torch.where(u < v, far - up, right - low)
+    across = torch.where(u < v, up - low, far - right)
+    height = low + u * along + v * across
+    slope = torch.stack((along, across), dim=-1) * (0.5 * last / half)
+    normal = torch.cat((-slope, torch.ones_like(slope[..., :1])), dim=-1)
+    normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    inside = (point[..., :2].abs() <= half).all(-1)
+    return torch.where(inside, (point[..., 2] - height) * normal[..., 2], nowhere), normal

@@ -1,0 +1,81 @@
+"""Activations: states of filtered, integrating and muscle actuators, each kept at one node."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.topology import EdgePair
+
+_DYN = mujoco.mjtDyn
+_KNOWN = (_DYN.mjDYN_INTEGRATOR, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT, _DYN.mjDYN_MUSCLE)
+
+
+@dataclass(frozen=True, eq=False)
+class Activations:
+    """Where body states hold the ``na`` activations of a model (``mjData.act``), in its order."""
+
+    actuator: np.ndarray  # [na] actuator of each
+    node: np.ndarray  # [na] node that holds it: the first one that the actuator moves
+    slot: np.ndarray  # [na] which of the node's activations it is
+    known: np.ndarray  # [na] bool, whether it changes by one of MuJoCo's laws, see ActivationLaws
+
+    @property
+    def size(self) -> int:
+        """Most activations that one node holds."""
+        return int(self.slot.max(initial=-1)) + 1
+
+    def mask(self, nodes: int, which: np.ndarray | None = None) -> np.ndarray:
+        """``[nodes, size]`` bool, where activations are, or those ``which`` ``[na]`` says."""
+        found = np.zeros((nodes, self.size), dtype=bool)
+        found[self.node, self.slot] = True if which is None else which
+        return found
+
+    def at_nodes(self, act: np.ndarray, nodes: int) -> np.ndarray:
+        """Activations ``[*B, na]`` as channels ``[*B, nodes, size]`` of their nodes, 0 elsewhere."""
+        found = np.zeros((*act.shape[:-1], nodes, self.size))
+        found[..., self.node, self.slot] = act
+        return found
+
+
+def find_activations(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: np.ndarray) -> Activations:
+    """Activations of a model whose actuators act at edge ``pairs`` in the slots ``action`` ``[P, C]``."""
+    order = np.argsort(model.actuator_actadr)
+    actuators = np.repeat(order, np.maximum(model.actuator_actnum[order], 0))
+    nodes = []
+    for actuator in actuators.tolist():
+        acting = np.flatnonzero((action == actuator).any(1))
+        pair = pairs[acting[0]] if len(acting) else None
+        nodes.append(1 if pair is None else pair.second or pair.first)
+    node = np.array(nodes, dtype=np.int64)
+    slot = np.array([nodes[:index].count(each) for index, each in enumerate(nodes)], dtype=np.int64)
+    return Activations(actuators, node, slot, _known(model, actuators))
+
+
+def _known(model: mujoco.MjModel, actuators: np.ndarray) -> np.ndarray:
+    lawful = np.isin(model.actuator_dyntype, [int(kind) for kind in _KNOWN]) & (model.actuator_actnum == 1)
+    # A limited filter that overshoots is between its limits differently in every physics step.
+    overshoots = (model.actuator_dyntype == int(_DYN.mjDYN_FILTER)) & (model.actuator_dynprm[:, 0] < model.opt.timestep)
+    lawful &= ~(overshoots & model.actuator_actlimited.astype(bool))
+    return (lawful & (model.actuator_plugin < 0))[actuators]
+
+
+def activation_numbers(model: mujoco.MjModel) -> list:
+    """Numbers of the laws of activations and of muscles' forces, which all variants of a scene share."""
+    acting = np.flatnonzero(model.actuator_actnum > 0)
+    names = ("dyntype", "actnum", "dynprm", "actlimited", "actrange", "actearly")
+    muscles = np.flatnonzero(muscle_actuators(model))
+    forces = ("gainprm", "biasprm", "lengthrange", "acc0")
+    columns = [*((name, acting) for name in names), *((name, muscles) for name in forces)]
+    arrays = [np.asarray(getattr(model, f"actuator_{name}")[which], dtype=float) for name, which in columns]
+    return [np.round(each, 9).tolist() for each in arrays]
+
+
+def muscle_actuators(model: mujoco.MjModel) -> np.ndarray:
+    """``[A]`` bool, actuators whose force is that of a muscle: by its length, velocity and activation."""
+    gain, bias = mujoco.mjtGain, mujoco.mjtBias
+    pulls = model.actuator_gaintype == int(gain.mjGAIN_MUSCLE)
+    return pulls & np.isin(model.actuator_biastype, (int(bias.mjBIAS_MUSCLE), int(bias.mjBIAS_NONE)))

@@ -1,0 +1,42 @@
+"""Equality constraints of a model that are in force, and what those of bodies join."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.topology import Topology, in_node, site_in_node
+
+_EQUALITY, _DISABLE = mujoco.mjtEq, mujoco.mjtDisableBit
+
+
+def active_constraints(model: mujoco.MjModel) -> list[int]:
+    """Equality constraints that are in force."""
+    if model.opt.disableflags & (_DISABLE.mjDSBL_EQUALITY | _DISABLE.mjDSBL_CONSTRAINT):
+        return []
+    return np.flatnonzero(model.eq_active0).tolist()
+
+
+def joins_bodies(model: mujoco.MjModel, equality: int) -> bool:
+    """Whether a constraint is a connect or weld."""
+    return model.eq_type[equality] in (int(_EQUALITY.mjEQ_CONNECT), int(_EQUALITY.mjEQ_WELD))
+
+
+def joined_frames(model: mujoco.MjModel, graph: Topology, equality: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Both nodes of a connect or weld constraint, and what it joins in their frames: places and quaternions.
+
+    What is joined has the same place and, in a weld, the same orientation while the constraint holds.
+    """
+    found, data = [], model.eq_data[equality]
+    weld = model.eq_type[equality] == int(_EQUALITY.mjEQ_WELD)
+    for end, at in enumerate((int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality]))):
+        if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
+            found.append(site_in_node(model, graph, at))
+            continue
+        # A weld has one anchor, in the second body, and the second body's pose in the first.
+        node, place, quat = in_node(model, graph, at, data[3 * (end == (0 if weld else 1)) :][:3])
+        if weld and end == 0:
+            own, quat = quat, np.empty(4)
+            mujoco.mju_mulQuat(quat, own, data[6:10])
+        found.append((node, place, quat))
+    return found

@@ -1,0 +1,64 @@
+"""Equality constraints that couple joints or tendons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.constraints import active_constraints, joined_frames, joins_bodies
+from torchrl_gn.scenes.force_elements import straight_joints, winding_joints
+from torchrl_gn.scenes.tendons import length_follows, tendon_joints
+from torchrl_gn.scenes.topology import topology
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.scene import Scene
+
+_EQUALITY = mujoco.mjtEq
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A constraint: the first joint or tendon is where a polynomial of the second has it, each from its reference."""
+
+    equality: int
+    of_tendons: bool
+    first: int  # joint or tendon
+    second: int  # -1: the first is held where the polynomial's constant says
+
+
+def couplings(scene: Scene) -> tuple[list[Coupling], list[int]]:
+    """Constraints of joints and tendons whose violation follows from body states, and other such constraints."""
+    model, found, others = scene.model, [], []
+    straight = straight_joints(scene) & ~winding_joints(scene)  # whole turns do not show
+    for equality in active_constraints(model):
+        kind = _EQUALITY(model.eq_type[equality])
+        ends = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
+        if kind not in (_EQUALITY.mjEQ_JOINT, _EQUALITY.mjEQ_TENDON):
+            continue
+        of_tendons, there = kind == _EQUALITY.mjEQ_TENDON, [end for end in ends if end >= 0]
+        if all(length_follows(scene, end) for end in there) if of_tendons else straight[there].all():
+            found.append(Coupling(equality, of_tendons, *ends))
+        else:
+            others.append(equality)
+    return found, others
+
+
+def coupled_joints(scene: Scene, coupling: Coupling) -> list[int]:
+    """Joints at which a coupling acts."""
+    ends = [end for end in (coupling.first, coupling.second) if end >= 0]
+    return sorted({joint for end in ends for joint in (tendon_joints(scene, end) if coupling.of_tendons else [end])})
+
+
+def constraint_numbers(scene: Scene) -> list[list[float]]:
+    """Numbers of the constraints in force that features read but samples do not bring."""
+    model, graph, rows = scene.model, topology(scene.model), []
+    for equality in active_constraints(model):
+        if joins_bodies(model, equality):
+            ends = joined_frames(model, graph, equality)
+            rows.append([number for _, place, quat in ends for number in (*place, *quat)])
+        else:
+            rows.append(model.eq_data[equality, :5].tolist())
+    return [np.round(row, 9).tolist() for row in rows]

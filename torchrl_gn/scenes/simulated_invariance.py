@@ -1,0 +1,219 @@
+"""Invariance by simulation: whether accelerations move along when a whole scene is shifted or turned."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.messages import quiet_mujoco
+from torchrl_gn.scenes.topology import Topology, offset
+from torchrl_gn.scenes.yaw_frame import YawFrame
+
+_JOINT = mujoco.mjtJoint
+_STATES, _LARGE = 4, 60  # states compared; half of them from so many degrees of freedom on
+_SMOOTH, _CONTACT = 1e-5, 1e-3  # largest relative difference without contacts, and with them
+_SHIFT, _ANGLE = 1.7, 0.83  # metres, radians
+_TINY = 1e-6  # N, a force
+_SLIPPERY = 0.1  # of the friction
+_REACH = 0.2  # of the scene's extent: how far from the world bodies touch it here
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A rigid motion of a whole scene: a turn about a world axis through ``pivot``, then a shift."""
+
+    shift: np.ndarray  # [3] metres
+    axis: int = 2  # 0, 1 or 2 for the world's x, y or z
+    angle: float = 0.0
+    pivot: np.ndarray | None = None  # [3] metres; None: the origin
+
+    @property
+    def quaternion(self) -> np.ndarray:
+        found = np.zeros(4)
+        found[0], found[1 + self.axis] = np.cos(self.angle / 2), np.sin(self.angle / 2)
+        return found
+
+    @property
+    def matrix(self) -> np.ndarray:
+        found = np.empty(9)
+        mujoco.mju_quat2Mat(found, self.quaternion)
+        return found.reshape(3, 3)
+
+    def place(self, point: np.ndarray) -> np.ndarray:
+        """A point ``[3]`` of the world after the motion."""
+        pivot = np.zeros(3) if self.pivot is None else self.pivot
+        return self.matrix @ (point - pivot) + pivot + self.shift
+
+
+def confirmed(
+    model: mujoco.MjModel, graph: Topology, invariant: np.ndarray, yaw_frame: YawFrame | None
+) -> tuple[np.ndarray, YawFrame | None]:
+    """Axes of translation invariance ``[3]`` and yaw frame that hold in simulation, of those that hold by rules."""
+
+    def fails(motion: Motion, *, contacts: bool) -> bool:
+        return changes_dynamics(model, graph, motion, contacts=contacts)
+
+    shifts = [Motion(_SHIFT * axis) for axis in np.eye(3)]
+    kept = [
+        bool(holds) and not any(fails(shift, contacts=contacts) for contacts in (False, True))
+        for holds, shift in zip(invariant, shifts, strict=True)
+    ]
+    if yaw_frame is not None:
+        turn = Motion(np.zeros(3), yaw_frame.axis, _ANGLE, yaw_frame.pivot)
+        if fails(turn, contacts=False):
+            yaw_frame = None
+        elif yaw_frame.exact and fails(turn, contacts=True):
+            yaw_frame = replace(yaw_frame, exact=False)
+    return np.array(kept), yaw_frame
+
+
+def changes_dynamics(model: mujoco.MjModel, graph: Topology, motion: Motion, *, contacts: bool) -> bool:
+    """Whether a scene that moved as a whole accelerates otherwise than turned, compared in a few random states.
+
+    Joints of the roots must be free, or slides, if any, that can make the motion, then a ball or a hinge about its
+    axis. Without contacts a difference in any state counts; with contacts, in most that have some: there ties are
+    broken by rounding.
+    """
+    model = _precise(model, graph, contacts)
+    rng, data, moves = np.random.default_rng(0), mujoco.MjData(model), _RootMoves(model, graph, motion)
+    differ = compared = 0
+    with quiet_mujoco():
+        for _ in range(_STATES if model.nv < _LARGE else _STATES // 2):
+            position, velocity, *held = _random_state(model, rng)
+            before = _acceleration(model, data, position, velocity, *held)
+            touches = _pushes(data)
+            after = _acceleration(model, data, moves.position(position), moves.velocity(velocity), *held)
+            touches |= _pushes(data)
+            size = max(np.abs(before).max(), np.abs(after).max()) + 1e-3
+            if np.isfinite(size) and (touches or not contacts):
+                away = np.abs(after - moves.velocity(before)).max()
+                differ += bool(away > (_CONTACT if contacts else _SMOOTH) * size)
+                compared += 1
+    return 2 * differ > compared if contacts else differ > 0
+
+
+def _precise(model: mujoco.MjModel, graph: Topology, contacts: bool) -> mujoco.MjModel:
+    """A copy that is solved to the last digits; without contacts, or with the world's from some distance on."""
+    model = copy.copy(model)
+    model.opt.iterations, model.opt.tolerance = 200, 0.0
+    if contacts:
+        fixed = graph.node_of_body[model.geom_bodyid] == 0
+        model.geom_margin[fixed] += _REACH * model.stat.extent
+        model.pair_margin[:] += _REACH * model.stat.extent
+        for friction in (model.geom_friction, model.pair_friction, model.opt.o_friction):
+            friction[:] *= _SLIPPERY  # of contacts that hold, the direction of friction does not show
+    else:
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    return model
+
+
+class _Root(NamedTuple):
+    """Joints of a tree's root."""
+
+    slides: list[int]  # before any other joint
+    other: int | None  # the first other joint, with which later ones turn
+    directions: np.ndarray  # [3, slides] of the slides in the world
+    inverse: np.ndarray  # [slides, 3]
+    anchor: np.ndarray  # [3] place at the reference of what slides
+    rest: np.ndarray  # [4] orientation at the reference
+    turn: float  # of a hinge by that of the scene
+
+
+class _RootMoves:
+    """What a motion makes of the coordinates and rates of the trees' roots."""
+
+    def __init__(self, model: mujoco.MjModel, graph: Topology, motion: Motion) -> None:
+        self.model, self.motion = model, motion
+        self.quaternion, self.matrix = motion.quaternion, motion.matrix
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        self.roots = [self._root(body, data.xanchor) for body in graph.body[graph.parent == 0].tolist()]
+
+    def _root(self, body: int, anchors: np.ndarray) -> _Root:
+        model, rest = self.model, offset(self.model, body, 0)[1]
+        first = int(model.body_jntadr[body])
+        joints = list(range(first, first + int(model.body_jntnum[body])))
+        other = next((joint for joint in joints if model.jnt_type[joint] != int(_JOINT.mjJNT_SLIDE)), None)
+        slides = [joint for joint in joints if other is None or joint < other]
+        axes = np.empty((len(joints), 3))
+        for row, joint in zip(axes, joints, strict=True):
+            mujoco.mju_rotVecQuat(row, model.jnt_axis[joint], rest)
+        directions = axes[: len(slides)].T
+        anchor = anchors[slides[-1] if other is None else other].copy()
+        turn = 0.0 if other is None else float(axes[other - first, self.motion.axis])
+        return _Root(slides, other, directions, np.linalg.pinv(directions), anchor, rest, turn)
+
+    def position(self, position: np.ndarray) -> np.ndarray:
+        """``qpos`` after the motion."""
+        model, motion, found = self.model, self.motion, position.copy()
+        for root in self.roots:
+            if root.slides:
+                at = model.jnt_qposadr[root.slides]
+                place = root.anchor + root.directions @ (position[at] - model.qpos0[at])
+                found[at] = model.qpos0[at] + root.inverse @ (motion.place(place) - root.anchor)
+            if root.other is None:
+                continue
+            first, kind = int(model.jnt_qposadr[root.other]), _JOINT(model.jnt_type[root.other])
+            if kind == _JOINT.mjJNT_FREE:
+                found[first : first + 3] = motion.place(position[first : first + 3])
+                found[first + 3 : first + 7] = _product(self.quaternion, position[first + 3 : first + 7])
+            elif kind == _JOINT.mjJNT_BALL:
+                turned = _product(self.quaternion, _product(root.rest, position[first : first + 4]))
+                found[first : first + 4] = _product(root.rest * [1, -1, -1, -1], turned)
+            else:
+                found[first] += motion.angle * root.turn
+        return found
+
+    def velocity(self, velocity: np.ndarray) -> np.ndarray:
+        """``qvel``, or ``qacc``, after the motion."""
+        model, found = self.model, velocity.copy()
+        for root in self.roots:
+            if root.slides:
+                at = model.jnt_dofadr[root.slides]
+                found[at] = root.inverse @ (self.matrix @ (root.directions @ velocity[at]))
+            if root.other is not None and model.jnt_type[root.other] == int(_JOINT.mjJNT_FREE):
+                first = int(model.jnt_dofadr[root.other])  # its rotation is in the body's own frame
+                found[first : first + 3] = self.matrix @ velocity[first : first + 3]
+        return found
+
+
+def _random_state(model: mujoco.MjModel, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Coordinates near the reference, rates, activations and controls."""
+    position, change = model.qpos0.copy(), 0.3 * rng.normal(size=model.nv)
+    for joint in np.flatnonzero(model.jnt_type == int(_JOINT.mjJNT_FREE)):
+        first = int(model.jnt_dofadr[joint])
+        change[first : first + 3] *= 0.2 * model.stat.extent
+    mujoco.mj_integratePos(model, position, change, 1.0)
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    return position, rng.normal(size=model.nv), rng.uniform(size=model.na), rng.uniform(low, high)
+
+
+def _acceleration(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    position: np.ndarray,
+    velocity: np.ndarray,
+    activation: np.ndarray,
+    control: np.ndarray,
+) -> np.ndarray:
+    """``qacc`` of a state; ``data`` holds its contacts' forces afterwards."""
+    mujoco.mj_resetData(model, data)
+    data.qpos[:], data.qvel[:], data.act[:], data.ctrl[:] = position, velocity, activation, control
+    mujoco.mj_forward(model, data)
+    return data.qacc.copy()
+
+
+def _pushes(data: mujoco.MjData) -> bool:
+    """Whether some contact exerts a force."""
+    of_contact = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+    return bool((np.abs(data.efc_force[of_contact]) > _TINY).any())
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    found = np.empty(4)
+    mujoco.mju_mulQuat(found, a, b)
+    return found

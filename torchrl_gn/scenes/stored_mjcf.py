@@ -1,0 +1,197 @@
+"""Limits of the MJCF that a checkpoint or data set brings: what it may repeat, reserve and read.
+
+A few lines of MJCF can ask for millions of bodies, or for files of the machine that loads it. What is over these limits
+is refused before MuJoCo sees it, and already where a scene is loaded from a file, so that nothing is trained that
+cannot be read again.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePath
+from xml.etree import ElementTree
+
+import mujoco
+
+from torchrl_gn.scenes.scene import SceneError
+
+_MOST_COPIES = 5_000  # elements beyond those in the text: MuJoCo takes seconds for so many
+_MOST_CELLS = 50_000_000  # of textures and height fields
+_FREE_BYTES, _RATIO = 64_000_000, 8  # files may be unpacked to so much, and to so many times their packed size
+# Most that attributes of these names may say, in any element.
+_MOST = {
+    **dict.fromkeys(("actdim", "nuser_actuator", "nuser_body", "nuser_cam", "nuser_geom", "nuser_jnt"), 1_000),
+    **dict.fromkeys(("nuser_sensor", "nuser_site", "nuser_tendon", "cellcount", "subgrid"), 1_000),
+    **dict.fromkeys(("nsample", "dim", "nkey", "maxhullvert"), 10_000),
+    **dict.fromkeys(("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations"), 100_000),
+    **dict.fromkeys(("sdf_iterations", "sdf_initpoints", "nuserdata"), 100_000),
+}
+_MOST_STEPS = 100_000  # that MuJoCo simulates to find the range of a muscle's length
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_DECLARATION = re.compile(r"^\s*<\?xml.*?\?>", re.DOTALL)
+
+
+def parsed(text: str, what: str) -> ElementTree.Element:
+    """Root of a model's text; SceneError if only MuJoCo can read it."""
+    # MuJoCo reads comments with "--" in them, which are no XML.
+    plain = _DECLARATION.sub("", _COMMENT.sub("", text))
+    if "<!" in plain and re.search(r"<!(DOCTYPE|ENTITY)", plain):
+        raise SceneError(f"{what} defines a document type or entities, which MJCF does not have; remove them.")
+    try:
+        return ElementTree.fromstring(plain)
+    except ElementTree.ParseError as error:
+        raise SceneError(f"MuJoCo reads {what}, but it is no XML that can be stored: {error}") from error
+
+
+def packed(content: bytes) -> str:
+    """A file of a model, compressed, as text."""
+    return base64.b64encode(zlib.compress(content)).decode("ascii")
+
+
+def unpacked(files: Mapping[str, str]) -> dict[str, bytes]:
+    """Contents of :func:`packed` files; SceneError if they are damaged or grow beyond all measure."""
+    room, contents = _FREE_BYTES + _RATIO * sum(map(len, files.values())), {}
+    for name, text in files.items():
+        try:
+            stream = zlib.decompressobj()
+            contents[name] = stream.decompress(base64.b64decode(text), room + 1)
+        except (ValueError, zlib.error) as error:
+            raise SceneError(f"The file {name!r} of a stored scene is damaged: {error}") from error
+        if not stream.eof and len(contents[name]) <= room:
+            raise SceneError(f"The file {name!r} of a stored scene is damaged: its end is missing.")
+        room -= len(contents[name])
+        if room < 0:
+            raise SceneError(f"The files of a scene, with {name!r}, are unpacked to too much for their packed size.")
+    return contents
+
+
+def checked(text: str, files: Mapping[str, bytes]) -> tuple[str, dict[str, bytes]]:
+    """A stored model's text and files as MuJoCo may read them: XML as it was checked.
+
+    Raises:
+        SceneError: if they are no XML, include others, repeat or reserve too much, or name files that are not stored.
+    """
+    roots = {
+        name: parsed(_decoded(content), f"the file {name!r}") for name, content in files.items() if _is_xml(content)
+    }
+    main = parsed(text, "a stored scene")
+    for root in (main, *roots.values()):
+        if next(root.iter("include"), None) is not None:
+            raise SceneError("A stored scene includes other files; stored scenes have the files' content in place.")
+        for element in (*root.iter("model"), *root.iter("flexcomp")):
+            if (file := element.get("file")) and _base(file) not in map(_base, files):
+                raise SceneError(f"A stored scene reads the file {file!r}, which is not stored with it.")
+    check_size(main, roots)
+    texts = {name: ElementTree.tostring(root) for name, root in roots.items()}
+    return ElementTree.tostring(main, encoding="unicode"), {**files, **texts}
+
+
+def check_size(main: ElementTree.Element, others: Mapping[str, ElementTree.Element]) -> None:
+    """Raise SceneError if a model, with ``others`` that it attaches, repeats or reserves too much."""
+    by_name = {_base(name): root for name, root in others.items()}
+    copies = _expanded(main, by_name, ()) - sum(1 for _ in main.iter())
+    if copies > _MOST_COPIES:
+        raise SceneError(
+            f"The model repeats elements (replicate, composite, flexcomp, attach) {copies:.3g} times; at most"
+            f" {_MOST_COPIES} can be stored and read again. Lower its counts."
+        )
+    for root in (main, *others.values()):
+        for element in root.iter():
+            for name, most in _MOST.items():
+                if (text := element.get(name)) and (number := max(_numbers(text), default=0)) > most:
+                    raise SceneError(f"{name}={number:g} of <{element.tag}> is too much: {most:g} at most.")
+        for element in root.iter("lengthrange"):
+            total, step = (
+                max(_numbers(element.get(*each)), default=0) for each in (("inttotal", "10"), ("timestep", "0.01"))
+            )
+            if not total <= _MOST_STEPS * step:
+                raise SceneError(f"inttotal={total:g} of <lengthrange> is too much for its timestep={step:g}.")
+    cells = sum(map(_cells, (main, *others.values())))
+    if cells > _MOST_CELLS:
+        raise SceneError(
+            f"Textures and height fields have {cells:.3g} cells; {_MOST_CELLS:.3g} at most. Lower their size."
+        )
+
+
+def require_stored(wanted: Iterator[Path], files: Mapping[str, object], text: str) -> None:
+    """Raise SceneError if a model would read a file that is not stored with it."""
+    for file in wanted:
+        if not is_among(file, files, text):
+            raise SceneError(f"A stored scene reads the file {str(file)!r}, which is not stored with it.")
+
+
+def is_among(file: Path, assets: Mapping[str, object], text: str) -> bool:
+    """Whether a mesh is among a model's stored files; one of an attached model does not say in which folder it is."""
+    return str(file) in assets or ("<model" in text and any(Path(name).name == file.name for name in assets))
+
+
+def _expanded(root: ElementTree.Element, others: Mapping[str, ElementTree.Element], path: tuple[str, ...]) -> float:
+    """Number of elements that MuJoCo makes of a model, attached ones with it."""
+    files = {element.get("name"): _base(element.get("file", "")) for element in root.iter("model")}
+    costs: dict[str, float] = {}
+    for file in files.values():
+        if file in path or len(path) > 20:
+            raise SceneError(f"The model {file!r} attaches itself.")
+        if file in others and file not in costs:
+            costs[file] = _expanded(others[file], others, (*path, file))
+    most, total, rest = max(costs.values(), default=0), 0.0, [(root, 1.0)]
+    while rest:
+        element, times = rest.pop()
+        count = math.prod(max(1.0, number) for number in _numbers(element.get("count", "")))
+        total += times
+        if element.tag in ("composite", "flexcomp"):
+            total += 4 * times * count  # a body, joints and a geom each
+        elif element.tag == "attach":
+            total += times * costs.get(files.get(element.get("model"), ""), most)
+        if total > 1e9:
+            return total
+        inner = times * count if element.tag == "replicate" else times
+        rest += [(child, inner) for child in element]
+    return total
+
+
+def _cells(root: ElementTree.Element) -> float:
+    total, default = 0.0, {"texture": [0.0], "hfield": [0.0]}
+    for parent in root.iter():
+        for element in parent:
+            if element.tag in default:
+                names = ("width", "height") if element.tag == "texture" else ("nrow", "ncol")
+                own = math.prod(max(_numbers(element.get(name, "0")), default=0) for name in names)
+                known = default[element.tag]
+                known[0] = max(known[0], own if parent.tag == "default" else 0)
+                total += own or known[0]
+    return total
+
+
+def _numbers(text: str) -> list[float]:
+    return [abs(float(word)) for word in text.split() if _NUMBER.fullmatch(word)]
+
+
+def _base(name: str) -> str:
+    """What MuJoCo finds a stored file by."""
+    return PurePath(name.replace("\\", "/")).name.lower()
+
+
+def _is_xml(content: bytes) -> bool:
+    return content.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"<"
+
+
+def _decoded(content: bytes) -> str:
+    return content.decode("utf-8-sig", errors="replace")
+
+
+def model_files(spec: mujoco.MjSpec) -> Iterator[Path]:
+    """Files that a model reads when it is compiled, as MuJoCo looks for them."""
+    for element in [*spec.meshes, *spec.hfields, *spec.skins]:
+        if element.file:
+            yield Path(spec.meshdir, element.file)
+    for texture in spec.textures:
+        for file in (texture.file, *texture.cubefiles):
+            if file:
+                yield Path(spec.texturedir, file)

@@ -1,0 +1,140 @@
+"""Tendons that make forces of their own: at which joints, and by which numbers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.force_elements import FAR, known_moments, line_actuators, straight_joints, winding_joints
+from torchrl_gn.scenes.lines import geom_in_node, known_tendon, moved_joints, tendon_ends, tendon_pieces
+from torchrl_gn.scenes.topology import site_in_node, topology
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.scene import Scene
+
+_DISABLE = mujoco.mjtDisableBit
+
+
+def tendon_joints(scene: Scene, tendon: int) -> list[int]:
+    """Joints that a tendon moves."""
+    model = scene.model
+    wraps = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+    if is_fixed(model, tendon):
+        return sorted(set(model.wrap_objid[wraps].tolist()))
+    graph = topology(model)
+    return moved_joints(graph, tendon_ends(model, graph, tendon))
+
+
+def is_fixed(model: mujoco.MjModel, tendon: int) -> bool:
+    """Whether a tendon is a sum of joint coordinates."""
+    return model.wrap_type[model.tendon_adr[tendon]] == int(mujoco.mjtWrap.mjWRAP_JOINT)
+
+
+def tendon_laws(model: mujoco.MjModel) -> np.ndarray:
+    """``[T, 7]`` of each tendon: limits, its spring's rest from and to, stiffness, damping, dry friction; 0 if off.
+
+    Limits are where the constraint's force sets in, beyond ``tendon_margin``.
+    """
+    off = model.opt.disableflags
+    laws = np.zeros((model.ntendon, 7))
+    laws[:, :2] = -FAR, FAR
+    if not off & (_DISABLE.mjDSBL_LIMIT | _DISABLE.mjDSBL_CONSTRAINT):
+        limited = model.tendon_limited.astype(bool)
+        laws[limited, :2] = (model.tendon_range + model.tendon_margin[:, None] * [1, -1])[limited]
+    laws[:, 2:4] = model.tendon_lengthspring
+    for column, name, flag in ((4, "stiffness", "mjDSBL_SPRING"), (5, "damping", "mjDSBL_DAMPER")):
+        if not off & int(getattr(_DISABLE, flag, 0) or _DISABLE.mjDSBL_PASSIVE):  # one flag for both in older MuJoCo
+            values = getattr(model, f"tendon_{name}")
+            laws[:, column] = values if values.ndim == 1 else values[:, 0]
+    if not off & (_DISABLE.mjDSBL_FRICTIONLOSS | _DISABLE.mjDSBL_CONSTRAINT):
+        laws[:, 6] = model.tendon_frictionloss
+    return laws
+
+
+def acting_tendons(scene: Scene) -> tuple[list[int], list[int]]:
+    """Tendons with limits, spring, damping or friction, and spatial ones that pull at balls or free bodies.
+
+    First those whose length and moments follow from body states, then the others.
+    """
+    model = scene.model
+    if not model.ntendon:
+        return [], []
+    laws = tendon_laws(model)
+    own = (np.abs(laws[:, :2]) < FAR).any(1) | laws[:, 4:].any(1) | curved_tendons(model)
+    driven = model.actuator_trnid[model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON), 0]
+    straight = straight_joints(scene)
+    known, others = [], []
+    for tendon in range(model.ntendon):
+        joints, fixed = tendon_joints(scene, tendon), is_fixed(model, tendon)
+        if not joints or not (own[tendon] or (tendon in driven and not fixed and not straight[joints].all())):
+            continue
+        by_length = (np.abs(laws[tendon, :2]) < FAR).any() or laws[tendon, 4] != 0
+        follows = length_follows(scene, tendon, wound=not by_length) and not curved_tendons(model)[tendon]
+        (known if follows else others).append(tendon)
+    return known, others
+
+
+def length_follows(scene: Scene, tendon: int, *, wound: bool = False) -> bool:
+    """Whether a tendon's length and moments follow from body states; ``wound``: but for whole turns of its joints."""
+    joints = tendon_joints(scene, tendon)
+    if not is_fixed(scene.model, tendon):
+        return known_tendon(scene.model, tendon) and bool(known_moments(scene)[joints].all())
+    return bool(straight_joints(scene)[joints].all()) and (wound or not winding_joints(scene)[joints].any())
+
+
+def curved_tendons(model: mujoco.MjModel) -> np.ndarray:
+    """``[T]`` bool, tendons whose spring or damper is no straight line."""
+    found = np.zeros(model.ntendon, dtype=bool)
+    for name in ("stiffnesspoly", "dampingpoly"):  # since MuJoCo 3.7
+        values = getattr(model, f"tendon_{name}", None)
+        if values is not None:
+            found |= values.any(axis=tuple(range(1, values.ndim)))
+    return found
+
+
+def tendon_coefficients(model: mujoco.MjModel) -> np.ndarray:
+    """``[T, J]`` of each joint's coordinate in fixed tendons; 0 in spatial ones."""
+    found = np.zeros((model.ntendon, model.njnt))
+    for tendon in range(model.ntendon):
+        for wrap in range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon]):
+            if is_fixed(model, tendon):
+                found[tendon, model.wrap_objid[wrap]] += model.wrap_prm[wrap]
+    return found
+
+
+def tendon_scales(model: mujoco.MjModel) -> np.ndarray:
+    """``[T]`` how much a tendon's length changes as one of its joints moves by 0.1 rad or 2 cm, 1 mm or more."""
+    data, step, lengths = mujoco.MjData(model), 1e-6, []
+    turning = np.ones(model.nv, dtype=bool)
+    for joint, kind in enumerate(model.jnt_type.tolist()):
+        sliding = {int(mujoco.mjtJoint.mjJNT_SLIDE): 1, int(mujoco.mjtJoint.mjJNT_FREE): 3}.get(kind, 0)
+        turning[model.jnt_dofadr[joint] :][:sliding] = False
+    for change in (np.zeros(model.nv), *(step * np.eye(model.nv))):
+        data.qpos[:] = model.qpos0
+        mujoco.mj_integratePos(model, data.qpos, change, 1.0)
+        for stage in ("kinematics", "comPos", "tendon"):
+            getattr(mujoco, f"mj_{stage}")(model, data)
+        lengths.append(data.ten_length.copy())
+    arms = np.abs(np.array(lengths[1:]).reshape(model.nv, -1) - lengths[0]) / step
+    return (arms * np.where(turning, 0.1, 0.02)[:, None]).max(0, initial=1e-3)
+
+
+def tendon_numbers(scene: Scene) -> list[list[float]]:
+    """Numbers of all tendons and of actuators between sites that features read but samples do not bring."""
+    model, graph, rows = scene.model, topology(scene.model), []
+    for tendon, law in enumerate(tendon_laws(model)):
+        rows.append([*law, *tendon_coefficients(model)[tendon], model.tendon_length0[tendon]])
+        for piece in tendon_pieces(model, tendon):
+            sites = [site for site in (piece.first, piece.second, piece.side) if site >= 0]
+            rows.append([piece.divisor, *(number for site in sites for number in site_in_node(model, graph, site)[1])])
+            if piece.geom >= 0:
+                _, place, frame = geom_in_node(model, graph, piece.geom)
+                rows.append([*place, *frame.ravel(), model.geom_size[piece.geom, 0]])
+    for actuator in line_actuators(scene):
+        if model.actuator_trntype[actuator] != int(mujoco.mjtTrn.mjTRN_TENDON):
+            sites = [site for site in model.actuator_trnid[actuator].tolist() if site >= 0]
+            poses = [number for site in sites for pose in site_in_node(model, graph, site)[1:] for number in pose]
+            rows.append([*poses, *model.actuator_gear[actuator], model.actuator_cranklength[actuator]])
+    return [np.round(row, 9).tolist() for row in rows]

@@ -1,0 +1,107 @@
+"""URDF files: the meshes that they name by package, and motors, which they do not have."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from urllib.parse import unquote, urlparse
+from xml.etree import ElementTree
+
+import mujoco
+
+from torchrl_gn.scenes.files import is_package_path, package_path
+from torchrl_gn.scenes.scene import SceneError
+
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_ROOT = re.compile(r"<([A-Za-z_][\w.-]*)")
+_AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def is_urdf(text: str) -> bool:
+    """Whether a model's text is URDF, by its root element."""
+    root = _ROOT.search(_COMMENT.sub("", text))
+    return root is not None and root.group(1) == "robot"
+
+
+def with_local_meshes(text: str, folder: Path) -> str:
+    """URDF text with paths, which are kept, in place of meshes' ``package://``, ``model://`` and ``file://`` names.
+
+    ``package://NAME/PATH`` is NAME/PATH, or else PATH, in the nearest folder above the file that has it, or in the
+    installed Python package NAME. What is not found stays: pictures are not read, and MuJoCo names what it misses.
+
+    Raises:
+        SceneError: if the text is no XML.
+    """
+    if "<mesh" not in text:
+        return text
+    try:
+        root = ElementTree.fromstring(_COMMENT.sub("", text).lstrip())
+    except ElementTree.ParseError as error:
+        raise SceneError(f"The URDF is no XML: {error}") from error
+    compiler = root.find("mujoco/compiler")
+    if compiler is None:
+        extension = root.find("mujoco")
+        extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
+        compiler = ElementTree.SubElement(extension, "compiler")
+    compiler.attrib.setdefault("strippath", "false")  # older versions of MuJoCo take a mesh's folders off
+    base = os.path.join(os.path.abspath(folder), compiler.get("meshdir", ""))
+    for mesh in root.iter("mesh"):
+        if (found := _mesh_path(mesh.get("filename", ""), folder)) is not None:
+            mesh.set("filename", Path(os.path.relpath(found, base)).as_posix())
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _mesh_path(name: str, folder: Path) -> Path | None:
+    """File that a mesh's URI names, None if it is no URI or is not found."""
+    scheme, separator, rest = name.partition("://")
+    if not separator:
+        return None
+    if scheme == "file":
+        return Path(unquote(urlparse(name).path))
+    inside = rest.partition("/")[2]
+    above = Path(os.path.abspath(folder))
+    for place in (above, *above.parents):
+        for path in (place / rest, place / inside):
+            if inside and path.is_file():
+                return path
+    try:
+        return package_path(name) if is_package_path(name) else None
+    except (FileNotFoundError, ValueError):
+        return None
+
+
+def add_motors(spec: mujoco.MjSpec) -> None:
+    """Add a motor for every hinge and slide, and three for every ball joint, of a model without actuators.
+
+    A motor has its joint's name, or that and the axis, as in ``hip_x``. Its control is the torque or force, N m or N,
+    within the joint's effort (``actfrcrange``); ball joints and joints without one have no bounds. Joints that follow
+    others (``mimic``) and free joints have no motor.
+
+    Raises:
+        SceneError: if the model has actuators, or no joint for a motor.
+    """
+    if spec.actuators:
+        raise SceneError("motors=True is for models without actuators; this one has some.")
+    following = {
+        equality.name1 for equality in spec.equalities if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.name2
+    }
+    for index, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"joint{index}"
+        if joint.name in following:
+            continue
+        if int(joint.type) in _SINGLE:
+            low, high = (float(effort) for effort in joint.actfrcrange)
+            limits = {"ctrllimited": True, "ctrlrange": [low, high]} if low < high else {}
+            _add_motor(spec, joint.name, joint.name, (1, 0, 0), **limits)
+        elif joint.type == mujoco.mjtJoint.mjJNT_BALL:
+            for axis, direction in _AXES.items():
+                _add_motor(spec, f"{joint.name}_{axis}", joint.name, direction)
+    if not spec.actuators:
+        raise SceneError("motors=True finds no joint for a motor: all are free, or follow others.")
+
+
+def _add_motor(spec: mujoco.MjSpec, name: str, joint: str, direction: tuple[int, int, int], **limits) -> None:
+    transmission = mujoco.mjtTrn.mjTRN_JOINT
+    spec.add_actuator(name=name, target=joint, trntype=transmission, gear=[*direction, 0, 0, 0], **limits)

@@ -1,0 +1,234 @@
+"""Contacts with the world: which points of bodies can touch which of its surfaces."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from torchrl_gn.scenes.collisions import colliding_geoms
+from torchrl_gn.scenes.contact_points import SLOTS
+from torchrl_gn.scenes.invariance import surface_velocities
+from torchrl_gn.scenes.surfaces import KINDS, MOST_SURFACES, Surface, find_surface, hull_vertices
+from torchrl_gn.scenes.topology import named, weld_roots
+
+if TYPE_CHECKING:
+    from torchrl_gn.scenes.scene import Scene
+
+_GEOM = mujoco.mjtGeom
+MOST_POINTS = 8  # of each node
+MOST_OF_ALL = 256  # points of all nodes
+
+
+@dataclass(frozen=True, eq=False)
+class WorldContacts:
+    """Points of bodies, the surfaces that they can touch, and their contacts' numbers.
+
+    A point is a sphere, or that of an ellipsoid, a disc or a rounded segment which is nearest to the surface.
+    """
+
+    surfaces: tuple[Surface, ...]  # [S] sorted by kind
+    geom: np.ndarray  # [C] geom that each point is on
+    node: np.ndarray  # [C]
+    slot: np.ndarray  # [C] number among the points of its node, below 8
+    # [C, 16] centre 3 in the node's frame, radius, half axes 9 of an ellipsoid about it (columns of a matrix, row by
+    # row), and vector 3 to the other end of a segment that begins there; metres. Segments come last
+    points: np.ndarray
+    velocity: np.ndarray  # [C, 6] of the geom's own material there, linear and angular about the centre, node's frame
+    touches: np.ndarray  # [C, S] bool, whether MuJoCo lets them collide
+    pairs: np.ndarray  # [C, S, 2] coefficient of sliding friction; distance at which the force sets in, metres
+    reduced: tuple[str, ...] = ()  # nodes of which some points are left out
+    ignored: tuple[str, ...] = ()  # geoms that can be touched but are no surface here
+
+    @property
+    def kinds(self) -> list[str]:
+        """Kinds ``[S]`` of the surfaces."""
+        return [surface.kind for surface in self.surfaces]
+
+    @property
+    def constants(self) -> np.ndarray:
+        """Constants ``[S, 22]`` of the surfaces."""
+        return np.array([surface.constants for surface in self.surfaces]).reshape(-1, 22)
+
+
+def find_world_contacts(scene: Scene) -> WorldContacts:
+    """Find what of a scene can touch its world.
+
+    Fixed bodies are no surfaces to what they, or those that they are fixed to, carry: the base of a robot is a part of
+    it.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    mujoco.mj_kinematics(model, data)
+    body = model.geom_bodyid
+    node, tree = np.searchsorted(scene.body, weld_roots(model))[body], model.body_rootid[body]
+    colliding = colliding_geoms(model) & ((tree[:, None] != tree) | (body == 0) | (body[:, None] == 0))
+    moving = np.flatnonzero(node > 0)
+    touched = [int(geom) for geom in np.flatnonzero(node == 0) if colliding[geom, moving].any()]
+    found = [surface for geom in touched if (surface := find_surface(model, data, geom)) is not None]
+    # What is endless first, then the largest.
+    size = np.where(np.isin(model.geom_type, (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)), np.inf, model.geom_rbound)
+    kept = sorted(found, key=lambda surface: -size[surface.geom])[:MOST_SURFACES]
+    surfaces = sorted(kept, key=lambda surface: (KINDS.index(surface.kind), surface.geom))
+    geoms = np.array([surface.geom for surface in surfaces], dtype=np.int64)
+    boxes = np.array([surface.kind == "box" for surface in surfaces], dtype=bool)
+    rows = [
+        (int(geom), int(node[geom]), _in_node(model, data, int(geom), int(scene.body[node[geom]]), point))
+        for geom in (moving[colliding[np.ix_(moving, geoms)].any(1)] if len(geoms) else ())
+        for point in _points(model, int(geom), bool(boxes.any()))
+    ]
+    chosen, slots, reduced = _chosen(rows)
+    of_geom = np.array([geom for geom, _, _ in chosen], dtype=np.int64)
+    points = np.array([point for _, _, point in chosen]).reshape(-1, 16)
+    touches = colliding[np.ix_(of_geom, geoms)] if len(chosen) else np.zeros((0, len(geoms)), dtype=bool)
+    # A segment's ends are points of their own, which suffice for other surfaces.
+    touches &= ~points[:, 13:].any(1, keepdims=True) | boxes
+    numbers = ContactNumbers(model)
+    pairs = np.array([[numbers(one, other) for other in geoms.tolist()] for one in of_geom.tolist()])
+    nodes = np.array([node for _, node, _ in chosen], dtype=np.int64)
+    return WorldContacts(
+        surfaces=tuple(surfaces),
+        geom=of_geom,
+        node=nodes,
+        slot=slots,
+        points=points,
+        velocity=_velocities(scene, data, of_geom, nodes, points),
+        touches=touches,
+        pairs=pairs.reshape(len(chosen), len(geoms), 2),
+        reduced=tuple(scene.node_names[one] for one in reduced),
+        ignored=tuple(named(model, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in touched if geom not in geoms),
+    )
+
+
+def shown_by_plane(scene: Scene) -> bool:
+    """Whether ``scene.contact_points`` has all of it: one plane that does not move, up to four points a node."""
+    contacts, points = scene.world_contacts, scene.contact_points
+    if not len(contacts.node):
+        return True
+    known = [] if points is None else [points.plane]
+    simple = np.isin(scene.model.geom_type[contacts.geom], (int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_CAPSULE)))
+    still = not contacts.constants[:, 16:].any() and not contacts.velocity.any()
+    few = contacts.slot.max() < SLOTS and not contacts.reduced
+    return [surface.geom for surface in contacts.surfaces] == known and bool(simple.all()) and still and bool(few)
+
+
+_Row = tuple[int, int, np.ndarray]  # geom, node, point
+
+
+def _chosen(rows: list[_Row]) -> tuple[list[_Row], np.ndarray, list[int]]:
+    """At most 8 points of each node and 256 of all, far from each other; their slots, and the nodes that lack some."""
+    nodes = np.array([node for _, node, _ in rows], dtype=np.int64)
+    counts = np.bincount(nodes)
+    limits = range(MOST_POINTS, 1, -1)
+    most = next((limit for limit in limits if np.minimum(counts, limit).sum() <= MOST_OF_ALL), 1)
+    chosen: list[tuple[int, _Row]] = []
+    for node in np.unique(nodes):
+        here = [row for row in rows if row[1] == node]
+        points = np.array([point for _, _, point in here])
+        middle = points[:, :3] + points[:, 13:] / 2
+        chosen += enumerate(here[index] for index in _outermost(middle, points[:, 3], most))
+    chosen.sort(key=lambda each: each[1][2][13:].any())
+    slots = np.array([slot for slot, _ in chosen], dtype=np.int64)
+    return [row for _, row in chosen], slots, np.flatnonzero(counts > most).tolist()
+
+
+def _outermost(points: np.ndarray, radius: np.ndarray, count: int) -> list[int]:
+    """Ascending indices of at most ``count`` spheres: those that reach farthest in some direction, then any.
+
+    Numbers are compared after rounding, so that points that are alike are chosen alike in every variant of a scene.
+    """
+    directions = np.array(sorted(itertools.product((-1, 0, 1), repeat=3), key=lambda each: -np.abs(each).sum())[:-1])
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    farthest = (directions @ points.T + radius).round(9).argmax(1)
+    return sorted(list(dict.fromkeys([*farthest.tolist(), *range(len(points))]))[:count])
+
+
+def _points(model: mujoco.MjModel, geom: int, has_boxes: bool) -> list[np.ndarray]:
+    """Points ``[16]`` of a geom in its frame; the side of a capsule too, which may lie on an edge of a box."""
+    size, none = model.geom_size[geom], np.zeros(3)
+
+    def sphere(center: ArrayLike, radius: float = 0.0, axes: ArrayLike = none, segment: ArrayLike = none) -> np.ndarray:
+        return np.concatenate((center, [radius], np.diag(axes).ravel(), segment))
+
+    match mujoco.mjtGeom(model.geom_type[geom]):
+        case _GEOM.mjGEOM_SPHERE:
+            return [sphere(none, size[0])]
+        case _GEOM.mjGEOM_CAPSULE:
+            end = np.array([0, 0, size[1]])
+            side = [sphere(-end, size[0], segment=2 * end)] * has_boxes
+            return [sphere(end, size[0]), sphere(-end, size[0]), *side]
+        case _GEOM.mjGEOM_BOX:
+            return [sphere(np.array(signs) * size) for signs in itertools.product((1, -1), repeat=3)]
+        case _GEOM.mjGEOM_CYLINDER:
+            return [sphere((0, 0, side * size[1]), axes=(size[0], size[0], 0)) for side in (1, -1)]
+        case _GEOM.mjGEOM_ELLIPSOID:
+            return [sphere(none, axes=size)]
+        case _GEOM.mjGEOM_MESH if (vertices := hull_vertices(model, int(model.geom_dataid[geom]))) is not None:
+            return [sphere(vertices[index]) for index in _outermost(vertices, np.zeros(len(vertices)), MOST_POINTS)]
+    return []
+
+
+def _in_node(model: mujoco.MjModel, data: mujoco.MjData, geom: int, root: int, point: np.ndarray) -> np.ndarray:
+    """A point ``[16]`` of a geom in the frame of its node's root body."""
+    frame = data.xmat[root].reshape(3, 3)
+    turn = frame.T @ data.geom_xmat[geom].reshape(3, 3)
+    center = frame.T @ (data.geom_xpos[geom] - data.xpos[root]) + turn @ point[:3]
+    return np.concatenate((center, point[3:4], (turn @ point[4:13].reshape(3, 3)).ravel(), turn @ point[13:]))
+
+
+def _velocities(
+    scene: Scene, data: mujoco.MjData, geoms: np.ndarray, nodes: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """Velocity ``[C, 6]`` of the geoms' own material at the points' centres, linear and angular, nodes' frames."""
+    given, found = surface_velocities(scene.model), np.zeros((len(geoms), 6))
+    for index, (geom, node) in enumerate(zip(geoms.tolist(), nodes.tolist(), strict=True)):
+        root = int(scene.body[node])
+        frame = data.xmat[root].reshape(3, 3)
+        turn = frame.T @ data.geom_xmat[geom].reshape(3, 3)
+        center = frame.T @ (data.geom_xpos[geom] - data.xpos[root])
+        linear, angular = turn @ given[geom, :3], turn @ given[geom, 3:]
+        found[index] = *(linear + np.cross(angular, points[index, :3] - center)), *angular
+    return found
+
+
+class ContactNumbers:
+    """What MuJoCo takes of two geoms for their contact."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        ends = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+        self._model, self._pairs = model, {frozenset(pair): index for index, pair in enumerate(ends)}
+
+    def __call__(self, first: int, second: int) -> tuple[float, float]:
+        """Coefficient of sliding friction, and the distance at which the force sets in, metres."""
+        model, both = self._model, [first, second]
+        sums, gaps, pair_gaps = _margin_rule()
+        if (pair := self._pairs.get(frozenset(both))) is not None:
+            friction = float(model.pair_friction[pair, 0]) if model.pair_dim[pair] > 1 else 0.0
+            return friction, float(model.pair_margin[pair] - pair_gaps * model.pair_gap[pair])
+        priority = model.geom_priority[both]
+        leading = np.array(both)[priority == priority.max()]
+        friction = float(model.geom_friction[leading, 0].max()) if model.geom_condim[leading].max() > 1 else 0.0
+        margin, gap = ((each[both].sum() if sums else each[both].max()) for each in (model.geom_margin, model.geom_gap))
+        return friction, float(margin - gaps * gap)
+
+
+@lru_cache
+def _margin_rule() -> tuple[bool, bool, bool]:
+    """Whether this MuJoCo adds margins, or takes the larger; and whether gaps count, of geoms and of explicit pairs.
+
+    In older versions a contact's force sets in ``gap`` below the margin; in later ones the gap only makes contacts
+    without force.
+    """
+    ball = '<body pos="0 0 {}"><freejoint/><geom name="{}" size=".1" margin="{}" gap="{}"/></body>'
+    text = f"<mujoco><worldbody>{ball.format(0, 'a', 0.3, 0.1)}{ball.format(0.1, 'b', 0.2, 0.1)}</worldbody>"
+    found = []
+    for pair in ("", '<contact><pair geom1="a" geom2="b" margin=".3" gap=".1"/></contact>'):
+        model = mujoco.MjModel.from_xml_string(f"{text}{pair}</mujoco>")
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        found.append(round(float(data.contact.includemargin[0]), 6))
+    return found[0] >= 0.4, found[0] not in (0.5, 0.3), found[1] < 0.3

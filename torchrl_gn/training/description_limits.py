@@ -1,0 +1,59 @@
+"""Build a network from a description that somebody else may have written: sizes are not believed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+_MOST_EACH, _MOST_TOGETHER = 100_000, 1_000_000  # of the whole numbers that describe a network
+_DESCRIBED_APART = ("scene", "kinematic_tree")  # which scene_from_description limits
+_FREE_BYTES, _RATIO = 16_000_000, 4  # weights in half precision are built in single; constants come on top
+_EACH = 4_096  # bytes that Python takes for a tensor, its module and their names
+_FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.eye, torch.arange}
+
+
+class MemoryLimit(TorchFunctionMode):
+    """Refuse tensors that a block makes beyond what a file with so many weights, of so many bytes, can be for.
+
+    Raises:
+        ValueError: at the first tensor too much, before anything is written to it.
+    """
+
+    def __init__(self, size: int, count: int) -> None:
+        super().__init__()
+        self.size, self.room = size, _FREE_BYTES + _RATIO * (size + count * _EACH)
+
+    def __torch_function__(self, func: Callable, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        made = func(*args, **(kwargs or {}))
+        if func in _FACTORIES and isinstance(made, Tensor) and not made.is_meta:
+            self.room -= made.untyped_storage().nbytes() + _EACH
+            if self.room < 0:
+                raise ValueError(
+                    f"its description is of a far larger network than the {self.size:,} bytes of weights are"
+                )
+        return made
+
+
+def check_whole_numbers(description: Any) -> None:
+    """Raise ValueError if a description of a network, apart from its scenes, has sizes that none can have."""
+    together = 0
+    for number in _whole_numbers(description):
+        together += abs(number)
+        if abs(number) > _MOST_EACH or together > _MOST_TOGETHER:
+            raise ValueError(f"its description has the number {number}, or numbers together, too large for a network")
+
+
+def _whole_numbers(value: Any) -> Iterator[int]:
+    rest = [value]
+    while rest:
+        each = rest.pop()
+        if isinstance(each, dict):
+            rest += [inner for name, inner in each.items() if name not in _DESCRIBED_APART]
+        elif isinstance(each, list):
+            rest += each
+        elif isinstance(each, int) and not isinstance(each, bool):
+            yield each
