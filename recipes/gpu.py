@@ -133,9 +133,11 @@ def measure_speed(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
             "compiled, tf32": ("compiled", None, True),
             "compiled, bfloat16": ("compiled", torch.bfloat16, True),
         }
-        if cfg.device == "cpu":
-            ways = {"torch": ways["torch"], "native": ways["native"]}
-        for way, (executor, dtype, rounded) in ways.items():
+        wanted_ways = cfg.ways or list(ways if cfg.device == "cuda" else ("torch", "native"))
+        if unknown := [way for way in wanted_ways if way not in ways]:
+            raise ValueError(f"ways={unknown} are not known; use any of {list(ways)}.")
+        for way in wanted_ways:
+            executor, dtype, rounded = ways[way]
             start = time.perf_counter()
             predictor = specialize(bound, executor=executor, dtype=dtype)
             key = f"{name}/{way}"

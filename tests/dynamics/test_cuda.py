@@ -216,6 +216,9 @@ def test_a_gpu_computes_what_the_processor_does(wide, inputs, name):
     with torch.no_grad():
         live = there.rollout(state.cuda(), actions.cuda())[0]
     torch.testing.assert_close(live.cpu(), wanted[0], rtol=1e-8, atol=1e-8)
+    moved = specialize(there).to("cpu")
+    assert moved.reason == "on cpu, it runs by torch operations"
+    torch.testing.assert_close(moved.rollout(state, actions)[0], wanted[0], rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.gpu

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics.bound import BoundPredictor, UnseenParameterWarning, static_graph
-from torchrl_gn.dynamics.executors import EXECUTORS, EagerExecutor, NativeExecutor
+from torchrl_gn.dynamics.executors import EXECUTORS, CudaExecutor, EagerExecutor, NativeExecutor
 from torchrl_gn.dynamics.predictor import Predictor, check_shapes, check_steps, require_bound
 from torchrl_gn.dynamics.program import Executor, InputScaling, PreparedStep, StepProgram, structure_key
 from torchrl_gn.dynamics.snapshot import Snapshot
@@ -80,11 +80,10 @@ class SpecializedPredictor(Predictor):
 
     @property
     def reason(self) -> str | None:
-        """Why torch operations run it although it is native; None if they do not."""
-        moved = self.executor_name == "native" and not self.squares.is_cpu
-        return self.executor.reason or (
-            f"on {self.squares.device.type}, it runs by torch operations" if moved else None
-        )
+        """Why torch operations run it although its executor has kernels; None if they do not."""
+        home = {NativeExecutor: "cpu", CudaExecutor: "cuda"}.get(type(self.executor))
+        here = self.squares.device.type
+        return self.executor.reason or (None if home in (None, here) else f"on {here}, it runs by torch operations")
 
     @without_autocast
     @torch.no_grad()

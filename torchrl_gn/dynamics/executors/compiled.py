@@ -141,10 +141,10 @@ def _compile(function: Callable) -> Callable:
     if not torch.cuda.is_available():
         # The kernels of a small graph take less time than calling them from Python.
         options["cpp_wrapper"] = True
-    return torch.compile(function, fullgraph=True, dynamic=False, options=options, **recompile_limits())
+    return torch.compile(function, fullgraph=True, dynamic=False, options=options, **_recompile_limits())
 
 
-def recompile_limits() -> dict[str, Any]:
+def _recompile_limits() -> dict[str, Any]:
     """Options of ``torch.compile`` for a function of its own with many shapes; none with a torch before 2.13."""
     known = inspect.signature(torch.compile).parameters
     wanted = {"recompile_limit": 1000, "isolate_recompiles": True}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import OrderedDict
 from collections.abc import Callable
@@ -14,7 +15,6 @@ from torch.autograd import forward_ad
 
 from torchrl_gn.cache import keep_inductor_private
 from torchrl_gn.dynamics.executors import eager
-from torchrl_gn.dynamics.executors.compiled import recompile_limits
 from torchrl_gn.dynamics.executors.cuda.graphs import StepGraph
 from torchrl_gn.dynamics.executors.cuda.nvrtc import NoCudaCompilerError, check_compiler
 from torchrl_gn.dynamics.executors.cuda.source import Layout
@@ -60,7 +60,7 @@ class CudaExecutor:
         make: Callable[..., Any] | None = None,
     ) -> None:
         self.change, self.graphs, self.compiles, self.reason = change, graphs, compiles, None
-        self._compiled: _CompiledNetwork | None = None
+        self._devices = ("cuda",) if make is None else ("cuda", "cpu")
         self._recorded: OrderedDict[tuple, StepGraph] = OrderedDict()
         plain = moved(program, "cpu")
         layers, self.reason = list_layers(plain)
@@ -94,7 +94,7 @@ class CudaExecutor:
         self._kernels = StateKernels(maths, layout, **({} if make is None else {"make": make}))
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"_recorded": OrderedDict(), "_compiled": None}  # a copy makes its own
+        return self.__dict__ | {"_recorded": OrderedDict()}  # a copy makes its own
 
     def pack(self, program: StepProgram) -> StepProgram:
         return program
@@ -142,6 +142,7 @@ class CudaExecutor:
             and state.dtype in _DTYPES
             and actions.dtype in _DTYPES
             and state.device == actions.device == program.movable.device
+            and state.device.type in self._devices  # not of a copy that was moved to the processor
             and not torch.compiler.is_compiling()
             and not torch._C._are_functorch_transforms_active()
             and forward_ad._current_level < 0
@@ -173,9 +174,7 @@ class CudaExecutor:
         """The network's output ``[P, B, F_out]`` of its inputs ``[N, B, F_n]`` and ``[E, B, F_e]``."""
         if not self.compiles:
             return predict(program.core, program.edge_index, nodes, edges)
-        if self._compiled is None:
-            self._compiled = _CompiledNetwork(program)
-        return self._compiled(program, nodes, edges)
+        return _compiled_network()(program.core, program.edge_index, nodes, edges)
 
     def recorded(self, program: StepProgram, kind: str, state: Tensor, action: Tensor) -> StepGraph:
         """The graph of a step (``"after"``) or its gradient (``"pull"``) for this number of samples."""
@@ -267,20 +266,17 @@ def predict(core: FoldedCore, edge_index: Tensor, nodes: Tensor, edges: Tensor) 
     return full[:, cast(ListedCore, core).predicted].transpose(0, 1).contiguous()
 
 
-class _CompiledNetwork:
-    """The network through ``torch.compile``, as a function of its tensors; compiled for every number of samples."""
+@functools.cache
+def _compiled_network() -> Callable[..., Tensor]:
+    """:func:`predict` through ``torch.compile``: compiled for every structure, dtype and number of samples."""
+    keep_inductor_private()
+    compiled = torch.compile(predict, fullgraph=True, dynamic=False)
 
-    def __init__(self, program: StepProgram) -> None:
-        of = skeleton(program.core)
+    def run(*given: Any) -> Tensor:
+        with torch._dynamo.config.patch(recompile_limit=1000, accumulated_recompile_limit=1000):
+            return compiled(*given)
 
-        def run(nodes: Tensor, edges: Tensor, edge_index: Tensor, *tensors: Tensor) -> Tensor:
-            return predict(rebuild(of, iter(tensors)), edge_index, nodes, edges)
-
-        keep_inductor_private()
-        self._run = torch.compile(run, fullgraph=True, dynamic=False, **recompile_limits())
-
-    def __call__(self, program: StepProgram, nodes: Tensor, edges: Tensor) -> Tensor:
-        return self._run(nodes, edges, program.edge_index, *(cast(Tensor, leaf) for _, leaf in leaves(program.core)))
+    return run
 
 
 def _flat(tensor: Tensor, dims: int) -> Tensor:
