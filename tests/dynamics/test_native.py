@@ -535,7 +535,7 @@ def test_other_processes_predict_the_same(quick, inputs, method):
     queue = context.Queue()
     process = context.Process(target=_in_child, args=(queue, predictor, state, actions))
     process.start()
-    found = queue.get(timeout=120)
+    found = queue.get(timeout=300)
     process.join()
     np.testing.assert_array_equal(found, expected.numpy())
     assert process.exitcode == 0

@@ -65,7 +65,7 @@ def _listen_to_ctrl_c() -> None:
 def _run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
     """Exit code, output and errors of a recipe."""
     process = _start(*options, recipe=recipe)
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=600)
     return process.returncode, output, errors
 
 

@@ -48,7 +48,7 @@ def commands(script: str, folder: Path) -> list[list[str]]:
     environment = os.environ | {"PATH": f"{folder}{os.pathsep}{os.environ['PATH']}"}
     # <time> stands for a name, not for a file to read.
     script = re.sub(r"<(\w+)>", r"\1", script)
-    subprocess.run(["bash", "-euc", script], cwd=folder, env=environment, check=True, timeout=60)
+    subprocess.run(["bash", "-euc", script], cwd=folder, env=environment, check=True, timeout=300)
     return [line.split("\x1f")[:-1] for line in log.read_text().splitlines()]
 
 

@@ -40,7 +40,7 @@ def read_wandb(folder):
     from wandb.proto import wandb_internal_pb2
 
     (path,) = folder.glob("wandb/offline-run-*/*.wandb")
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 300
     while True:
         records = [wandb_internal_pb2.Record.FromString(data) for data in wandb_records(path)]
         kinds = [record.WhichOneof("record_type") for record in records]
