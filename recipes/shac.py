@@ -41,7 +41,7 @@ from torchrl_gn.planners.plan import check_count
 from torchrl_gn.training import RunFolder, load_pretrained
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
-MAY_CHANGE = ("rounds", "zero_shot", "threads", "logger", "run_dir")
+MAY_CHANGE = ("rounds", "zero_shot", "threads", "device", "logger", "run_dir")
 COLUMNS = {
     "frames": "frames",
     "minutes": "processor minutes",
@@ -126,7 +126,8 @@ def judge_all(cfg: DictConfig, tasks: list[Task], policy: BoundedPolicy) -> tupl
 
 def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float | None]:
     """Play every task with exploration; trajectories, and the models' mean error; None if all became unstable."""
-    played = [task.play(learner.policy.for_scene(task.scene), seed) for task in learner.tasks]
+    policy = learner.playing()
+    played = [task.play(policy.for_scene(task.scene), seed) for task in learner.tasks]
     errors = [error_of(task.model, new) for task, new in zip(learner.tasks, played, strict=True) if len(new)]
     return played, statistics.fmean(errors) if errors else None
 
@@ -179,11 +180,11 @@ def main(cfg: DictConfig) -> None:
         keep_latest(learner, done[-1], policy, latest)
     with tqdm(total=cfg.rounds, initial=len(done), desc="rounds", leave=False) as bar:
         for index in range(len(done), cfg.rounds):
-            began, seed = time.process_time(), cfg.seed + 1000 * (index + 1)
+            began, start, seed = time.process_time(), time.perf_counter(), cfg.seed + 1000 * (index + 1)
             torch.manual_seed(seed)  # a resumed run draws what it would have drawn
             losses, now = learner.learn(index), Round(run.path, index)
             played, error = play_round(learner, seed)
-            seconds = time.process_time() - began
+            minutes, seconds = (time.process_time() - began) / 60, time.perf_counter() - start
             policy = learner.averaged(run.path, index)
             judged, numbers = judge_all(cfg, tasks, policy)
             random_steps = len(tasks) * cfg.first.trajectories * cfg.first.length
@@ -191,7 +192,8 @@ def main(cfg: DictConfig) -> None:
             rounds.append(
                 {
                     "frames": before["frames"] + len(tasks) * cfg.action_repeat * cfg.episodes * cfg.steps,
-                    "minutes": before["minutes"] + seconds / 60,
+                    "minutes": before["minutes"] + minutes,
+                    "seconds": before.get("seconds", 0.0) + seconds,  # by the clock; older rounds have none
                     **numbers,
                     "error": error,
                     **losses,

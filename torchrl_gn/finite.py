@@ -15,6 +15,12 @@ def is_traced() -> bool:
     return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
 
 
+def _may_ask() -> bool:
+    """Whether code may branch on numbers: neither traced, nor recorded as a CUDA graph."""
+    recorded = torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing()
+    return not (recorded or is_traced())
+
+
 def require_real(value: object, what: str, *, whole: bool = True) -> None:
     """TypeError, naming ``what``, unless a value is a tensor of real numbers, which may be ``whole``: integers."""
     if not isinstance(value, Tensor):
@@ -29,7 +35,7 @@ def require_real(value: object, what: str, *, whole: bool = True) -> None:
 
 def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> None:
     """Raise ValueError, naming ``what``, value and index, if a number of ``value`` is not finite; waits for a GPU."""
-    if is_traced():
+    if not _may_ask():
         return
     if isinstance(value, TensorDictBase):
         for key, entry in value.items(include_nested=True, leaves_only=True):
@@ -43,7 +49,7 @@ def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> No
 
 def require_all_finite(values: Mapping[str, Tensor]) -> None:
     """As :func:`require_finite` of each, by what it is; waits for a device once."""
-    if is_traced():
+    if not _may_ask():
         return
     elsewhere = [value for value in values.values() if not value.is_cpu]
     if elsewhere and bool(torch.stack([torch.isfinite(value).all() for value in elsewhere]).all()):

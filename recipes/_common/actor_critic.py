@@ -38,6 +38,7 @@ class TargetSquares:
     def __init__(self, scene: Scene, half_sides: Sequence[float]) -> None:
         model, self.scene = scene.model, scene
         self.half_sides = np.array([float(each) for each in half_sides])
+        self._sizes = torch.from_numpy(self.half_sides)  # where states are
         if not (self.half_sides > 0).all():
             raise ValueError(f"target_squares={list(half_sides)} must be positive half sides, metres.")
         slides = [
@@ -75,8 +76,10 @@ class TargetSquares:
 
     def move(self, state: Tensor) -> Tensor:
         """States ``[B, N, 13]`` with the first body somewhere else in a square around the target."""
-        sizes = torch.from_numpy(self.half_sides)[torch.randint(len(self.half_sides), (len(state), 1, 1))]
-        place = sizes * (2 * torch.rand(len(state), 1, 2, dtype=torch.float64) - 1)
+        device, count = state.device, len(state)
+        self._sizes = self._sizes.to(device)
+        sizes = self._sizes[torch.randint(len(self._sizes), (count, 1, 1), device=device)]
+        place = sizes * (2 * torch.rand(count, 1, 2, dtype=torch.float64, device=device) - 1)
         moved = state.clone()
         moved[:, 1:, :2] += place.to(state) - state[:, 1:2, :2]
         return moved

@@ -23,6 +23,7 @@ from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import fit, load_pretrained, plain_config, save_checkpoint
 from torchrl_gn.training.tensor_files import write_tensors
+from torchrl_gn.training.workers import Workers
 
 
 class Round:
@@ -42,7 +43,7 @@ class Round:
 
 
 class Task:
-    """A scene with its reward, and the model and value that learn for it.
+    """A scene with its reward, and the model and value that learn for it, with their data on one device.
 
     Args:
         folder: of its files in a run and in a round.
@@ -56,6 +57,7 @@ class Task:
         if reward.target_shape is not None:
             raise ValueError(f"A policy of states does not know the target of {reward}.")
         self.cfg, self.scene, self.reward, self.judge, self.folder = cfg, scene, reward, judge, folder
+        self.device = Workers().device(cfg.device)
         self.squares = TargetSquares(scene, cfg.target_squares) if cfg.target_squares else None
         self.invariances = task_invariances(scene, reward)
         self.data: list[TensorDict] = []
@@ -70,23 +72,24 @@ class Task:
         """Trajectories of random control, and those that finished rounds played."""
         cfg = self.cfg
         first = collect_trajectories(self.scene, cfg.first.trajectories, steps=cfg.first.length, seed=cfg.seed)
-        self.data = [windows(first["state"], first["action"])]
+        self.data = [windows(first["state"], first["action"]).to(self.device)]
         for each in done:
             played = load_tensors(each.of("played", self))
-            self.data.append(TensorDict(played, [len(played["action"])]))
+            self.data.append(TensorDict(played, [len(played["action"])]).to(self.device))
 
     def begin(self, policy: BoundedPolicy, begun: Round | None) -> None:
         """Make model, value and loss, or read them from the last round."""
         cfg, config = self.cfg, plain_config(self.cfg)
         if begun is None:
-            self.model = ForwardModel.for_scene(self.scene, **config["model"]).bind(self.scene)
+            model = ForwardModel.for_scene(self.scene, **config["model"])
             options = {"discount": cfg.discount, "hidden": cfg.hidden}
             self.value = StateValue(self.scene, canonicalizer=self.invariances, **options)
         else:
-            self.model = load_pretrained(begun.of("model", self)).bind(self.scene)
+            model = load_pretrained(begun.of("model", self)).model
             self.value = load_pretrained(begun.of("value", self)).value
+        self.model = model.to(self.device).bind(self.scene)
         imagined = ModelEnv(self.model, self.reward)  # until the model has learned: learn_model() takes a snapshot
-        self.loss = SHACLoss(policy, self.value, imagined, steps=cfg.horizon, lmbda=cfg.lmbda)
+        self.loss = SHACLoss(policy, self.value, imagined, steps=cfg.horizon, lmbda=cfg.lmbda).to(self.device)
 
     @property
     def newest(self) -> TensorDict:
@@ -107,7 +110,8 @@ class Task:
         newest, rewards = self.newest, None
         if first:
             before, after = newest["state"][:, :-1], newest["state"][:, 1:]
-            rewards = self.reward(before, newest["action"], after, None).flatten(0, 1)
+            reward = cast(Reward, self.loss.env.reward)  # on the device
+            rewards = reward(before, newest["action"], after, None).flatten(0, 1)
         seen = newest["state"].flatten(0, 1)
         self.loss.fit_normalizers(seen if self.squares is None else self.squares.move(seen), rewards)
 
@@ -119,7 +123,8 @@ class Task:
 
         def draw(size: int) -> Tensor:
             counts = size - size // 2, size // 2
-            parts = [of[torch.randint(len(of), (count,))] for of, count in zip(states, counts, strict=True)]
+            draws = zip(states, counts, strict=True)
+            parts = [of[torch.randint(len(of), (count,), device=of.device)] for of, count in draws]
             if self.squares is not None:
                 parts[0] = self.squares.move(parts[0])
             return torch.cat(parts)
@@ -139,7 +144,7 @@ class Task:
 
     def add(self, played: TensorDict, of: Round) -> None:
         """Keep a round's trajectories, also in its folder."""
-        self.data.append(played)
+        self.data.append(played.to(self.device))
         write_tensors(of.of("played", self), dict(played.items()))
 
 
@@ -153,6 +158,7 @@ class ActorCritic:
         else:
             kept = load_pretrained(begun.policy)
             self.policy = kept.policy
+        self.policy.to(tasks[0].device)
         for task in tasks:
             task.begin(self.policy.for_scene(task.scene), begun)
         rates = {name: cfg[name] for name in ("policy_lr", "value_lr", "alpha_lr")}
@@ -177,9 +183,13 @@ class ActorCritic:
         sizes = {"updates": self.cfg.updates, "batch_size": self.cfg.batch_size}
         return self.optimizer.learn(batches, **sizes, desc=f"policy, round {index}")
 
+    def playing(self) -> BoundedPolicy:
+        """A copy of the policy on the processor, where MuJoCo is."""
+        return copy.deepcopy(self.policy).cpu()
+
     def averaged(self, folder: Path, index: int) -> BoundedPolicy:
-        """The policy with mean weights of the last rounds, a quarter of all or ``average``: steadier than one."""
-        policy = copy.deepcopy(self.policy)
+        """:meth:`playing` with mean weights of the last rounds, a quarter of all or ``average``: steadier than one."""
+        policy = self.playing()
         first = index + 1 - min(self.cfg.average, 1 + index // 4)
         before = [load_pretrained(Round(folder, each).policy).policy for each in range(first, index)]
         with torch.no_grad():

@@ -133,7 +133,7 @@ class ModelEnv(ModelBasedEnvBase):
             state = self.starts.draw(shape, tensordict.get("_reset", None), simulator=self._simulator)
             if self._simulator is not None:
                 state = self._simulator.observe(state)
-        reset = TensorDict({"state": state}, batch_size=shape)
+        reset = TensorDict({"state": state}, batch_size=shape, device=self.device)  # as is what is added
         if (key := self._parameters_key) is not None:
             if (parameters := tensordict.get(key, None)) is None:
                 parameters = cast(Any, self.world_model).own_parameters().expand(shape)
@@ -150,7 +150,7 @@ class ModelEnv(ModelBasedEnvBase):
             reset.set("past_actions", self._past_actions(known).clone())
         if self.terminal is not None:
             reset.set("discount", torch.ones(*shape, 1, dtype=torch.float32))
-        return reset.to(self.device)
+        return reset
 
     def _past_actions(self, tensordict: TensorDictBase) -> Tensor:
         """Actions of the steps before ``[*B, history, A]``, the latest first; zeros (within bounds) by default."""

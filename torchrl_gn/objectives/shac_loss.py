@@ -126,7 +126,8 @@ class SHACLoss(LossModule):
 
     def _imagine(self, state: Tensor) -> tuple[TensorDict, Tensor]:
         """Steps ``[B, H]`` of the policy in the model, and estimates ``[B, H]`` of the entropy of its actions."""
-        now = self.env.reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
+        # Not reset(), which asks whether an episode has ended: it would wait for a device.
+        now = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
         steps, entropies = [], []
         with frozen(self.env.world_model), self.policy.prepared(), set_exploration_type(ExplorationType.RANDOM):
             for _ in range(self.steps):
@@ -156,6 +157,7 @@ class SHACLoss(LossModule):
                 "done": done,
             }
             batch = TensorDict({"features": here, "next": after}, imagined.shape)
+            self._estimator.vectorized = here.is_cpu  # which looks for ends: it would wait for a device
             targets = self.value.normalizer(cast(Tensor, self._estimator.value_estimate(batch)))
         return (alive * (self.value.normalized(here) - targets).square()).mean()
 

@@ -1,0 +1,66 @@
+"""Rounds of recipes/shac.py with networks on the device, and MuJoCo beside it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+import torchrl_gn as gn
+
+from .device import NAME
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+sys.path.append(str(RECIPES))  # as Python does for a script there
+
+from _common.actor_critic_rounds import ActorCritic, Round, Task  # noqa: E402
+
+SMALL = {
+    "first": {"trajectories": 4, "length": 50, "steps": 2},
+    "model": {"hidden": 8, "latent": 8},
+    "graph": {"hidden": [8], "latent": 8},
+    "evaluate": {"episodes": 2, "steps": 5},
+    **{"updates": 3, "batch_size": 8, "horizon": 3, "hidden": [8], "episodes": 2, "steps": 50, "model_steps": 2},
+}
+
+
+def learner(device: str, begun: Round | None = None, **options) -> ActorCritic:
+    cfg = OmegaConf.merge(OmegaConf.load(RECIPES / "config/shac.yaml"), SMALL, {"device": device, **options})
+    assert isinstance(cfg, DictConfig)
+    scene = gn.load_scene(cfg.system, timestep=cfg.timestep)
+    torch.manual_seed(0)
+    reward = gn.make_reward(cfg.reward, scene)
+    made = ActorCritic(cfg, [Task(cfg, scene, reward, reward, "")], begun)
+    made.tasks[0].collect([] if begun is None else [begun])
+    return made
+
+
+SWIMMER = {"system": "swimmer3", "reward": "near", "timestep": 0.1, "target_squares": [0.3, 2]}
+
+
+@pytest.mark.parametrize("options", [{"reward": "run"}, {"policy": "graph"}, SWIMMER], ids=["run", "graph", "near"])
+def test_rounds_are_those_of_the_cpu(gpu, tmp_path, options):
+    found = []
+    for device in ("cpu", NAME):
+        made, kept, losses = learner(device, **options), Round(tmp_path / device, 0), []
+        (task,) = made.tasks
+        for index in range(2):
+            torch.manual_seed(index)
+            losses.append(made.learn(index))
+            played = task.play(made.playing().for_scene(task.scene), seed=index)
+            assert played["state"].is_cpu and len(played)
+            if index == 0:
+                made.save(kept)
+                task.add(played, kept)
+                kept.numbers.write_text("{}")
+                made = learner(device, kept, **options)  # goes on from files
+                (task,) = made.tasks
+        assert {each.device.type for each in [*made.policy.parameters(), task.loss.log_alpha]} == {device}
+        judged = task.judged(made.averaged(tmp_path / device, 1))
+        numbers = {f"{name} {index}": of[name] for index, of in enumerate(losses) for name in of}
+        found.append((numbers, judged["next", "reward"]))
+    assert found[1][0] == pytest.approx(found[0][0], rel=1e-2, abs=1e-3)
+    torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-2, atol=1e-2)
