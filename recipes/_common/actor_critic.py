@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, cast
 
 import mujoco
@@ -20,9 +23,11 @@ from torchrl_gn.objectives import SHACLoss
 from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.scenes import ObservationGraph, Scene
 from torchrl_gn.training.optimizers import clip_gradients
+from torchrl_gn.training.recorded_update import UpdateGraph, clip_on_device
 
 WINDOW = 50  # control steps of a trajectory that the model learns from
 _BETAS = (0.7, 0.95)  # SHAC's: gradients change fast with the policy
+_MAX_NORM = 1.0
 _KEPT = {"reward": "imagined_reward", "loss_value": "loss_value", "entropy": "entropy"}
 
 
@@ -88,6 +93,8 @@ class TargetSquares:
 class ActorCriticOptimizer:
     """Updates policy, values and entropies' weights by Adam, each kind with its own rate and clipped gradients.
 
+    On an NVIDIA GPU the third update is recorded as a CUDA graph, which all after it replay.
+
     Args:
         losses: of every task, whose policies share their weights.
     """
@@ -103,6 +110,9 @@ class ActorCriticOptimizer:
             (self.alphas, alpha_lr),
         )
         self.optimizer = torch.optim.Adam([{"params": of, "lr": lr} for of, lr in groups], betas=_BETAS, fused=True)
+        self.clipped = [self.policy, *self.values, *([alpha] for alpha in self.alphas)]
+        self._by_torch, self._graph = 2 if self.alphas[0].is_cuda else math.inf, None  # updates before the recording
+        self._states: list[Tensor] = []
 
     def learn(
         self, starts: Sequence[Callable[[int], Tensor]], *, updates: int, batch_size: int, desc: str
@@ -111,21 +121,69 @@ class ActorCriticOptimizer:
         kept: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
             for update in range(updates):
-                self.optimizer.zero_grad()
-                for loss, draw in zip(self.losses, starts, strict=True):
-                    out = loss(TensorDict({"state": draw(batch_size)}, [batch_size]))
-                    (out["loss_actor"] / len(self.losses) + out["loss_value"] + out["loss_alpha"]).backward()
-                    if update >= 3 * updates // 4:
-                        for name, values in kept.items():
-                            values.append(out[name].detach())
-                for group in (self.policy, *self.values, *([alpha] for alpha in self.alphas)):
-                    clip_gradients(group, 1.0, f"update {update}")
-                self.optimizer.step()
+                found = self._update([partial(draw, batch_size) for draw in starts], f"update {update}")
+                if update >= 3 * updates // 4:
+                    for name, values in kept.items():
+                        values += [of[name] for of in found]
                 bar.update()
         return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in kept.items()}
 
+    def _update(self, draws: Sequence[Callable[[], Tensor]], when: str) -> list[dict[str, Tensor]]:
+        """Update from the states that are drawn for every loss; numbers of each. FloatingPointError changes nothing."""
+        if self._graph is None and self._by_torch < 1:
+            self._record([draw() for draw in draws])
+        if self._graph is None:
+            self._by_torch -= 1
+            self.optimizer.zero_grad()
+            found = [self._backward(loss, draw()) for loss, draw in zip(self.losses, draws, strict=True)]
+            for group in self.clipped:
+                clip_gradients(group, _MAX_NORM, when)
+            self.optimizer.step()
+            return found
+        for static, draw in zip(self._states, draws, strict=True):
+            static.copy_(draw())
+        numbers = self._graph()
+        norms, rest = numbers[: len(self.clipped)], iter(torch.tensor(numbers[len(self.clipped) :]))
+        if not all(map(math.isfinite, norms)):
+            self._graph.undo()
+            raise FloatingPointError(f"The gradient is not finite at {when}; lower the learning rate.")
+        return [{name: next(rest) for name in _KEPT} for _ in self.losses]
+
+    def _backward(self, loss: SHACLoss, state: Tensor) -> dict[str, Tensor]:
+        """Add the gradient of a loss in states ``[B, N, 13]``."""
+        out = loss(TensorDict({"state": state}, [len(state)]))
+        (out["loss_actor"] / len(self.losses) + out["loss_value"] + out["loss_alpha"]).backward()
+        return {name: out[name].detach() for name in _KEPT}
+
+    def _record(self, states: list[Tensor]) -> None:
+        """Record the update of as many states."""
+        self._states = states
+        gc.collect()  # what earlier updates left of their gradients belongs to another stream
+        self._set_capturable(True)
+        self.optimizer.zero_grad()
+        self._graph = UpdateGraph.or_none(
+            self._on_device, [each for of in self.clipped for each in of], [self.optimizer]
+        )
+        if self._graph is None:
+            self._by_torch = math.inf
+            self._set_capturable(False)
+
+    def _set_capturable(self, value: bool) -> None:
+        for group in self.optimizer.param_groups:
+            group["capturable"] = value
+
+    def _on_device(self) -> Tensor:
+        """The update without waiting for the device: norms of the gradients that are clipped, and numbers of losses."""
+        found = [self._backward(loss, state) for loss, state in zip(self.losses, self._states, strict=True)]
+        norms = [clip_on_device(group, _MAX_NORM) for group in self.clipped]
+        self.optimizer.step()
+        return torch.stack([*norms, *(value.double() for of in found for value in of.values())])
+
     def state_dict(self) -> dict[str, Any]:
-        return {"adam": self.optimizer.state_dict(), "log_alphas": [alpha.detach() for alpha in self.alphas]}
+        adam = self.optimizer.state_dict()
+        for group in adam["param_groups"]:
+            group["capturable"] = False  # or the CPU refuses it
+        return {"adam": adam, "log_alphas": [alpha.detach() for alpha in self.alphas]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.optimizer.load_state_dict(state["adam"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import torchrl_gn as gn
 
-from .device import NAME
+from .device import NAME, without_waits
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 sys.path.append(str(RECIPES))  # as Python does for a script there
@@ -64,3 +65,32 @@ def test_rounds_are_those_of_the_cpu(gpu, tmp_path, options):
         found.append((numbers, judged["next", "reward"]))
     assert found[1][0] == pytest.approx(found[0][0], rel=1e-2, abs=1e-3)
     torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("options", [{"reward": "run"}, {"policy": "graph"}, SWIMMER], ids=["run", "graph", "near"])
+def test_what_is_recorded_never_waits(gpu, monkeypatch, options):
+    weights, numbers = [], []
+    for recorded in (False, True):
+        made = learner(NAME, **options)
+        torch.manual_seed(0)
+        made.learn(0)
+        optimizer, draw = made.optimizer, made.tasks[0].starts()
+        with without_waits():
+            states = draw(8)
+        torch.manual_seed(1)
+        if recorded:
+            optimizer._states = [states]
+            optimizer.optimizer.zero_grad()
+            for name in ("is_initialized", "is_current_stream_capturing"):  # what says that a graph is recorded
+                monkeypatch.setattr(torch.cuda, name, lambda: True)
+            with without_waits():
+                found = optimizer._on_device()
+            monkeypatch.undo()
+            numbers.append(found[len(optimizer.clipped) :].tolist())
+        else:
+            numbers.append(
+                [float(each) for each in optimizer._update([partial(torch.clone, states)], "now")[0].values()]
+            )
+        weights.append(torch.cat([each.detach().flatten() for of in optimizer.clipped for each in of]).cpu())
+    assert numbers[1] == pytest.approx(numbers[0])
+    torch.testing.assert_close(weights[1], weights[0], rtol=1e-5, atol=1e-6)

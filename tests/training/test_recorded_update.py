@@ -9,7 +9,7 @@ from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training import Budget, Trainer, make_optimizer
-from torchrl_gn.training.recorded_update import RecordedUpdates
+from torchrl_gn.training.recorded_update import RecordedUpdates, UpdateGraph
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")]
 
@@ -66,3 +66,14 @@ def test_what_cannot_be_recorded_is_left_to_torch(scenes, data):
     noisy = ForwardModelLoss(trainer.loss.model, noise=0.1)
     assert RecordedUpdates.of(noisy, trainer.optimizer, trainer.device) is None
     assert RecordedUpdates.of(trainer.loss, trainer.optimizer, torch.device("cpu")) is None
+
+
+def test_an_update_that_waits_for_the_gpu_is_left_to_torch():
+    number = torch.zeros((), device="cuda")
+    with pytest.warns(UserWarning, match="run without a CUDA graph, more slowly"):
+        assert UpdateGraph.or_none(lambda: number.add_(torch.rand_like(number).item()), [number], []) is None
+    assert torch.rand(3, device="cuda").isfinite().all() and number == 0
+    graph = UpdateGraph.or_none(lambda: number.add_(1).clone(), [number], [])
+    assert graph is not None and [graph(), graph()] == [1.0, 2.0]
+    graph.undo()
+    assert number == 1

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -58,42 +60,83 @@ class _Recorded:
     def __init__(self, loss: ForwardModelLoss, optimizer: ScheduledOptimizer, batch: TensorDictBase) -> None:
         self._batch = batch.select(*loss.in_keys[:3]).clone()
         self._inputs = [self._batch.get(key) for key in loss.in_keys[:3]]
-        self._changed = _trained_tensors(optimizer)
-        self._before = [torch.empty_like(each) for each in self._changed]
-        self._graph = torch.cuda.CUDAGraph()
-        optimizer.zero_grad()
-        with torch.cuda.graph(self._graph):
-            torch._foreach_copy_(self._before, self._changed)  # pyright: ignore
+
+        def update() -> Tensor:
             value = loss.unchecked(self._batch)["loss_forward_model"]
             value.backward()
-            gradients = [each.grad for each in optimizer.parameters if each.grad is not None]
-            norm = nn.utils.get_total_norm(gradients)
-            if optimizer.max_norm < math.inf:
-                torch._foreach_mul_(gradients, (optimizer.max_norm / (norm + 1e-6)).clamp(max=1.0))  # pyright: ignore
+            norm = clip_on_device(optimizer.parameters, optimizer.max_norm)
             for each in optimizer.optimizers:
                 each.step()
-            self._result = torch.stack((value.detach().double(), norm.double()))
+            return torch.stack((value.detach().double(), norm))
+
+        optimizer.zero_grad()
+        self._graph = UpdateGraph(update, optimizer.parameters, optimizer.optimizers)
 
     def __call__(self, entries: list[Tensor], step: int) -> float:
         for static, given in zip(self._inputs, entries, strict=True):
             static.copy_(given)
-        self._graph.replay()
-        value, norm = self._result.tolist()
+        value, norm = self._graph()
         if not (math.isfinite(value) and math.isfinite(norm)):
-            with torch.no_grad():
-                torch._foreach_copy_(self._changed, self._before)  # pyright: ignore
+            self._graph.undo()
             what = f"The loss is {value}" if not math.isfinite(value) else "The gradient is not finite"
             raise FloatingPointError(f"{what} at step {step}; lower the learning rate.")
         return value
 
 
-def _trained_tensors(optimizer: ScheduledOptimizer) -> list[Tensor]:
-    """All tensors that an update changes."""
-    moments = [
-        value
-        for each in optimizer.optimizers
-        for state in each.state.values()
-        for value in state.values()
-        if isinstance(value, Tensor)
-    ]
-    return [*(parameter.data for parameter in optimizer.parameters), *moments]
+class UpdateGraph:
+    """An update recorded as a CUDA graph, which can be undone.
+
+    Args:
+        update: loss, gradient and optimisers: returns numbers ``[K]`` and never waits for the GPU. It is not run.
+        parameters: all that it changes, with the state of the optimisers, which have stepped before.
+    """
+
+    def __init__(
+        self, update: Callable[[], Tensor], parameters: Sequence[Tensor], optimizers: Sequence[torch.optim.Optimizer]
+    ) -> None:
+        states = (value for each in optimizers for state in each.state.values() for value in state.values())
+        self._changed = [each.data for each in parameters] + [each for each in states if isinstance(each, Tensor)]
+        self._before = [torch.empty_like(each) for each in self._changed]
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph):
+            torch._foreach_copy_(self._before, self._changed)  # pyright: ignore
+            self._numbers = update()
+
+    @classmethod
+    def or_none(
+        cls, update: Callable[[], Tensor], parameters: Sequence[Tensor], optimizers: Sequence[torch.optim.Optimizer]
+    ) -> UpdateGraph | None:
+        """The graph; None, with a warning, of an update that cannot be recorded: run it without."""
+        stream = torch.cuda.current_stream()
+        try:
+            return cls(update, parameters, optimizers)
+        except RuntimeError as error:
+            # What a recording leaves that failed: its stream, and random numbers that wait for its end.
+            torch.cuda.set_stream(stream)
+            generator = torch.cuda.default_generators[stream.device_index]
+            fresh = torch.Generator(stream.device).manual_seed(generator.initial_seed() + 1)
+            generator.graphsafe_set_state(fresh.graphsafe_get_state())
+            reason = (str(error.__context__ or error).splitlines() or [""])[0]  # the end of a recording fails too
+            warnings.warn(f"Updates run without a CUDA graph, more slowly: {reason}", stacklevel=2)
+            return None
+
+    def __call__(self) -> list[float]:
+        """Update; its numbers, for which the host waits, once."""
+        self._graph.replay()
+        return self._numbers.tolist()
+
+    @torch.no_grad()
+    def undo(self) -> None:
+        """Undo the last update."""
+        torch._foreach_copy_(self._changed, self._before)  # pyright: ignore
+
+
+def clip_on_device(parameters: Iterable[Tensor], max_norm: float) -> Tensor:
+    """Clip the joint gradient without waiting for the device; its norm ``[]`` before, float64, if finite or not."""
+    gradients = [each.grad for each in parameters if each.grad is not None]
+    # In float64: squares overflow float32 from 1.8e19 on.
+    norm = torch.linalg.vector_norm(torch.cat([each.flatten() for each in gradients]), dtype=torch.float64)
+    if max_norm < math.inf:
+        factor = (max_norm / (norm + 1e-6)).clamp(max=1.0)
+        torch._foreach_mul_(gradients, factor.to(gradients[0].dtype))  # pyright: ignore
+    return norm

@@ -1,0 +1,125 @@
+"""Updates of an actor-critic recorded as one CUDA graph; without a GPU, played where they would be replayed."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+import torchrl_gn as gn
+from torchrl_gn.training.recorded_update import UpdateGraph
+
+from .conftest import ROOT
+
+pytestmark = pytest.mark.slow
+SMALL = {
+    "first": {"trajectories": 4, "length": 50, "steps": 2},
+    "model": {"hidden": 8, "latent": 8},
+    **{"horizon": 3, "hidden": [8], "action_repeat": 1, "timestep": None, "model_steps": 1, "value_lr": 1e-2},
+}
+
+
+class Played(UpdateGraph):
+    """Runs the update at every call."""
+
+    def __init__(self, update, parameters, optimizers):
+        self._update, self._parameters = update, parameters
+        self._changed = [each.data for each in parameters]
+        self._changed += [value for each in optimizers for state in each.state.values() for value in state.values()]
+
+    @classmethod
+    def or_none(cls, *arguments):
+        return cls(*arguments)
+
+    def __call__(self):
+        self._before = [each.clone() for each in self._changed]
+        for each in self._parameters:
+            each.grad = None
+        return self._update().tolist()
+
+
+@pytest.fixture(
+    params=[
+        "cpu",
+        pytest.param(
+            "cuda",
+            marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")],
+        ),
+    ]
+)
+def learners(request, monkeypatch):
+    """Two that learn alike: the second without a graph."""
+    from _common import actor_critic
+    from _common.actor_critic_rounds import ActorCritic, Task
+
+    cfg = OmegaConf.merge(OmegaConf.load(ROOT / "recipes/config/shac.yaml"), SMALL, {"device": request.param})
+    assert isinstance(cfg, DictConfig)
+    scene, made = gn.load_scene("pendulum"), []
+    reward = gn.make_reward("balance", scene)
+    for _ in range(2):
+        torch.manual_seed(0)
+        task = Task(cfg, scene, reward, reward, "")
+        made.append(ActorCritic(cfg, [task], None))
+        task.collect([])
+        task.learn_model(0)
+    if request.param == "cpu":
+        monkeypatch.setattr(actor_critic, "UpdateGraph", Played)
+        made[0].optimizer._by_torch = 2
+    made[1].optimizer._by_torch = 10**6
+    return made
+
+
+def update(learner, seed: int, states: torch.Tensor | None = None):
+    torch.manual_seed(seed)
+    given = learner.tasks[0].starts()(8) if states is None else states
+    torch.manual_seed(seed)
+    return learner.optimizer._update([lambda: given], f"update {seed}")[0]
+
+
+def weights(learner) -> torch.Tensor:
+    return torch.cat([each.detach().flatten() for of in learner.optimizer.clipped for each in of])
+
+
+def test_recorded_updates_are_those_of_torch(learners):
+    for seed in range(5):
+        before, found = weights(learners[1]), [update(each, seed) for each in learners]
+        changed = weights(learners[1]) - before
+        for name, value in found[0].items():
+            torch.testing.assert_close(value, found[1][name].cpu(), rtol=1e-4, atol=1e-4)
+        assert (weights(learners[0]) - weights(learners[1])).norm() < 1e-2 * changed.norm()
+    assert learners[0].optimizer._graph is not None and learners[1].optimizer._graph is None
+    for learner in learners:  # as between two rounds: the graph reads what is refreshed in place
+        learner.tasks[0].learn_model(1)
+    before, found = weights(learners[1]), [update(each, 5) for each in learners]
+    for name, value in found[0].items():
+        torch.testing.assert_close(value, found[1][name].cpu(), rtol=1e-3, atol=1e-3)
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing(learners):
+    recorded = learners[0]
+    for seed in range(3):
+        update(recorded, seed)
+    optimizer = recorded.optimizer
+    before, adam = weights(recorded), copy.deepcopy(optimizer.state_dict()["adam"]["state"])
+    scale = recorded.tasks[0].value.normalizer.std
+    kept = scale.clone()
+    scale.fill_(torch.nan)
+    with pytest.raises(FloatingPointError, match="not finite at update 3; lower"):
+        update(recorded, 3)
+    scale.copy_(kept)
+    assert torch.equal(weights(recorded), before)
+    for index, state in optimizer.state_dict()["adam"]["state"].items():
+        assert all(torch.equal(value, adam[index][name]) for name, value in state.items())
+    update(recorded, 4)
+    assert not torch.equal(weights(recorded), before) and bool(weights(recorded).isfinite().all())
+
+
+def test_its_optimiser_goes_on_anywhere(learners):
+    for seed in range(3):
+        update(learners[0], seed)
+    state = learners[0].optimizer.state_dict()
+    assert not any(group["capturable"] for group in state["adam"]["param_groups"])
+    learners[1].optimizer.load_state_dict(state)
+    update(learners[1], 3)
