@@ -13,9 +13,11 @@ Parts, each written to metrics.json as it ends, so that a run that is cut off ke
   and as torch.compile makes it.
 - `cores`: our native executor on this machine's processor.
 - `training`: recipes/forward_model.py with its data, training and evaluation.
+- `policy`: recipes/shac.py judged by the suite's cheetah run, and the seconds of learning and playing until the median
+  of the last five rounds' returns exceeds 519, what TD-MPC2 reaches in 100,000 frames.
 - `jraph`: the same network alone in jraph under jax.jit, on the GPU that JAX finds.
 
-Random weights, normalisers of a short collection. Takes about five minutes. Results: docs/results/gpu.md.
+Random weights, normalisers of a short collection. Takes about eight minutes. Results: docs/results/gpu.md.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -53,6 +55,7 @@ from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training.checkpoint import package_versions
 
 ROOT = Path(__file__).parent.parent
+RETURN = 519  # of TD-MPC2, cheetah run, 100,000 frames
 
 
 def load(name: str) -> Scene:
@@ -229,22 +232,44 @@ def measure_cores(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
     return out
 
 
+def run_recipe(cfg: DictConfig, name: str, place: Path, options: Sequence[str]) -> dict[str, Any]:
+    """Numbers of a recipe on the device and the seconds of its process, or how it failed."""
+    command = [sys.executable, str(ROOT / f"recipes/{name}.py"), f"device={cfg.device}", f"run_dir={place}"]
+    start = time.perf_counter()
+    done = subprocess.run([*command, f"seed={cfg.seed}", *options], capture_output=True, text=True, cwd=ROOT)
+    out: dict[str, Any] = {"whole_seconds": time.perf_counter() - start}
+    if done.returncode:
+        return {**out, "failed": (done.stdout + done.stderr)[-2000:]}
+    if warned := [line for line in done.stderr.splitlines() if "Warning" in line]:  # updates without graphs, say
+        out["warned"] = "\n".join(warned)[:2000]
+    metrics = json.loads((place / "metrics.json").read_text())
+    tqdm.write(done.stdout)
+    return out | {key: value for key, value in metrics.items() if isinstance(value, (int, float))}
+
+
 def measure_training(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) -> dict[str, Any]:
     """Seconds and errors of recipes/forward_model.py, a run for each set of options."""
     out: dict[str, Any] = {}
     for index, options in enumerate(cfg.training):
-        place = folder / f"training{index}"
-        command = [sys.executable, str(ROOT / "recipes/forward_model.py"), f"device={cfg.device}", f"run_dir={place}"]
-        command += [f"data.folder={folder / 'data'}", f"seed={cfg.seed}", *options.split()]
-        start = time.perf_counter()
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-        out[f"{options}/whole_seconds"] = time.perf_counter() - start
-        if done.returncode:
-            out[f"{options}/failed"] = (done.stdout + done.stderr)[-2000:]
-        else:
-            metrics = json.loads((place / "metrics.json").read_text())
-            out |= {f"{options}/{key}": value for key, value in metrics.items() if isinstance(value, (int, float))}
-            tqdm.write(done.stdout)
+        given = [f"data.folder={folder / 'data'}", *options.split()]
+        numbers = run_recipe(cfg, "forward_model", folder / f"training{index}", given)
+        out |= {f"{options}/{key}": value for key, value in numbers.items()}
+        keep(out)
+    return out
+
+
+def measure_policy(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) -> dict[str, Any]:
+    """Returns of recipes/shac.py, a run for each set of options, and when they exceed TD-MPC2's."""
+    out: dict[str, Any] = {}
+    for index, options in enumerate(cfg.policy):
+        given = ["judged_reward=run", *options.split()]
+        numbers = run_recipe(cfg, "shac", folder / f"policy{index}", given)
+        rounds, key = itertools.count(), "round {}/median_return_of_last_five"
+        medians = itertools.takewhile(lambda each: each is not None, (numbers.get(key.format(of)) for of in rounds))
+        above = next((of for of, median in enumerate(medians) if cast(float, median) > RETURN), None)
+        for name in ("seconds", "frames"):
+            numbers[f"{name}_to_{RETURN}"] = None if above is None else numbers[f"round {above}/{name}"]
+        out |= {f"{options}/{key}": value for key, value in numbers.items()}
         keep(out)
     return out
 
@@ -303,6 +328,7 @@ def main(cfg: DictConfig) -> None:
         "parts": lambda keep: measure_parts(cfg, keep),
         "cores": lambda keep: measure_cores(cfg, keep),
         "training": lambda keep: measure_training(cfg, keep, run.path),
+        "policy": lambda keep: measure_policy(cfg, keep, run.path),
         "jraph": lambda keep: measure_jraph(cfg, keep),
     }
     if unknown := [part for part in cfg.parts if part not in works]:
