@@ -87,7 +87,7 @@ def test_recorded_updates_are_those_of_torch(learners):
         before, found = weights(learners[1]), [update(each, seed) for each in learners]
         changed = weights(learners[1]) - before
         for name, value in found[0].items():
-            torch.testing.assert_close(value, found[1][name].cpu(), rtol=1e-4, atol=1e-4)
+            torch.testing.assert_close(value.cpu(), found[1][name].cpu(), rtol=1e-4, atol=1e-4)
         assert (weights(learners[0]) - weights(learners[1])).norm() < 1e-2 * changed.norm()
     assert learners[0].optimizer._graph is not None and learners[1].optimizer._graph is None
     for learner in learners:  # as between two rounds: the graph reads what is refreshed in place
