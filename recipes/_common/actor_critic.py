@@ -22,7 +22,8 @@ from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.objectives import SHACLoss
 from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.scenes import ObservationGraph, Scene
-from torchrl_gn.training.optimizers import clip_gradients
+from torchrl_gn.training.nested_state import require_like
+from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
 from torchrl_gn.training.recorded_update import UpdateGraph, clip_on_device
 
 WINDOW = 50  # control steps of a trajectory that the model learns from
@@ -180,13 +181,11 @@ class ActorCriticOptimizer:
         return torch.stack([*norms, *(value.double() for of in found for value in of.values())])
 
     def state_dict(self) -> dict[str, Any]:
-        adam = self.optimizer.state_dict()
-        for group in adam["param_groups"]:
-            group["capturable"] = False  # or the CPU refuses it
-        return {"adam": adam, "log_alphas": [alpha.detach() for alpha in self.alphas]}
+        return {"adam": self.optimizer.state_dict(), "log_alphas": [alpha.detach() for alpha in self.alphas]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.optimizer.load_state_dict(state["adam"])
+        require_like(self.state_dict()["log_alphas"], state["log_alphas"], "training.log_alphas")
+        load_optimizer(self.optimizer, state["adam"])
         with torch.no_grad():
             for alpha, kept in zip(self.alphas, state["log_alphas"], strict=True):
                 alpha.copy_(kept)

@@ -164,7 +164,7 @@ class ActorCritic:
         rates = {name: cfg[name] for name in ("policy_lr", "value_lr", "alpha_lr")}
         self.optimizer = ActorCriticOptimizer([task.loss for task in tasks], **rates)
         if kept is not None:
-            self.optimizer.load_state_dict(kept.training)
+            kept.resume(self.optimizer.load_state_dict)
 
     def _new_policy(self) -> BoundedPolicy:
         first = self.tasks[0]

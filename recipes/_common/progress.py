@@ -18,6 +18,7 @@ from torchrl_gn.evaluation.errors import HORIZONS
 from torchrl_gn.interrupts import held
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
+from torchrl_gn.training.nested_state import require_like
 from torchrl_gn.training.off_policy import OffPolicyTrainer
 from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.run_folder import RunFolder
@@ -151,8 +152,8 @@ def train_with_progress(
     prefix = f"{name}/" if name else ""
     curves: dict[str, list] = {"seconds": [], "loss": []}
     if resumed is not None:
-        trainer.load_state_dict(resumed.training)
-        curves = resumed.training["curves"]
+        resumed.resume(trainer.load_state_dict)
+        curves = resumed.resume(_curves)
         if trainer.fraction >= 1 and trainer.workers.first:
             say_finished(path, f"{trainer.step:,} steps, {trainer.seconds / 60:.3g} minutes", "steps= or minutes=")
     losses: list[float] = curves.pop("recent", [])  # since the last of the curves
@@ -196,12 +197,20 @@ def train_with_progress(
     return curves
 
 
+def _curves(training: dict) -> dict[str, list]:
+    curves = {"recent": [], **training["curves"]}
+    require_like({"seconds": [], "loss": [], "recent": []}, curves, "training.curves")
+    if len(curves["seconds"]) != len(curves["loss"]):
+        raise ValueError("training.curves has lists of several lengths")
+    return curves
+
+
 def learn_with_progress(
     trainer: OffPolicyTrainer, path: Path, resumed: Checkpoint | None, tracker: Tracker, *, config: Mapping[str, Any]
 ) -> None:
     """Train a policy with a progress bar; save every ``checkpoint_seconds`` of ``config``, on Ctrl-C and at the end."""
     if resumed is not None:
-        trainer.load_state_dict(resumed.training)
+        resumed.resume(trainer.load_state_dict)
         if trainer.frames >= trainer.total:
             say_finished(path, f"{trainer.frames:,} frames", "trainer.frames=")
 

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from torchrl_gn.atomic import write_json
-from torchrl_gn.training import load_pretrained
+from torchrl_gn.training import load_pretrained, save_checkpoint
 
 SMALL = (
     "system=pendulum",
@@ -20,6 +20,7 @@ SMALL = (
     "first.steps=5",
 )
 SMALL += ("updates=3", "batch_size=8", "horizon=3", "hidden=[8]", "episodes=2", "steps=50", "model_steps=3")
+FORWARD = ("system=pendulum", "data.train=4", "data.validation=2", "data.test=2", "model.hidden=8", "minutes=1")
 SMALL += ("model={hidden:8,latent:8}", "evaluate.episodes=2", "evaluate.steps=20")
 
 
@@ -37,7 +38,7 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     assert metrics[0]["round 2/return"] == metrics[0]["return"]
     first, second = (load_file(folder / "policy.safetensors") for folder in (whole, resumed))
     assert all(torch.equal(first[name], second[name]) for name in first if name != "description")  # it has run_dir
-    one = load_file(whole / "rounds/000/policy.safetensors")
+    one = load_file(whole / "rounds/001/policy.safetensors")
     assert any(not torch.equal(one[name], first[name]) for name in first if name.startswith("model.network"))
 
     # Of three rounds the last alone is kept, of six the mean of the last two.
@@ -54,6 +55,37 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     planning = ("horizon=2", "steps=2", "episodes=2", "video=false", "gn.warm_up=1", "gn.samples=3", "gn.iterations=1")
     code, _, errors = call("system=pendulum", *given, *planning, f"run_dir={tmp_path / 'mpc'}", recipe="mpc")
     assert code == 0, errors
+
+
+def forge(path, change) -> None:
+    """Write a checkpoint again, with another state to resume from."""
+    honest = load_pretrained(path)
+    change(honest.training)
+    scenes = honest.scenes()
+    save_checkpoint(path, honest.trained, scene=scenes, config=honest.config, training=honest.training)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("recipe", "small", "more", "file", "change"),
+    [
+        ("shac", SMALL, "rounds={}", "rounds/001/policy.safetensors", lambda of: of["log_alphas"].clear()),
+        ("forward_model", FORWARD, "steps={}", "checkpoint/checkpoint.safetensors", lambda of: of.pop("curves")),
+        (
+            "forward_model",
+            FORWARD,
+            "steps={}",
+            "checkpoint/checkpoint.safetensors",
+            lambda of: of["optimizer"]["0"]["state"][0].update(momentum_buffer=torch.zeros(2)),
+        ),
+    ],
+    ids=["shac", "curves", "moments"],
+)
+def test_a_forged_state_to_resume_from_is_refused_by_name(tmp_path, call, recipe, small, more, file, change):
+    assert call(*small, more.format(2), f"run_dir={tmp_path}", recipe=recipe)[0] == 0
+    forge(tmp_path / file, change)
+    code, _, errors = call(*small, more.format(3), f"run_dir={tmp_path}", recipe=recipe)
+    assert code == 1 and f"CheckpointError: Checkpoint {tmp_path / file} cannot resume this training: " in errors
 
 
 def test_one_judged_episode_has_no_spread(tmp_path, call):

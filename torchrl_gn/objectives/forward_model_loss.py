@@ -192,9 +192,13 @@ class ForwardModelLoss(LossModule):
         return {"noise_scale": self.noise_scale, "error_weight": self.error_weight, "generator": generator}
 
     def load_training_state(self, state: dict) -> None:
-        self.noise_scale.copy_(state["noise_scale"])
-        weight = state["error_weight"]  # None in older files if not fitted
-        self.error_weight.copy_(torch.tensor(-1.0) if weight is None else weight)
+        for name in ("noise_scale", "error_weight"):
+            own, saved = getattr(self, name), state[name]
+            if saved is None and name == "error_weight":
+                saved = torch.full_like(own, -1)  # of older files, not fitted
+            if not isinstance(saved, Tensor) or saved.shape != own.shape:
+                raise ValueError(f"the loss's {name} is no tensor {list(own.shape)}")
+            own.copy_(saved)
         if self.generator is not None and state["generator"] is not None:
             self.generator.set_state(state["generator"])
 

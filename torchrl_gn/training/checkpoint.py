@@ -8,7 +8,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -43,6 +43,9 @@ KINDS: dict[str, type[Trained]] = {
     "graph_state_policy": GraphStatePolicy,
 }
 _Kind = TypeVar("_Kind")
+_Loaded = TypeVar("_Loaded")
+# What using a description or state that is anybody's raises.
+_UNUSABLE = (ValueError, RuntimeError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 
 
 class CheckpointError(ValueError):
@@ -59,6 +62,7 @@ class Checkpoint:
     versions: dict  # of packages, likewise
     metrics: dict = field(default_factory=dict)
     training: dict = field(default_factory=dict)  # nested state to resume from
+    path: Path | None = None  # that it was read from
 
     def __repr__(self) -> str:
         scenes, own = [description["name"] for description in self.scene_descriptions], self.versions
@@ -88,6 +92,17 @@ class Checkpoint:
     def policy(self) -> BoundedPolicy:
         """The policy over states; CheckpointError if it is another kind of model."""
         return self._as(BoundedPolicy)
+
+    def resume(self, load: Callable[[dict], _Loaded]) -> _Loaded:
+        """Return what ``load``, say ``trainer.load_state_dict``, makes of :attr:`training`.
+
+        CheckpointError, naming the file, if that is the state of other networks or options, or forged.
+        """
+        try:
+            return load(self.training)
+        except _UNUSABLE as error:
+            why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {_first_line(error)}"
+            raise CheckpointError(f"Checkpoint {self.path} cannot resume this training: {why}.") from error
 
     def _as(self, kind: type[_Kind]) -> _Kind:
         if not isinstance(self.trained, kind):
@@ -208,23 +223,25 @@ def read_checkpoint(
             if value.is_floating_point() and not bool(torch.isfinite(value).all()):
                 raise CheckpointError(f"Checkpoint {path} has NaN or Inf in {name!r}; use another or train again.")
         text = tensors.pop(_DESCRIPTION).numpy().tobytes() if _DESCRIPTION in tensors else in_header
-        return _checkpoint_of(json.loads(text), tensors, {} if physics is None else {"physics": physics})
+        checkpoint = _checkpoint_of(json.loads(text), tensors, {} if physics is None else {"physics": physics})
+        return replace(checkpoint, path=path)
     except CheckpointError:
         raise
     except ValueError as error:
         raise CheckpointError(f"Checkpoint {path} cannot be used: {error}") from error
-    except (RuntimeError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError) as error:
+    except _UNUSABLE as error:
         raise CheckpointError(
             f"Checkpoint {path} is of another version of torchrl_gn, whose networks are not built as here, or forged"
-            f" ({type(error).__name__}: {(str(error).splitlines() or [''])[0]}); train again."
+            f" ({type(error).__name__}: {_first_line(error)}); train again."
         ) from error
 
 
 def _checkpoint_of(description: dict, tensors: dict[str, Tensor], given: dict[str, Any]) -> Checkpoint:
     """The checkpoint of a description and tensors that are whole, but may be anybody's."""
     scenes, plain = description["scenes"], {name: description[name] for name in ("config", "versions", "metrics")}
-    if not all(isinstance(each, dict) for each in [*scenes, *plain.values()]) or not isinstance(scenes, list):
-        raise TypeError("scenes, config, versions and metrics are no dictionaries")
+    training = unflatten(description["training"], tensors)
+    if not all(isinstance(each, dict) for each in [*scenes, *plain.values(), training]) or not isinstance(scenes, list):
+        raise TypeError("scenes, config, versions, metrics and training are no dictionaries")
     weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
     stored = next((value.dtype for name, value in weights.items() if name.endswith(".weight")), None)
     if stored is None or not stored.is_floating_point:
@@ -236,7 +253,11 @@ def _checkpoint_of(description: dict, tensors: dict[str, Tensor], given: dict[st
     for name, module in model.named_modules():
         if isinstance(module, Normalizer) and not bool(torch.isfinite(module.inverse_std).all()):
             raise ValueError(f"the statistics {name!r} have no standard deviation")
-    return Checkpoint(model, scenes, **plain, training=unflatten(description["training"], tensors))
+    return Checkpoint(model, scenes, **plain, training=training)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [""])[0]
 
 
 def pretrained_names() -> list[str]:

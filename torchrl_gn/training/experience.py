@@ -14,6 +14,9 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.training.nested_state import require_like
+
 
 def make_collector(
     env: EnvBase | Sequence[Callable[[], EnvBase]], policy: TensorDictModuleBase, *, seed: int | None, **options: Any
@@ -59,9 +62,20 @@ def buffer_state(buffer: TensorDictReplayBuffer) -> dict[str, torch.Tensor]:
     return {str(key): cast(torch.Tensor, value).roll(-oldest, 0) for key, value in filled.flatten_keys(".").items()}
 
 
-def load_buffer_state(buffer: TensorDictReplayBuffer, state: dict[str, torch.Tensor], capacity: int) -> None:
-    """Extend a replay buffer with the last ``capacity`` transitions of :func:`buffer_state`."""
+def load_buffer_state(
+    buffer: TensorDictReplayBuffer, state: dict[str, torch.Tensor], capacity: int, graph: ObservationGraph
+) -> None:
+    """Extend a replay buffer with the last ``capacity`` transitions of :func:`buffer_state`.
+
+    ValueError if they are no transitions of the body of ``graph``.
+    """
     if state:
+        count, seen = len(state["action"]), graph.num_observations
+        like = {"observation": torch.zeros(count, seen), "action": torch.zeros(count, graph.num_actions)}
+        like |= {"next.observation": like["observation"], "next.reward": torch.zeros(count, 1)}
+        like |= {f"next.{name}": torch.zeros(count, 1, dtype=torch.bool) for name in ("done", "terminated")}
+        require_like(like, state, "training.buffer")
+        state = {name: state[name] for name in like}
         flat = TensorDict(state)
         flat.auto_batch_size_(1)
         buffer.extend(flat.unflatten_keys(".")[-capacity:])

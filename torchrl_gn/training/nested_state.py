@@ -1,9 +1,10 @@
-"""Nested training state as tensors by name and a plain mirror of the structure."""
+"""Nested training state as tensors by name and a plain mirror of the structure, which anybody may have written."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from torch import Tensor
 
@@ -31,3 +32,45 @@ def unflatten(mirror: Any, tensors: Mapping[str, Tensor]) -> Any:
     if "list" in mirror:
         return [unflatten(item, tensors) for item in mirror["list"]]
     return mirror["value"]
+
+
+def require_like(own: Any, saved: Any, name: str = "training") -> None:
+    """Raise ValueError, naming the entry, where a saved state is not as one's own: in keys, kinds, shapes of tensors.
+
+    For None any fits. An empty dictionary of one's own takes any, an empty list any number of numbers. Keys that
+    one's own lacks are ignored.
+    """
+    if own is None:
+        return
+    if isinstance(own, Tensor):
+        fits = isinstance(saved, Tensor) and saved.shape == own.shape
+        fits = fits and (saved.dtype == own.dtype or saved.is_floating_point() and own.is_floating_point())
+        what = f"a tensor {list(own.shape)} of {own.dtype}"
+    elif isinstance(own, Mapping):
+        fits, what = isinstance(saved, Mapping) and own.keys() <= saved.keys(), f"a dictionary of {list(own)}"
+    elif isinstance(own, (list, tuple)):
+        fits = isinstance(saved, (list, tuple)) and (len(saved) == len(own) or not own and all(map(_is_number, saved)))
+        what = f"a list of {len(own) or 'numbers'}"
+    elif _is_number(own):
+        fits = _is_number(saved) and math.isfinite(saved) and (isinstance(own, float) or isinstance(saved, int))
+        what = f"a finite {type(own).__name__}"
+    else:
+        fits, what = type(saved) is type(own), f"a {type(own).__name__}"
+    if not fits:
+        raise ValueError(f"{name} is not {what}")
+    items = own.items() if isinstance(own, Mapping) else enumerate(own) if isinstance(own, (list, tuple)) else ()
+    for key, value in items:
+        require_like(value, cast(Any, saved)[key], f"{name}.{key}")
+
+
+def require_amounts(amounts: Mapping[str, Any], name: str = "training.progress") -> None:
+    """Raise ValueError if one of some numbers, None or dictionaries of them, is below 0."""
+    for key, value in amounts.items():
+        if isinstance(value, Mapping):
+            require_amounts(value, f"{name}.{key}")
+        elif value is not None and value < 0:
+            raise ValueError(f"{name}.{key} is below 0")
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) is float or type(value) is int and abs(value) < 2**63

@@ -24,7 +24,8 @@ from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.policies import Agent
 from torchrl_gn.training.experience import buffer_state, device_of, load_buffer_state, make_collector
-from torchrl_gn.training.optimizers import clip_gradients
+from torchrl_gn.training.nested_state import require_amounts, require_like
+from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
 
 _KEPT = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
@@ -252,20 +253,30 @@ class OffPolicyTrainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from what :meth:`state_dict` returned; ValueError if it has more frames than this training."""
+        """Resume from what :meth:`state_dict` returned.
+
+        ValueError if it has more frames than this training, is of other networks or options, or forged.
+        """
+        own = self.state_dict()
+        curve = {name: [] for name in own["curve"]}
+        # Optimiser and buffer are checked as they are loaded.
+        require_like({**own, "optimizer": {}, "buffer": {}, "curve": curve}, state)
+        require_amounts(state["progress"])
+        if len({len(state["curve"][name]) for name in curve}) > 1:
+            raise ValueError("training.curve has lists of several lengths")
         frames = state["progress"]["frames"]
         if frames >= self.total + self.per_batch:
             raise ValueError(f"The checkpoint has {frames} frames already; give frames={frames} or more to resume.")
         for loss, saved in zip(self.losses, state["losses"], strict=True):
             loss.load_state_dict(saved)
-        self.optimizer.load_state_dict(state["optimizer"])
+        load_optimizer(self.optimizer, state["optimizer"])
         self.target.counter = state["target_counter"]
-        load_buffer_state(self.buffer, state["buffer"], self.capacity)
+        load_buffer_state(self.buffer, state["buffer"], self.capacity, self.agent.graph)
         self.generator.set_state(state["generators"]["buffer"])
         torch.set_rng_state(state["generators"]["global"])
-        self.curve = LearningCurve(**{name: list(values) for name, values in state["curve"].items()})
-        for name, value in state["progress"].items():
-            setattr(self, name, value)
+        self.curve = LearningCurve(**{name: list(state["curve"][name]) for name in curve})
+        for name in own["progress"]:
+            setattr(self, name, state["progress"][name])
 
 
 def _next(batches: Iterator[TensorDictBase]) -> TensorDictBase | None:

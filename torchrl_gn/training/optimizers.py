@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, cast, get_args
 
 import torch
@@ -11,8 +11,11 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from torchrl_gn.training.muon import Muon
+from torchrl_gn.training.nested_state import require_amounts, require_like
 
 Preset = Literal["muon", "adam", "paper"]
+
+_KEPT: dict[type, tuple[str, ...]] = {torch.optim.Adam: ("exp_avg", "exp_avg_sq"), Muon: ("momentum_buffer",)}
 
 
 class ScheduledOptimizer:
@@ -106,7 +109,33 @@ class ScheduledOptimizer:
 
     def load_state_dict(self, state: dict) -> None:
         for index, optimizer in enumerate(self.optimizers):
-            optimizer.load_state_dict(state[str(index)])
+            load_optimizer(optimizer, state[str(index)])
+
+
+def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
+    """Load what ``state_dict()`` of such an optimiser returned; ValueError if it is of other parameters, or forged.
+
+    Rates and other numbers are restored, how updates are computed is not.
+    """
+    groups = []
+    for own, saved in zip(optimizer.state_dict()["param_groups"], state["param_groups"], strict=True):
+        numbers = {name: value for name, value in own.items() if name in saved and _is_numeric(value)}
+        require_like(numbers, saved, "training.optimizer.param_groups")
+        groups.append({**own, **{name: saved[name] for name in numbers}})
+    optimizer.load_state_dict({"state": state["state"], "param_groups": groups})
+    kept = next((names for kind, names in _KEPT.items() if isinstance(optimizer, kind)), ())
+    for parameter, of in optimizer.state.items():
+        # Kernels believe the shapes: a fused one would write beyond the end of moments that are too small.
+        like: dict[str, Any] = {name: torch.empty_like(parameter, device="meta") for name in kept}
+        if isinstance(optimizer, torch.optim.Adam):
+            like["step"] = torch.zeros(())
+        require_like(like, of, "training.optimizer.state")
+        require_amounts({name: of[name] for name in like if name == "step"}, "training.optimizer.state")
+
+
+def _is_numeric(option: Any) -> bool:
+    each = option if isinstance(option, (list, tuple)) else [option]
+    return all(type(number) in (int, float) for number in each)
 
 
 def clip_gradients(parameters: Iterable[torch.Tensor], max_norm: float, when: str) -> float:

@@ -18,6 +18,7 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss, SeveralScenesLoss
 from torchrl_gn.processor import threads_for_native
 from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.nested_state import require_amounts, require_like
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 from torchrl_gn.training.recorded_update import RecordedUpdates
 from torchrl_gn.training.workers import Workers
@@ -198,7 +199,15 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Resume from what :meth:`state_dict` returned."""
+        """Resume from what :meth:`state_dict` returned; ValueError if it is of other networks or options, or forged."""
+        own = self.state_dict()
+        if "unroll" not in state["samplers"]:  # windows come only now
+            own["samplers"].pop("unroll", None)
+        # Optimiser and loss check what they load.
+        own |= {"optimizer": {}, "loss": {}, "best_weights": self.model.state_dict() if state["best_weights"] else {}}
+        own["progress"]["best"] = None if state["progress"]["best"] is None else 0.0
+        require_like(own, state)
+        require_amounts(state["progress"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.loss.load_training_state(state["loss"])
         for module in () if self.workers.first else self.loss.modules():  # the state is that of rank 0
