@@ -28,6 +28,7 @@ from _common.report_data import INDEX, add_run, read, read_run, recipe_of
 from _common.report_drawing import draw_figure
 from _common.report_figures import read_figures, stale_figures
 from _common.report_pages import fill_readme, make_pages
+from torchrl_gn.atomic import atomic_path
 
 REPORT = Path(__file__).parents[1] / "docs" / "results"
 
@@ -60,7 +61,11 @@ def main(cfg: DictConfig) -> None:
         files = ", ".join(map(str, [*changed, *(images / name for name in stale)]))
         raise ValueError(f"{files} differ from the data; run python recipes/report.py and commit them.")
     for file in changed:
-        file.write_text(pages[file]) if file in pages else file.unlink()
+        if file in pages:
+            with atomic_path(file) as temporary:
+                temporary.write_text(pages[file])
+        else:
+            file.unlink()
         print(file)
     for name in stale:
         file = images / name

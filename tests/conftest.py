@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
+import resource
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import mujoco
 import pytest
@@ -226,3 +228,19 @@ def ctrl_c() -> Iterator[Callable[..., Callable]]:
 
     yield interrupt
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def files_end_at() -> Callable[[int], AbstractContextManager]:
+    """``with files_end_at(1000):`` files of this process take 1000 bytes, as if the disk were full then."""
+
+    @contextmanager
+    def limited(size: int) -> Iterator[None]:
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    return limited

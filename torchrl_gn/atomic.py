@@ -31,13 +31,23 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     _make_folder(path.parent)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
-        yield temporary
-        # Some writers deny access to others: give the file the user's default mode.
-        os.umask(mask := os.umask(0))
-        temporary.chmod(0o666 & ~mask)
-        _sync(temporary)
-        os.replace(temporary, path)
-        sync_folder(path.parent)
+        with naming_full_disk(path):
+            yield temporary
+            # Some writers deny access to others: give the file the user's default mode.
+            os.umask(mask := os.umask(0))
+            temporary.chmod(0o666 & ~mask)
+            _sync(temporary)
+            os.replace(temporary, path)
+            sync_folder(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming_full_disk(path: Path) -> Iterator[None]:
+    """Let an OSError of the block, if there is no space, name the path that is written whole or not at all."""
+    try:
+        yield
     except OSError as error:
         if error.errno in NO_SPACE and str(path) not in str(error):
             raise OSError(
@@ -46,8 +56,6 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
                 " the same again",
             ) from error
         raise
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:

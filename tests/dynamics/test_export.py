@@ -182,3 +182,22 @@ def test_c_refuses_what_the_native_executor_cannot_run(scenes, make_model, tmp_p
     with pytest.raises(TypeError, match="specialised for another executor"):
         export_c(specialize(bound, executor="eager"), tmp_path / "step")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@with_compiler
+@pytest.mark.parametrize("room", [1, 20_000])
+def test_a_full_disk_leaves_what_was_there(scenes, make_model, tmp_path, files_end_at, room):
+    """Where torch's own writer of files ended the process."""
+    model = make_model(scenes["pendulum"]).bind(scenes["pendulum"])
+    (path := tmp_path / "step.pt2").write_text("old")
+    (folder := tmp_path / "step").mkdir()
+    (folder / "step.h").write_text("old")
+    native = specialize(model, executor="native")  # which may have to be built first
+    for write in lambda: export_step(model, path), lambda: export_c(native, folder):
+        with files_end_at(room), pytest.raises(OSError, match="cannot be written: .* make room"):
+            write()
+    assert {file.name: file.read_text() for file in tmp_path.rglob("*") if file.is_file()} == {
+        "step.pt2": "old",
+        "step.h": "old",
+    }

@@ -100,6 +100,20 @@ def test_mp4_has_every_frame(scenes, tmp_path, silent):
     assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == 11
 
 
+@pytest.mark.filterwarnings("ignore:.*FileIO:pytest.PytestUnraisableExceptionWarning")  # imageio's broken pipe
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+@pytest.mark.parametrize("room", [10, 4000])
+def test_a_full_disk_leaves_no_part_of_a_video(scenes, tmp_path, files_end_at, suffix, room):
+    """Also where ffmpeg does not say that it was stopped."""
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    truth = moving_states(scenes["swimmer6"], 40)
+    (path := tmp_path / f"v{suffix}").write_text("old")
+    with files_end_at(room), pytest.raises(OSError, match=r"^[^\n]* make room[^\n]*$"):
+        rollout_video(scenes["swimmer6"], truth, truth, path, size=96)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
 def test_panels_show_truth_prediction_and_divergence(scenes, silent):
     scene = scenes["swimmer6"]
     truth = moving_states(scene, 3)

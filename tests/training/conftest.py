@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import resource
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -21,22 +19,6 @@ from torchrl_gn.training.trainer import Trainer
 from ..learner import make_learner as make_learner
 from ..learner import point_env as point_env
 from ..sizes import SMALL
-
-
-@pytest.fixture
-def files_end_at() -> Callable[[int], AbstractContextManager]:
-    """``with files_end_at(1000):`` files of this process take 1000 bytes, as if the disk were full then."""
-
-    @contextmanager
-    def limited(size: int) -> Iterator[None]:
-        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-    return limited
 
 
 @pytest.fixture(scope="session")

@@ -65,3 +65,13 @@ def test_an_empty_file_begins_anew(tmp_path):
     (tmp_path / "numbers.csv").touch()
     CsvLog(tmp_path / "numbers.csv").log({"loss": 1}, 0)
     assert rows(tmp_path / "numbers.csv") == [{"step": "0", "loss": "1.0"}]
+
+
+def test_a_full_disk_leaves_no_half_row(path, files_end_at):
+    before = path.read_bytes()
+    log = CsvLog(path)
+    log.log({"loss": 1.0, "other": 1.0}, 10)
+    whole = path.read_bytes()
+    with files_end_at(len(whole) + 4), pytest.raises(OSError, match=r"csv cannot be written: .* make room"):
+        log.log({"loss": 2.0, "other": 1.0}, 11)
+    assert path.read_bytes() == whole != before

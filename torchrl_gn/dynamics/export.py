@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import io
 import json
 import os
 import re
@@ -35,6 +36,7 @@ def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os
     Raises:
         TypeError: for a recurrent model.
         ValueError: if each sample brings its own physical parameters.
+        OSError: if there is no space; what was there is kept.
     """
     model = _specialized(predictor, "eager")
     program = model.program()
@@ -53,9 +55,12 @@ def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os
         "state": [{"component": part.name, "size": part.size} for part in model.layout.components],
         "actions": scene.num_actions,
     }
-    with atomic_path(path) as temporary, warnings.catch_warnings():
+    content = io.BytesIO()  # torch's own writer of files ends the process when the disk is full
+    with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "No complete tensor found")  # constants that share memory are saved whole
-        torch.export.save(exported, temporary, extra_files={"scene.json": json.dumps(about)})
+        torch.export.save(exported, content, extra_files={"scene.json": json.dumps(about)})
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
     return Path(path)
 
 
@@ -78,6 +83,7 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
         TypeError: if the native executor cannot run the model: a recurrent one, a core that is no list of layers,
             16-bit products, a feature without scalar form.
         ValueError: if each sample brings its own physical parameters, or the folder's name is no C identifier.
+        OSError: if there is no space; what was there is kept.
     """
     folder = Path(folder).absolute()
     if not re.fullmatch(r"[A-Za-z_]\w*", folder.name, re.ASCII):

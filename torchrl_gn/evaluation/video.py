@@ -43,6 +43,9 @@ def rollout_video(
         prediction: ``[T + 1, N, 13]`` predicted states, or None; frames of non-finite states say so.
         path: file to write: ``.gif``, or ``.mp4`` (needs imageio-ffmpeg).
         speed: 1 is real time. States are skipped to keep frames at least 20 ms long.
+
+    Raises:
+        OSError: if there is no space; what was there is kept.
     """
     path = Path(path)
     if path.suffix not in (".gif", ".mp4"):
@@ -130,10 +133,19 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
     first = next(frames)
     rate: Any = 1 / seconds  # need not be a whole number, despite the annotation
     options: dict[str, Any] = {"quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    with closing(imageio_ffmpeg.write_frames(str(path), first.size, fps=rate, **options)) as writer:
-        writer.send(None)
-        for frame in itertools.chain([first], frames):
-            writer.send(frame.tobytes())
+    count, full = 0, f"ffmpeg could not write the whole video to {path.parent}: make room, or write a .gif."
+    try:
+        with closing(imageio_ffmpeg.write_frames(str(path), first.size, fps=rate, **options)) as writer:
+            writer.send(None)
+            for frame in itertools.chain([first], frames):
+                writer.send(frame.tobytes())
+                count += 1
+        # ffmpeg may fail without a word once it has all frames.
+        written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    except (OSError, RuntimeError) as error:  # of many lines
+        raise OSError(full) from error
+    if (written or 0) < count:
+        raise OSError(full)
 
 
 def _to_numpy(scene: Scene, what: str, states: Tensor) -> np.ndarray:

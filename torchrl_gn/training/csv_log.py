@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import csv
+import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
-from torchrl_gn.atomic import atomic_path
+from torchrl_gn.atomic import atomic_path, naming_full_disk
 
 
 class CsvLog:
@@ -41,8 +42,14 @@ class CsvLog:
         if new or same:
             self._rewrite()
             return
-        with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, self._names).writerow(self._rows[-1])
+        whole = self.path.stat().st_size
+        with naming_full_disk(self.path):
+            try:
+                with self.path.open("a", newline="") as file:
+                    csv.DictWriter(file, self._names).writerow(self._rows[-1])
+            except OSError:
+                os.truncate(self.path, whole)  # no half row
+                raise
 
     def _rewrite(self) -> None:
         with atomic_path(self.path) as temporary, temporary.open("w", newline="") as file:
