@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from statistics import median
@@ -26,6 +25,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from _common import clean_exit, finish_run, open_run, with_help
+from _common.parent import run_child
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.objectives import ForwardModelLoss
@@ -66,7 +66,7 @@ def start(cfg: DictConfig, batch: int, processes: int) -> dict[str, float]:
         options = [f"{name}={cfg[name]}" for name in ("system", "steps", "warm_up", "trajectories", "threads", "seed")]
         options += [f"batches=[{batch}]", f"optimizer={cfg.optimizer}"]
         environment = os.environ | {PART: str(place), "OMP_NUM_THREADS": str(cfg.threads)}
-        done = subprocess.run([*command, __file__, *options], env=environment, capture_output=True, text=True)
+        done = run_child([*command, __file__, *options], env=environment)
         if done.returncode:
             raise ValueError(f"{processes} processes failed:\n{done.stderr}")
         return json.loads(place.read_text())

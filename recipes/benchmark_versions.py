@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from statistics import median
@@ -26,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from _common import clean_exit, finish_run, open_run, with_help
+from _common.parent import run_child
 
 HERE = Path(__file__).resolve().parents[1]
 WORKER = Path(__file__).parent / "_common" / "version_times.py"
@@ -38,7 +38,7 @@ def start(cfg: DictConfig, checkout: Path) -> dict[str, float]:
         place = Path(folder) / "options.json"
         place.write_text(json.dumps(OmegaConf.to_container(cfg, resolve=True)))
         command = [sys.executable, "-W", "ignore", str(WORKER), str(place)]
-        done = subprocess.run(command, env=environment, cwd=checkout, capture_output=True, text=True)
+        done = run_child(command, env=environment, cwd=checkout)
         if done.returncode:
             raise ValueError(f"The version in {checkout} failed:\n{done.stderr}")
         found = json.loads(place.read_text())

@@ -27,7 +27,6 @@ import itertools
 import json
 import re
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -42,8 +41,9 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from _common import clean_exit, finish_run, open_run, with_help
+from _common import clean_exit, finish_run, open_run, parent, with_help
 from _common.gpu_parts import StepParts
+from _common.parent import run_child
 from torchrl_gn.atomic import write_json
 from torchrl_gn.cache import keep_inductor_private
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
@@ -236,7 +236,7 @@ def run_recipe(cfg: DictConfig, name: str, place: Path, options: Sequence[str]) 
     """Numbers of a recipe on the device and the seconds of its process, or how it failed."""
     command = [sys.executable, str(ROOT / f"recipes/{name}.py"), f"device={cfg.device}", f"run_dir={place}"]
     start = time.perf_counter()
-    done = subprocess.run([*command, f"seed={cfg.seed}", *options], capture_output=True, text=True, cwd=ROOT)
+    done = run_child([*command, f"seed={cfg.seed}", *options], cwd=ROOT)
     out: dict[str, Any] = {"whole_seconds": time.perf_counter() - start}
     if done.returncode:
         return {**out, "failed": (done.stdout + done.stderr)[-2000:]}
@@ -299,8 +299,8 @@ def measure_jraph(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
 
 def run_tests(cfg: DictConfig) -> dict[str, Any]:
     """Outcome of the tests that need a GPU."""
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", *cfg.test_files]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    command = [sys.executable, parent.__file__, "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", *cfg.test_files]
+    done = run_child(command, cwd=ROOT)
     lines = done.stdout.strip().splitlines()
     return {"passed": done.returncode == 0, "last": lines[-1] if lines else "", "output": done.stdout[-6000:]}
 

@@ -2,7 +2,8 @@
 
     PYTHONPATH=checkout python version_times.py options.json
 
-It imports nothing else of the recipes, which are of their own version. Writes the times over the options.
+It imports nothing else of the recipes, which are of their own version, but how to end with the one that runs it.
+Writes the times over the options.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from statistics import median
 
 import torch
 from omegaconf import DictConfig
+from parent import end_with_parent  # it lies beside this file
 
 import torchrl_gn
 from torchrl_gn import collect_trajectories, load_pretrained, specialize
@@ -81,6 +83,7 @@ def measure(cfg: DictConfig) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     file = Path(sys.argv[1])
     times = measure(DictConfig(json.loads(file.read_text())))
     file.write_text(json.dumps({"library": torchrl_gn.__file__, "times": times}))
