@@ -13,6 +13,7 @@ import torch
 
 from torchrl_gn.data.dataset_files import DatasetError
 from torchrl_gn.data.logs.log_checks import check_timestep, check_velocities, gain_and_correlation
+from torchrl_gn.data.logs.robot_log_formats import read_npz
 from torchrl_gn.maths import quaternion
 
 Order = Literal["wxyz", "xyzw"]
@@ -68,8 +69,7 @@ def load_pose_log(
     if not path.exists() or path.suffix != ".npz":
         raise DatasetError(f"No log of poses at {path}: it must be an .npz file.")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return _log({name: file[name] for name in file.files}, timestep, order, frame)
+        return _log(read_npz(path), timestep, order, frame)
     except (ValueError, OSError, EOFError, BadZipFile) as error:
         raise DatasetError(f"{path} cannot be read as a log of poses: {error}") from error
 
@@ -123,6 +123,8 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
     """Arrays ``[R, B, k]`` (time ``[R]``, action ``[R, A]``) without padding, and rows of each episode."""
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
     found = {name: arrays[name] for name in (*sizes, "state", "action", "time") if name in arrays}
+    if single := [name for name, values in found.items() if not values.ndim]:
+        raise ValueError(f"{single} are single numbers, not a row for each time.")
     if "state" in found:
         state = found.pop("state")
         if state.shape[-1] != 13 or found.keys() & sizes.keys():

@@ -35,10 +35,21 @@ def read_log_arrays(path: Path) -> LogArrays:
     return READERS[path.suffix](path)
 
 
-def _read_npz(path: Path) -> LogArrays:
-    with np.load(path, allow_pickle=False) as file:
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Named arrays of a file; ValueError, OSError, EOFError or BadZipFile if it has other content."""
+    file = np.load(path, allow_pickle=False)
+    if isinstance(file, np.ndarray):
+        raise ValueError("it is a single array (.npy), no .npz file of named ones")
+    with file:
         _refuse_twice(file.files)
-        return LogArrays(dict(file))
+        arrays = dict(file)
+    if others := [name for name, values in arrays.items() if not isinstance(values, np.ndarray)]:
+        raise ValueError(f"{others} in it are no arrays")
+    return arrays
+
+
+def _read_npz(path: Path) -> LogArrays:
+    return LogArrays(read_npz(path))
 
 
 def _read_csv(path: Path) -> LogArrays:
