@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import os
+import shlex
 import stat
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -45,6 +47,16 @@ def test_what_is_written_is_read_whatever_the_umask(folder):
     assert [file.name for file in folder.iterdir()] == ["a.json"]
     for path in (folder, folder / "a.json"):
         assert not path.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
+def test_the_warning_says_how_to_use_a_folder_that_an_older_version_made(folder):
+    folder.mkdir(parents=True)  # under the umask of private groups
+    assert folder.stat().st_mode & stat.S_IWGRP
+    with pytest.warns(SharedCacheWarning) as said:
+        write_cached("a.json", b"one")
+    subprocess.run(shlex.split(str(said[0].message).rpartition("run: ")[2]), check=True)
+    write_cached("a.json", b"one")
+    assert read_cached("a.json") == b"one"
 
 
 @pytest.mark.parametrize("how", SHARED)
