@@ -157,8 +157,8 @@ def _open_folder(folder: Path) -> int:
     os.close(descriptor)
     raise SharedCacheError(
         f"{folder} is another user's or can be written by others, who could put code there: nothing there is used or"
-        " kept. Delete it, or choose another place (XDG_CACHE_HOME, TORCHINDUCTOR_CACHE_DIR); if an older version made it"
-        f" and nobody else was there, run: chmod go-w {shlex.quote(str(folder))}"
+        " kept. Delete it, or choose another place (XDG_CACHE_HOME, TORCHINDUCTOR_CACHE_DIR); if an older version made"
+        f" it and nobody else was there, run: chmod go-w {shlex.quote(str(folder))}"
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchrl_gn.scenes import SceneError, load_scene, scene_from_description
+from torchrl_gn.scenes import SceneError, load_scene, scene_from_description, stored_mjcf
 from torchrl_gn.scenes.stored_mjcf import packed, unpacked
 
 BALL = '<body><joint/><geom size=".1"/></body>'
@@ -54,6 +54,24 @@ def test_copies_and_comments_that_only_mujoco_reads_come_back():
 
 def test_files_are_unpacked_as_they_were_and_no_further_than_their_size():
     files = {"a": b"text", "b": bytes(range(256)) * 99, "c": b""}
-    assert unpacked({name: packed(content) for name, content in files.items()}) == files
+    assert unpacked(packed(files)) == files
     with pytest.raises(SceneError, match="'b', are unpacked to too much"):
-        unpacked({"a": packed(b"0" * 50_000_000), "b": packed(b"0" * 50_000_000)})
+        unpacked({name: packed({name: b"0" * 50_000_000})[name] for name in "ab"})
+
+
+def test_files_that_could_not_be_unpacked_again_are_refused_when_they_are_loaded(tmp_path, monkeypatch):
+    mesh = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "part.obj").write_text(mesh + 500 * "#\n")
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><asset><mesh name="m" file="part.obj"/></asset><worldbody><body><joint/><geom type="mesh" mesh="m"/>'
+        "</body></worldbody></mujoco>"
+    )
+    scene = load_scene(tmp_path / "robot.xml")
+    unpacks = stored_mjcf.unpacked(scene.description()["assets"])
+    assert unpacks == {"part.obj": (tmp_path / "part.obj").read_bytes()}
+    monkeypatch.setattr(stored_mjcf, "_FREE_BYTES", 0)
+    monkeypatch.setattr(stored_mjcf, "_RATIO", 1)
+    stored = scene.description()["assets"]
+    for refuse in lambda: stored_mjcf.unpacked(stored), lambda: load_scene(tmp_path / "robot.xml"):
+        with pytest.raises(SceneError, match=r"part\.obj.* are unpacked to too much"):
+            refuse()

@@ -16,9 +16,9 @@ from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.control_bounds import ActionBounds, plain_bounds
 from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
-from torchrl_gn.scenes.mjcf_text import encoded_assets, inlined, read_text, reads_files_early
+from torchrl_gn.scenes.mjcf_text import inlined, model_assets, read_text, reads_files_early
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
-from torchrl_gn.scenes.stored_mjcf import checked, is_among, model_files, require_stored, unpacked
+from torchrl_gn.scenes.stored_mjcf import checked, is_among, model_files, packed, require_stored, unpacked
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
 from torchrl_gn.scenes.urdf import add_motors, is_urdf, with_local_meshes
 from torchrl_gn.scenes.variants import build_system, make_variant
@@ -199,8 +199,9 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
         label = "string" if path is None else f"file {path}"
         raise SceneError(f"MuJoCo cannot read the {'URDF' if urdf else 'MJCF'} {label}: {error}") from error
     text = inlined(text, folder)
-    assets = encoded_assets(spec, text, folder)
-    checked(text, unpacked(assets))  # what could not be read again is refused now
+    contents = model_assets(spec, text, folder)
+    checked(text, contents)  # what could not be read again is refused now
+    assets = packed(contents)
     if dropped := drop_missing_visuals(spec, lambda file: is_among(file, assets, text)):
         few = ", ".join(dropped[:3]) + ", ..." * (len(dropped) > 3)
         warnings.warn(

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from torchrl_gn.scenes.scene import SceneError
-from torchrl_gn.scenes.stored_mjcf import model_files, packed, parsed
+from torchrl_gn.scenes.stored_mjcf import model_files, parsed
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 
@@ -60,9 +60,9 @@ def _found(file: str, *folders: Path) -> Path | None:
     return None
 
 
-def encoded_assets(spec: mujoco.MjSpec, text: str, folder: Path) -> dict[str, str]:
-    """Files that a model reads, compressed and encoded, by the path under which MuJoCo asks for them."""
-    return {name: packed(content) for name, content in _files(spec, text, folder)}
+def model_assets(spec: mujoco.MjSpec, text: str, folder: Path) -> dict[str, bytes]:
+    """Contents of the files that a model reads, by the path under which MuJoCo asks for them."""
+    return dict(_files(spec, text, folder))
 
 
 def reads_files_early(text: str) -> bool:

@@ -21,6 +21,7 @@ from torchrl_gn.scenes.scene import SceneError
 
 _MOST_COPIES = 5_000  # elements beyond those in the text: MuJoCo takes seconds for so many
 _MOST_CELLS = 50_000_000  # of textures and height fields
+_TOO_MUCH = "are unpacked to too much for their packed size."
 _FREE_BYTES, _RATIO = 64_000_000, 8  # files may be unpacked to so much, and to so many times their packed size
 # Most that attributes of these names may say, in any element.
 _MOST = {
@@ -49,14 +50,17 @@ def parsed(text: str, what: str) -> ElementTree.Element:
         raise SceneError(f"MuJoCo reads {what}, but it is no XML that can be stored: {error}") from error
 
 
-def packed(content: bytes) -> str:
-    """A file of a model, compressed, as text."""
-    return base64.b64encode(zlib.compress(content)).decode("ascii")
+def packed(contents: Mapping[str, bytes]) -> dict[str, str]:
+    """Files of a model, compressed, as texts; SceneError if :func:`unpacked` would refuse them."""
+    files = {name: base64.b64encode(zlib.compress(content)).decode("ascii") for name, content in contents.items()}
+    if sum(map(len, contents.values())) > _room(files):
+        raise SceneError(f"The files of a scene, {list(files)}, {_TOO_MUCH}")
+    return files
 
 
 def unpacked(files: Mapping[str, str]) -> dict[str, bytes]:
     """Contents of :func:`packed` files; SceneError if they are damaged or grow beyond all measure."""
-    room, contents = _FREE_BYTES + _RATIO * sum(map(len, files.values())), {}
+    room, contents = _room(files), {}
     for name, text in files.items():
         try:
             stream = zlib.decompressobj()
@@ -67,8 +71,12 @@ def unpacked(files: Mapping[str, str]) -> dict[str, bytes]:
             raise SceneError(f"The file {name!r} of a stored scene is damaged: its end is missing.")
         room -= len(contents[name])
         if room < 0:
-            raise SceneError(f"The files of a scene, with {name!r}, are unpacked to too much for their packed size.")
+            raise SceneError(f"The files of a scene, with {name!r}, {_TOO_MUCH}")
     return contents
+
+
+def _room(files: Mapping[str, str]) -> int:
+    return _FREE_BYTES + _RATIO * sum(map(len, files.values()))
 
 
 def checked(text: str, files: Mapping[str, bytes]) -> tuple[str, dict[str, bytes]]:
