@@ -67,6 +67,14 @@ def sync_folder(folder: Path) -> None:
             raise
 
 
+def sync_all(folder: Path) -> None:
+    """Wait until all that is in a folder is on disk, and its name."""
+    for path in folder.rglob("*"):
+        sync_folder(path) if path.is_dir() else _sync(path)
+    sync_folder(folder)
+    sync_folder(folder.parent)
+
+
 def remove_leftovers(folder: str | os.PathLike, *, of: Path | None = None) -> list[Path]:
     """Remove the temporary files that killed processes left in a folder and those in it; return their paths.
 

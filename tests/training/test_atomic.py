@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_gn.atomic import atomic_path, read_json, remove_leftovers, write_json
+from torchrl_gn.atomic import atomic_path, read_json, remove_leftovers, sync_all, write_json
 
 
 def test_the_file_appears_once_the_block_succeeds(tmp_path):
@@ -122,3 +122,13 @@ os._exit(9)
     left = remove_leftovers(tmp_path)
     assert sorted(path.name.split(".")[1] for path in left) == ["checkpoint", "rollout", "table"]
     assert sorted(path for path in Path(tmp_path).rglob("*") if path.is_file()) == sorted(others)
+
+
+def test_all_of_a_folder_is_on_disk(tmp_path, monkeypatch):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "a" / "b" / "plain").write_text("text")
+    (tmp_path / "a" / "file.memmap").write_text("text")
+    synced = set()
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.add(os.fstat(descriptor).st_ino))
+    sync_all(tmp_path / "a")
+    assert synced == {place.stat().st_ino for place in (tmp_path, tmp_path / "a", *(tmp_path / "a").rglob("*"))}

@@ -14,7 +14,7 @@ import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
-from torchrl_gn.atomic import atomic_path, remove_leftovers, sync_folder
+from torchrl_gn.atomic import atomic_path, naming_full_disk, remove_leftovers, sync_all
 from torchrl_gn.data.tensor_folder import open_tensors
 
 FORMAT = 6
@@ -117,14 +117,11 @@ class DatasetFiles:
             size = self.manifest["request"]["sizes"][split]
             cast(TensorDict, rows[:1]).expand(size).memmap_like(str(folder))
             for file in folder.rglob("*.memmap") if hasattr(os, "posix_fallocate") else ():
-                with open(file, "r+b") as stream:  # a full disk raises here; later it would kill the process
+                # A full disk raises here; later it would kill the process.
+                with naming_full_disk(file), open(file, "r+b") as stream:
                     os.posix_fallocate(stream.fileno(), 0, file.stat().st_size)
         TensorDict.load_memmap(folder, allow_pickle=False)[first : first + len(rows)] = rows
-        for file in folder.rglob("*.*"):
-            with open(file, "r+b") as stream:
-                os.fsync(stream.fileno())
-        for each in {file.parent for file in folder.rglob("*.*")} if not chunks else ():
-            sync_folder(each)
+        sync_all(folder)
         layout = {file.relative_to(folder).as_posix(): file for file in sorted(folder.rglob("meta.json"))}
         sums = {name: zlib.crc32(file.read_bytes()) for name, file in layout.items()}
         chunks.append({"rejected": rejected, "crc32": {**sums, **_checksums(rows)}})
