@@ -215,7 +215,8 @@ def main(cfg: DictConfig) -> None:
     if others:
         kept = load_pretrained(latest[0]).policy
         zero_shot = {f"zero_shot/{task.scene.name}": judge(cfg, task, kept)[1]["return"] for task in others}
-    finish_run(cfg, run, tracker, report(run, tasks, rounds, judged, zero_shot), checkpoints=latest)
+    metrics = report(run, tasks, rounds, judged, zero_shot)
+    finish_run(cfg, run, tracker, metrics, checkpoints=latest, step=rounds[-1]["frames"])
 
 
 def keep_latest(learner: ActorCritic, last: Round, policy: BoundedPolicy, latest: list[Path]) -> None:

@@ -29,13 +29,37 @@ def test_a_whole_file_goes_on(path):
         warnings.simplefilter("error")
         log = CsvLog(path)
     assert path.read_bytes() == before
-    log.log({"loss": 9}, 3)
+    log.log({"loss": 9, "a,b": 3}, 3)
     assert [(row["step"], row["loss"]) for row in rows(path)] == [
         ("0", "0.0"),
         ("1", "0.5"),
         ("2", "1.0"),
         ("3", "9.0"),
     ]
+
+
+def test_a_name_that_is_logged_again_leaves_others_as_they_are(tmp_path):
+    """Of a model that was trained before another, or of a run that is only evaluated again."""
+    path = tmp_path / "numbers.csv"
+    log = CsvLog(path)
+    for name in "ab":
+        for step in (1, 2, 3):
+            log.log({f"{name}/loss": step}, step)
+    log.log({"error": 5}, 3)
+    whole = rows(path)
+    assert [(row["step"], row["a/loss"], row["b/loss"]) for row in whole] == [
+        ("1", "1.0", "1.0"),
+        ("2", "2.0", "2.0"),
+        ("3", "3.0", "3.0"),
+    ]
+    log = CsvLog(path)
+    log.log({"b/loss": 7}, 2)
+    assert [row["a/loss"] for row in rows(path)] == ["1.0", "2.0", "3.0"]
+    assert [row["b/loss"] for row in rows(path)] == ["1.0", "7.0", ""]
+    for step in (2, 3):
+        log.log({"b/loss": step}, step)
+    log.log({"error": 5}, 3)
+    assert rows(path) == whole
 
 
 @pytest.mark.parametrize(

@@ -14,61 +14,69 @@ from torchrl_gn.atomic import atomic_path, naming_full_disk
 class CsvLog:
     """Write ``path``: a row for each step, ``step`` and a column for each name, empty where nothing was logged.
 
-    A file that is there goes on; its rows of the same or later steps are replaced by the first row that is logged. Rows
-    that a full disk or a power cut left damaged are left out, with a warning.
+    A file that is there goes on; when a name is logged first, its numbers of the same or later steps go. Rows that a
+    full disk or a power cut left damaged are left out, with a warning.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self._names, self._rows = path, ["step"], []
+        self.path, self._names, self._rows = path, ["step"], dict[int, dict[str, str]]()
         damaged = 0
         if path.exists():
             self._names, self._rows, damaged = _read(path)
+        self._before = set(self._names[1:])  # names that were not logged since
         if damaged:
             warnings.warn(f"{path}: {damaged} damaged rows are left out.", stacklevel=2)
             self._rewrite()
-        self._resumed = bool(self._rows)
 
     def log(self, numbers: Mapping[str, float], step: int) -> None:
         """Add numbers to the row of a step; a new name adds a column."""
-        if self._resumed:
-            self._resumed, self._rows = False, [row for row in self._rows if int(row["step"]) < step]
-            self._rewrite()
+        if again := self._before & numbers.keys():
+            self._before -= again
+            for late in [each for each in self._rows if each >= step]:
+                row = {name: value for name, value in self._rows.pop(late).items() if name not in again}
+                self._rows |= {late: row} if row else {}
         new = [name for name in numbers if name not in self._names]
-        same = bool(self._rows) and self._rows[-1]["step"] == str(step)
-        if not same:
-            self._rows.append({"step": str(step)})
-        self._rows[-1] |= {name: repr(float(value)) for name, value in numbers.items()}
+        rewrite = bool(again or new) or max(self._rows, default=step - 1) >= step
+        self._rows.setdefault(step, {}).update({name: repr(float(value)) for name, value in numbers.items()})
         self._names += new
-        if new or same:
+        if rewrite:
             self._rewrite()
             return
         whole = self.path.stat().st_size
         with naming_full_disk(self.path):
             try:
-                with self.path.open("a", newline="") as file:
-                    csv.DictWriter(file, self._names).writerow(self._rows[-1])
+                with self.path.open("a", newline="", encoding="utf-8") as file:
+                    csv.DictWriter(file, self._names).writerow({"step": step, **self._rows[step]})
             except OSError:
                 os.truncate(self.path, whole)  # no half row
                 raise
 
     def _rewrite(self) -> None:
-        with atomic_path(self.path) as temporary, temporary.open("w", newline="") as file:
+        with atomic_path(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self._names)
             writer.writeheader()
-            writer.writerows(self._rows)
+            writer.writerows({"step": step, **self._rows[step]} for step in sorted(self._rows))
 
 
-def _read(path: Path) -> tuple[list[str], list[dict[str, str]], int]:
-    """Names, whole rows, and the number of others; a last row without its line's end is cut."""
+def _read(path: Path) -> tuple[list[str], dict[int, dict[str, str]], int]:
+    """Names, whole rows by step, and the number of others; a last row without its line's end is cut."""
     text = path.read_bytes().decode(errors="replace")
-    *whole, cut = text.splitlines(keepends=True) or [""]
-    lines = [*whole, cut] if cut.endswith("\n") else whole
-    names = next(csv.reader(lines[:1]), [])
-    if names[:1] != ["step"] or len(set(names)) < len(names) or "\0" in lines[0]:
-        return ["step"], [], len(lines) + (not cut.endswith("\n") and bool(cut))
-    fields = [[] if "\0" in line else next(csv.reader([line]), []) for line in lines[1:]]
-    rows = [dict(zip(names, each, strict=True)) for each in fields if _is_whole(each, len(names))]
-    return names, rows, len(fields) - len(rows) + (not cut.endswith("\n") and bool(cut))
+    *lines, cut = text.split("\n")
+    names, *fields = map(_fields, lines or [""])
+    if names[:1] != ["step"] or len(set(names)) < len(names):
+        return ["step"], {}, len(lines) + bool(cut)
+    whole = [each for each in fields if _is_whole(each, len(names))]
+    rows: dict[int, dict[str, str]] = {}
+    for step, *values in whole:
+        row = {name: value for name, value in zip(names[1:], values, strict=True) if value}
+        rows.setdefault(int(step), {}).update(row)
+    return names, rows, len(fields) - len(whole) + bool(cut)
+
+
+def _fields(line: str) -> list[str]:
+    """Fields of a line; none if it has NUL or other characters that no number and no name has."""
+    line = line.removesuffix("\r")
+    return next(csv.reader([line]), []) if line.isprintable() else []
 
 
 def _is_whole(fields: list[str], count: int) -> bool:
