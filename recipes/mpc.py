@@ -45,7 +45,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import CEMPlanner, MPPIPlanner
 from tqdm import tqdm
 
@@ -97,25 +97,23 @@ class RandomControl(TensorDictModuleBase):
 def make_planner(
     name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, done: int, policy: BoundedPolicy | None = None
 ) -> TensorDictModuleBase:
-    """Make a planner that goes on after ``done`` steps; its random numbers depend on them."""
+    """Make a planner that goes on after ``done`` steps; :func:`draw_anew` seeds it at each."""
     proposing = {} if policy is None else {"proposal": policy, "propose_every_step": bool(cfg.policy_every_step)}
-    seed = cfg.seed + 1_000_000 * done
-    torch.manual_seed(seed)  # what TorchRL's planners draw from
     if name in ("random", "nothing"):
         return RandomControl(env.scene, cfg.episodes, cfg.steps, cfg.seed + 2, float(name == "random"), step=done)
     if name == "policy":
         assert policy is not None
         return policy
     if name == "ilqg":
-        return ILQGPlanner(env, cfg.horizon, seed=seed, **proposing, **cfg.ilqg)
+        return ILQGPlanner(env, cfg.horizon, **proposing, **cfg.ilqg)
     if name == "ilqr":
         assert imagined is not None
-        return ILQGPlanner(imagined, cfg.horizon, seed=seed, **proposing, **cfg.ilqr)
+        return ILQGPlanner(imagined, cfg.horizon, **proposing, **cfg.ilqr)
     if name == "gn":
         assert imagined is not None
         more = proposing | {key: value for key, value in cfg.gn.items() if key != "lr"}
         optimizer = partial(torch.optim.Adam, lr=cfg.gn.lr)
-        return GradientPlanner(imagined, cfg.horizon, optimizer=optimizer, seed=seed, **more)
+        return GradientPlanner(imagined, cfg.horizon, optimizer=optimizer, **more)
     where = env if name.endswith("_true") else imagined
     assert where is not None
     kind = name.removesuffix("_true")
@@ -127,6 +125,14 @@ def make_planner(
     if name.startswith("cem"):
         return CEMPlanner(where, planning_horizon=cfg.horizon, **sizes)
     return MPPIPlanner(where, ReturnToGo(), chosen.temperature, planning_horizon=cfg.horizon, **sizes)
+
+
+def draw_anew(planner: nn.Module, seed: int) -> None:
+    """Seed a planner before a step, so that one that goes on draws what it would have drawn."""
+    torch.manual_seed(seed)  # what TorchRL's planners draw from
+    for module in planner.modules():
+        if isinstance(module, (GradientPlanner, ILQGPlanner)):
+            module.set_seed(seed)
 
 
 def play_step(
@@ -159,6 +165,7 @@ def execute(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEn
         try:
             while len(episodes) < cfg.steps:
                 with let_in_at_once():
+                    draw_anew(policy, cfg.seed + 1_000_000 * len(episodes))
                     after, step = play_step(cfg, name, policy, env, imagined, episodes)
                 episodes.record(after, step)
                 bar.set_postfix(reward=f"{float(step['reward'].nanmean()):.3g}", refresh=False)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
@@ -15,7 +14,6 @@ from torchrl_gn.data import Simulator, collect_trajectories, spline_controls, tr
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import save_checkpoint
 
@@ -181,15 +179,13 @@ def test_bad_options_are_named(tmp_path, call):
         assert code == 1 and message in errors and "Traceback" not in errors, errors
 
 
-def test_planners_that_go_on_draw_other_numbers(load):
-    recipe = load("mpc")
-    env = SceneEnv(load_scene("pendulum"), make_reward("balance", load_scene("pendulum")))
-    cfg = OmegaConf.create({"seed": 3, "horizon": 2, "episodes": 1, "steps": 9})
-    cfg.cem = {"iterations": 1, "top_k": 2, "candidates": 4}
-    drawn = []
-    for executed in (0, 5, 5):
-        recipe.make_planner("cem_true", cfg, env, None, executed)
-        drawn.append(torch.rand(3))
-    assert torch.equal(drawn[1], drawn[2]) and not torch.equal(drawn[0], drawn[1])
-    torch.manual_seed(3)
-    assert torch.equal(torch.rand(3), drawn[0])  # whoever executed before
+def test_planners_that_go_on_draw_what_they_would_have_drawn(tmp_path, call):
+    options = ("system=pendulum", "planner=[gn,cem]", "horizon=2", "episodes=2", "video=false")
+    options += ("gn.candidates=2", "gn.samples=2", "gn.warm_up=1", "gn.iterations=1")
+    options += ("cem.iterations=1", "cem.candidates=4", "cem.top_k=2")
+    for folder, steps in (("whole", 4), ("resumed", 2), ("resumed", 4)):
+        code, _, errors = call(*options, f"steps={steps}", f"run_dir={tmp_path / folder}", recipe="mpc")
+        assert code == 0, errors
+    for name in ("gn", "cem"):
+        whole, resumed = (load_file(tmp_path / folder / f"{name}.safetensors") for folder in ("whole", "resumed"))
+        assert torch.equal(whole["action"], resumed["action"]) and torch.equal(whole["state"], resumed["state"])

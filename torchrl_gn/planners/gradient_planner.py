@@ -116,6 +116,10 @@ class GradientPlanner(RecedingHorizonPlanner):
         self.register_buffer("middle", ((low + high) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         self.to(env.device)
+        self.set_seed(seed)
+
+    def set_seed(self, seed: int | None) -> None:
+        """Draw what comes next from another seed; None: from torch's global generator."""
         self._rng = numpy_generator(seed)
 
     @property

@@ -124,9 +124,13 @@ class ILQGPlanner(RecedingHorizonPlanner):
         self.horizon, self.iterations = horizon, iterations
         self.warm_up = 10 * iterations if warm_up is None else warm_up
         self.control_cost, self.central, self.num_threads = control_cost, central, num_threads
-        self._rng = numpy_generator(seed)
+        self.set_seed(seed)
         self._plants: dict[int, Plant] = {}
         self._warned = False
+
+    def set_seed(self, seed: int | None) -> None:
+        """Draw what comes next from another seed; None: from torch's global generator."""
+        self._rng = numpy_generator(seed)
 
     def plant(self, variant: int = 0) -> Plant:
         """What is planned on: of the true physics, one of the environment's scenes."""
