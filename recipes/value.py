@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torch import Tensor
 
-from _common import clean_exit, finish_run, open_log, refuse_other_options, scene_options, with_help
+from _common import clean_exit, finish_run, open_log, read_config, refuse_other_options, scene_options, with_help
 from _common.episodes import transitions
 from _common.options import SCENE_OPTIONS
 from _common.planning_task import reward_of
@@ -44,7 +44,7 @@ def task_of(files: list[Path]) -> DictConfig:
             raise ValueError(
                 f"episodes={file} must be a file in a run folder of recipes/mpc.py, with its {CONFIG_FILE}."
             )
-        played = cast(DictConfig, OmegaConf.load(config))
+        played = read_config(config)
         tasks.append({key: played[key] for key in TASK})
         if played.variants:
             raise ValueError(f"episodes={file} are of variants, which a value of states cannot tell apart.")

@@ -12,5 +12,6 @@ from _common.options import scene_options as scene_options
 from _common.run import finish_run as finish_run
 from _common.run import open_log as open_log
 from _common.run import open_run as open_run
+from _common.run import read_config as read_config
 from _common.run import refuse_other_options as refuse_other_options
 from _common.run import resumed_checkpoint as resumed_checkpoint

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from torchrl_gn.dynamics import Physics
 from torchrl_gn.training import Checkpoint, RunFolder, Tracker, load_pretrained
@@ -40,6 +42,17 @@ def resumed_checkpoint(
     return checkpoint
 
 
+def read_config(path: Path) -> DictConfig:
+    """Read the ``config.yaml`` of a run; ValueError, naming it, if it is damaged."""
+    try:
+        config = OmegaConf.load(path)
+    except (YAMLError, OmegaConfBaseException, ValueError, OSError, AssertionError) as error:
+        raise ValueError(f"{path} is damaged ({' '.join(str(error).split())}); name a new run_dir.") from error
+    if not isinstance(config, DictConfig):
+        raise ValueError(f"{path} is damaged (it holds no options); name a new run_dir.")
+    return config
+
+
 def refuse_other_options(cfg: DictConfig, run: RunFolder, may_change: Collection[str]) -> None:
     """Refuse to go on with a run of other options than its ``config.yaml`` has.
 
@@ -47,7 +60,7 @@ def refuse_other_options(cfg: DictConfig, run: RunFolder, may_change: Collection
         ValueError: if an option outside of ``may_change`` differs.
     """
     if (config := run.path / CONFIG_FILE).exists():
-        run.refuse_changes(cast(DictConfig, OmegaConf.load(config)), cfg, free=may_change)
+        run.refuse_changes(read_config(config), cfg, free=may_change)
 
 
 def finish_run(

@@ -51,14 +51,14 @@ class RunFolder:
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"run_dir={self.path} is a file; name a folder.")
         self.name, config = name, self.path / CONFIG_FILE
-        first = config.read_text().partition("\n")[0] if config.exists() else ""
+        first = config.read_text(errors="replace").partition("\n")[0] if config.exists() else ""
         if first.startswith(_RECIPE) and (other := first.removeprefix(_RECIPE)) != name:
             raise ValueError(f"run_dir={self.path} holds a run of {other}, not of {name}. Name a new run_dir.")
         self.path.mkdir(parents=True, exist_ok=True)
         if (here := self.path.resolve()) not in self._locks and (lock := lock_folder(here)) is not None:
             self._locks[here] = lock
-        if first.startswith(_RECIPE):  # not in any folder that a user names
-            remove_leftovers(self.path)
+        # All of a run's; in any other folder that a user names, those of a run that was killed in its first write.
+        remove_leftovers(self.path, of=None if first.startswith(_RECIPE) else config)
         self._start = time.perf_counter()
         self._written: list[Path] = []
         RunFolder._latest = self
