@@ -203,7 +203,7 @@ def main(cfg: DictConfig) -> None:
                 learner.save(now)
                 for task, trajectories in zip(tasks, played, strict=True):
                     task.add(trajectories, now)
-                write_json(now.numbers, rounds[-1])
+                write_json(now.numbers, rounds[-1], checked=True)
                 keep_latest(learner, now, policy, latest)
                 tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from typing import Any
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # a full disk, a quota, a limit on the size of files
 
+_CHECKSUM = "sha256"  # an entry of JSON files
 _TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")  # names of atomic_path's temporary files
 
 
@@ -87,10 +89,14 @@ def remove_leftovers(folder: str | os.PathLike, *, of: Path | None = None) -> li
     return left
 
 
-def write_json(path: str | os.PathLike, values: Any) -> None:
-    """Write plain values as indented JSON, atomically; raise ValueError for NaN and infinity."""
+def write_json(path: str | os.PathLike, values: Any, *, checked: bool = False) -> None:
+    """Write plain values as indented JSON, atomically; raise ValueError for NaN and infinity.
+
+    ``checked``: add a last entry to a dictionary, its checksum, for numbers that results are made of.
+    """
     try:
-        text = json.dumps(values, indent=2, allow_nan=False)
+        more = {_CHECKSUM: _digest(values)} if checked else {}
+        text = json.dumps({**values, **more} if checked else values, indent=2, allow_nan=False)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; JSON holds finite numbers only.") from error
     with atomic_path(path) as temporary:
@@ -100,9 +106,21 @@ def write_json(path: str | os.PathLike, values: Any) -> None:
 def read_json(path: str | os.PathLike) -> Any:
     """Read what :func:`write_json` wrote; raise ValueError, naming the file, if it is damaged."""
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return parse_json(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is damaged ({error}); delete it, and run again what made it.") from error
+
+
+def parse_json(text: str) -> Any:
+    """Parse the text of such a file; raise ValueError if it is no JSON, or not as its checksum, if it has one."""
+    values = json.loads(text)
+    if isinstance(values, dict) and _CHECKSUM in values and values.pop(_CHECKSUM) != _digest(values):
+        raise ValueError("checksum differs")
+    return values
+
+
+def _digest(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, allow_nan=False).encode()).hexdigest()
 
 
 def _make_folder(folder: Path) -> None:

@@ -246,7 +246,7 @@ def report_learning(
     ``label`` names the agent in the figure; ``more`` are further metrics.
     """
     curve = trainer.curve
-    write_json(run.file("curve.json"), vars(curve))
+    write_json(run.file("curve.json"), vars(curve), checked=True)
     plot_learning_curves({label: (curve.frames, [curve.returns])}, run.file("curve.png"))
     last = curve.returns[-max(1, len(curve.returns) // 10) :]
     numbers = {

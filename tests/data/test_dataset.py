@@ -19,6 +19,7 @@ import torch
 from filelock import FileLock, Timeout
 from tensordict import TensorDict, TensorDictBase
 
+from torchrl_gn.atomic import read_json
 from torchrl_gn.data import (
     DatasetError,
     Simulator,
@@ -186,6 +187,13 @@ def test_a_full_disk_leaves_it_to_be_gone_on_with(
     assert len(create_dataset(tmp_path / "d", pendulum, **SIZES).train) == 10
 
 
+def test_files_that_may_not_be_so_large_are_named(tmp_path: Path, pendulum: Scene, files_end_at) -> None:
+    with files_end_at(5000):
+        with pytest.raises(OSError, match=r"d/train cannot be written: File too large\. Make room"):
+            create_dataset(tmp_path / "d", pendulum, **SIZES)
+    assert len(create_dataset(tmp_path / "d", pendulum, **SIZES).train) == 10
+
+
 def test_others_wait_while_it_is_made(tmp_path: Path, pendulum: Scene) -> None:
     def locked(*_) -> None:
         with pytest.raises(Timeout), FileLock(tmp_path / ".d.lock", timeout=0):
@@ -253,7 +261,7 @@ def _break_manifest(folder: Path) -> Path:
 
 def _drop_from_manifest(folder: Path) -> Path:
     file = folder / "manifest.json"
-    manifest = json.loads(file.read_text())
+    manifest = read_json(file)
     del manifest["chunks"]
     file.write_text(json.dumps(manifest))
     return file
@@ -261,7 +269,7 @@ def _drop_from_manifest(folder: Path) -> Path:
 
 def _empty_request(folder: Path) -> Path:
     file = folder / "manifest.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "request": {"sizes": {}, "chunk": 0}}))
+    file.write_text(json.dumps({**read_json(file), "request": {"sizes": {}, "chunk": 0}}))
     return file
 
 
@@ -271,7 +279,7 @@ def _grow(folder: Path) -> Path:
     for leaf in file.parent.glob("*.memmap"):
         leaf.write_bytes(leaf.read_bytes() * 2)
     file.write_text(file.read_text().replace("[4", "[8"))
-    manifest = json.loads(manifest_file.read_text())
+    manifest = read_json(manifest_file)
     chunk = manifest["chunks"]["test"][0]
     chunk["crc32"]["meta.json"] = zlib.crc32(file.read_bytes())
     manifest["chunks"]["test"].append(chunk)
@@ -281,13 +289,13 @@ def _grow(folder: Path) -> Path:
 
 def _newer(folder: Path) -> Path:
     file = folder / "manifest.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "format": 99}))
+    file.write_text(json.dumps({**read_json(file), "format": 99}))
     return file
 
 
 def _older(folder: Path) -> Path:
     file = folder / "manifest.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "format": 3}))
+    file.write_text(json.dumps({**read_json(file), "format": 3}))
     return file
 
 

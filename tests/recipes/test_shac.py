@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from torchrl_gn.atomic import write_json
+from torchrl_gn.atomic import read_json, write_json
 from torchrl_gn.training import load_pretrained, save_checkpoint
 
 SMALL = (
@@ -211,7 +211,7 @@ def test_a_round_whose_episodes_all_became_unstable_does_not_end_the_run(tmp_pat
     kept = tmp_path / "rounds/000"
     played = load_file(kept / "played.safetensors")
     save_file({name: value[:0].clone() for name, value in played.items()}, kept / "played.safetensors")
-    numbers = json.loads((kept / "numbers.json").read_text())
+    numbers = read_json(kept / "numbers.json")
     write_json(kept / "numbers.json", {**numbers, "error": None})
     code, output, errors = call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0, errors

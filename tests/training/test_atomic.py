@@ -55,6 +55,11 @@ def test_json_round_trips_and_refuses_what_json_cannot_hold(tmp_path):
         with pytest.raises(ValueError, match="metrics.json: .* finite numbers only"):
             write_json(path, {"loss": bad})
     assert read_json(path) == values
+    write_json(path, values, checked=True)
+    assert read_json(path) == values and json.loads(path.read_text()).keys() - values.keys() == {"sha256"}
+    path.write_text(path.read_text().replace("0.1", "0.2"))
+    with pytest.raises(ValueError, match=r"metrics\.json is damaged \(checksum differs\); delete it"):
+        read_json(path)
     for damaged in (b'{"loss": 0.', b"", b"\0\0", b"\xff{}"):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"metrics\.json is damaged .*; delete it"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_gn.atomic import read_json
 from torchrl_gn.training import RunFolder, package_versions
 
 
@@ -23,7 +23,7 @@ def left_to_others() -> Iterator[None]:
 def test_metrics_are_flat_plain_numbers(tmp_path):
     folder = RunFolder(tmp_path / "run", "train")
     written = folder.write_metrics({"error": 0.1, "steps": 3, "diverged": math.inf, "nan": math.nan}, seed=7)
-    read = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    read = read_json(tmp_path / "run" / "metrics.json")
     assert read == written
     assert (read["error"], read["steps"], read["diverged"], read["nan"]) == (0.1, 3, None, None)
     assert read["seed"] == 7 and read["wall_clock_seconds"] >= 0
@@ -50,9 +50,10 @@ def test_a_run_is_continued_in_its_folder(tmp_path):
 def test_leftovers_of_a_killed_run_are_gone_once_it_is_continued(tmp_path):
     left = [tmp_path / ".rollout.0a1b2c3d.gif", tmp_path / "checkpoint" / ".checkpoint.0a1b2c3d.safetensors"]
     left[1].parent.mkdir()
-    for file in left:
+    for file in (*left, first := tmp_path / ".config.0a1b2c3d.yaml"):
         file.write_text("half")
     RunFolder(tmp_path, "train").write_config("a: 1\n")
+    assert not first.exists()
     assert all(file.exists() for file in left)  # of whoever had a folder that was no run
     RunFolder(tmp_path, "train")
     assert not any(file.exists() for file in left)

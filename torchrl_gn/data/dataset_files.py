@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
+import re
 import zlib
 from contextlib import AbstractContextManager, nullcontext
 from importlib.metadata import version
@@ -14,7 +14,7 @@ import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
-from torchrl_gn.atomic import atomic_path, naming_full_disk, remove_leftovers, sync_all
+from torchrl_gn.atomic import naming_full_disk, parse_json, remove_leftovers, sync_all, write_json
 from torchrl_gn.data.tensor_folder import open_tensors
 
 FORMAT = 6
@@ -72,7 +72,7 @@ class DatasetFiles:
     def read(self) -> None:
         """Read the manifest; DatasetError if it is missing, damaged or of another format."""
         try:
-            manifest = json.loads(self.manifest_path.read_text(encoding="utf-8"))
+            manifest = parse_json(self.manifest_path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise self.error("no such file, so there is no data set. Make one with create_dataset.") from None
         except ValueError as error:
@@ -95,8 +95,7 @@ class DatasetFiles:
         self._write()
 
     def _write(self) -> None:
-        with atomic_path(self.manifest_path) as temporary:
-            temporary.write_text(json.dumps(self.manifest, indent=1), encoding="utf-8")
+        write_json(self.manifest_path, self.manifest, checked=True)
 
     def rows_done(self, split: str) -> int:
         """Number of rows in a split's finished chunks."""
@@ -115,7 +114,7 @@ class DatasetFiles:
                 raise DatasetError(f"{place}: a link, through which nothing is written. {_REMEDY}")
         if not chunks:
             size = self.manifest["request"]["sizes"][split]
-            cast(TensorDict, rows[:1]).expand(size).memmap_like(str(folder))
+            _make_files(cast(TensorDict, rows[:1]).expand(size), folder)
             for file in folder.rglob("*.memmap") if hasattr(os, "posix_fallocate") else ():
                 # A full disk raises here; later it would kill the process.
                 with naming_full_disk(file), open(file, "r+b") as stream:
@@ -155,6 +154,17 @@ class DatasetFiles:
                     where = f"{folder / name}: sequences {first} to {first + len(rows) - 1}"
                     raise DatasetError(f"{where} do not have their checksum: damaged. {_REMEDY}")
         return data
+
+
+def _make_files(like: TensorDict, folder: Path) -> None:
+    """Map tensors of a shape from new files; OSError if these would be larger than files may be."""
+    try:
+        like.memmap_like(str(folder))
+    except RuntimeError as error:
+        if (number := re.search(r"unable to resize file .*\((\d+)\)$", str(error))) is None:
+            raise
+        what = f"{folder} cannot be written: {os.strerror(int(number[1]))}. Make room and run the same again"
+        raise OSError(int(number[1]), what) from error
 
 
 def _wrong(manifest: dict) -> str | None:

@@ -132,7 +132,7 @@ class RunFolder:
             "processor": ", ".join([processor_name(), instruction_sets(), *restrictions()]),
             **{f"version/{name}": version for name, version in package_versions().items()},
         }
-        write_json(self.file(METRICS_FILE), everything)
+        write_json(self.file(METRICS_FILE), everything, checked=True)
         return everything
 
 
