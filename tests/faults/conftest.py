@@ -1,0 +1,9 @@
+"""Recipes' own modules, as Python finds them for a script in recipes."""
+
+from __future__ import annotations
+
+import sys
+
+from .server import RECIPES
+
+sys.path.append(str(RECIPES))

@@ -1,0 +1,295 @@
+"""Run recipes in copies of a process that has imported everything, which takes seconds, and strike them.
+
+A process forks for each order, a line of JSON, and answers with the copy's id; for ``{"wait": id}`` with its exit code.
+The copy is a recipe as a user starts it, but for Hydra's command line and for the content of pictures, which takes
+longer than all else. Recipes that others start are copies too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import resource
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import IO, Any
+
+ROOT = Path(__file__).parents[2]
+RECIPES = ROOT / "recipes"
+FOLDER = "run"  # of a run, in the working folder of its process
+OUTSIDE = "interrupted outside of the recipe"
+_OPERATIONS = ("open", "os.rename", "os.remove", "os.mkdir")  # audit events of files; open is of reading, too
+
+
+@dataclass(frozen=True)
+class Strike:
+    """A signal to a run.
+
+    Attributes:
+        number: of the signal.
+        at: before this file operation in the run folder, counted from 1.
+        after: or so many seconds after the beginning.
+    """
+
+    number: signal.Signals
+    at: int | None = None
+    after: float | None = None
+
+    def __str__(self) -> str:
+        return f"{self.number.name} " + (f"at file operation {self.at}" if self.at else f"after {self.after:.3f} s")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a run ended: its exit code, what it said, its seconds and file operations (0 if it was killed)."""
+
+    code: int
+    said: str
+    seconds: float
+    processor: float  # seconds of that, also of processes that it started
+    operations: int
+
+
+class Running:
+    """A run in a process of its own."""
+
+    def __init__(self, server: Server, place: Path, number: int) -> None:
+        self._server, self.place, self.number, self._start = server, place, number, time.monotonic()
+        self._handle = os.pidfd_open(number)
+
+    @property
+    def goes_on(self) -> bool:
+        return not select.select([self._handle], [], [], 0)[0]
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal; a process that has ended is still there until :meth:`end` asks for its exit code."""
+        os.kill(self.number, number)
+
+    def until(self, happened: Callable[[], bool]) -> None:
+        """Wait for something, or for the end of the run."""
+        while self.goes_on and not happened():
+            time.sleep(0.001)
+
+    def end(self, timeout: float = 300) -> Ended:
+        """Wait for the end, and kill what does not."""
+        if late := not select.select([self._handle], [], [], timeout)[0]:
+            self.send(signal.SIGKILL)
+        os.close(self._handle)
+        code, processor = self._server.ask({"wait": self.number})
+        seconds = time.monotonic() - self._start
+        log, count = self.place / f"log.{self.number}", self.place / f"operations.{self.number}"
+        operations = int(count.read_text()) if count.exists() else 0
+        said = log.read_text(errors="replace") + f"\nstill there after {timeout} s" * late
+        return Ended(int(code), said, seconds, processor, operations)
+
+
+class Server:
+    """The process that is copied."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, __file__]
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        # One thread, as copies of a process have no other; nothing here starts one.
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline"}
+        paths = filter(None, (str(ROOT), str(RECIPES), os.environ.get("PYTHONPATH")))
+        self._process = subprocess.Popen(command, env=environment | {"PYTHONPATH": os.pathsep.join(paths)}, **pipes)
+
+    def ask(self, order: dict[str, Any]) -> list[float]:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(json.dumps(order) + "\n")
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline())
+
+    def start(
+        self,
+        recipe: str,
+        options: Sequence[str],
+        place: Path,
+        *,
+        strike: Strike | None = None,
+        largest_file: int | None = None,
+        settings: dict[str, Any] | None = None,
+    ) -> Running:
+        """Start a recipe in the working folder ``place``, with ``run_dir=run`` there.
+
+        Args:
+            strike: of those at a file operation, what strikes.
+            largest_file: bytes that a file may have, as if the disk were full then.
+            settings: constants of the recipe's module.
+        """
+        place.mkdir(parents=True, exist_ok=True)
+        order: dict[str, Any] = {"recipe": recipe, "options": [*options, f"run_dir={FOLDER}"], "place": str(place)}
+        order |= {"largest_file": largest_file, "settings": settings or {}}
+        if strike is not None and strike.at is not None:
+            order["strike"] = [int(strike.number), strike.at]
+        return Running(self, place, int(self.ask(order)[0]))
+
+    def run(self, recipe: str, options: Sequence[str], place: Path, **more: Any) -> Ended:
+        """As :meth:`start`, to the end; a strike after some time, too."""
+        running, strike = self.start(recipe, options, place, **more), more.get("strike")
+        if strike is not None and strike.after is not None:
+            select.select([running._handle], [], [], strike.after)
+            running.send(strike.number)
+        return running.end()
+
+    def close(self) -> None:
+        self._process.communicate(timeout=60)
+
+
+@contextlib.contextmanager
+def serving() -> Iterator[Server]:
+    server = Server()
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def _load(recipe: str) -> ModuleType:
+    """A recipe's module."""
+    if (name := f"recipe_{recipe}") in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, RECIPES / f"{recipe}.py")
+    assert spec is not None and spec.loader is not None
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _watch_operations(order: dict[str, Any]) -> Callable[[], int]:
+    """Count file operations in the run folder, and strike before one of them; return the count."""
+    folder, own, count = str(Path(order["place"], FOLDER)) + os.sep, os.getpid(), 0
+    number, at = order.get("strike", (0, 0))
+
+    def watch(event: str, arguments: tuple) -> None:
+        nonlocal count
+        if event in _OPERATIONS and isinstance(arguments[0], (str, bytes, os.PathLike)) and os.getpid() == own:
+            if os.path.abspath(os.fsdecode(arguments[0])).startswith(folder):
+                count += 1
+                if count == at:
+                    os.kill(own, number)
+
+    sys.addaudithook(watch)
+    return lambda: count
+
+
+def _run(order: dict[str, Any]) -> None:
+    """Be a recipe that was ordered, and end."""
+    os.chdir(order["place"])
+    log = os.open(f"log.{os.getpid()}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    if (limit := order["largest_file"]) is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    for name, value in order["settings"].items():
+        setattr(_load(order["recipe"]), name, value)
+    operations = _watch_operations(order)
+    code = _main(order["recipe"], order["options"])
+    with contextlib.suppress(OSError):
+        Path(f"operations.{os.getpid()}").write_text(str(operations()))
+    os._exit(code)
+
+
+def _main(recipe: str, options: Sequence[str]) -> int:
+    """Call a recipe's main function as its process would; return the exit code."""
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+    from tqdm import tqdm
+
+    tqdm.set_lock(threading.RLock())  # not one of all copies, which one that is killed could keep
+    GlobalHydra.instance().clear()  # of the recipe that started this one
+    code = 0
+    try:
+        # Shells let what they start in the background ignore Ctrl-C.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        with hydra.initialize_config_dir(str(RECIPES / "config"), version_base=None):
+            config = hydra.compose(recipe, overrides=list(options))
+        _load(recipe).main(config)
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    except KeyboardInterrupt:
+        sys.stderr.write(f"{OUTSIDE}\n")
+        code = 130
+    except BaseException as error:
+        sys.excepthook(type(error), error, error.__traceback__)
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    return code
+
+
+class _Child:
+    """A recipe that another one starts, for ``subprocess.Popen``."""
+
+    def __init__(self, command: Sequence[str], *, stdout: IO, stderr: IO, cwd: Path, start_new_session: bool) -> None:
+        from _common import parent
+
+        ours, theirs = os.pipe()
+        self.number = os.fork()
+        if not self.number:
+            if start_new_session:
+                os.setsid()
+            os.dup2(ours, 0)
+            os.dup2(stdout.fileno(), 1)
+            os.dup2(stderr.fileno(), 2)
+            os.closerange(3, 1000)  # other children's pipes, and locks of run folders
+            os.environ[parent._VARIABLE] = "1"
+            os.chdir(cwd)
+            os._exit(_main(Path(command[1]).stem, command[2:]))
+        os.close(ours)
+        self.stdin = os.fdopen(theirs, "wb")
+
+    def wait(self) -> int:
+        return os.waitstatus_to_exitcode(os.waitpid(self.number, 0)[1])
+
+    def terminate(self) -> None:
+        os.kill(self.number, signal.SIGTERM)
+
+
+def _prepare() -> None:
+    """Import all recipes, and replace what takes long and decides nothing."""
+    import matplotlib.backends.backend_agg  # noqa: F401
+    from matplotlib.figure import Figure
+
+    from _common import sweeps
+    from torchrl_gn.evaluation import video
+
+    for path in sorted(RECIPES.glob("*.py")):
+        if path.stem != "gpu":
+            _load(path.stem)
+    Figure.savefig = lambda self, file, **options: Path(file).write_bytes(b"figure" * 1000)  # type: ignore
+    video._write_gif = lambda path, frames, seconds: path.write_bytes(b"video" * 1000)  # type: ignore
+    sweeps.start_child = _Child  # type: ignore
+
+
+def _serve() -> None:
+    """Fork for each line of the standard input."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal; copies listen
+    _prepare()
+    for line in sys.stdin:
+        order = json.loads(line)
+        if "wait" in order:
+            _, status, used = os.wait4(order["wait"], 0)
+            answer = [os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime]
+        elif not (answer := [os.fork()])[0]:
+            _run(order)
+        answers.write(f"{json.dumps(answer)}\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    _serve()
