@@ -38,7 +38,7 @@ from torchrl_gn.evaluation import evaluate_errors, plot_learning_curves, rollout
 from torchrl_gn.interrupts import held
 from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.training import RunFolder, load_pretrained
+from torchrl_gn.training import RunFolder, Tracker, load_pretrained
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
 MAY_CHANGE = ("rounds", "zero_shot", "threads", "device", "logger", "run_dir")
@@ -178,6 +178,7 @@ def main(cfg: DictConfig) -> None:
     if done:  # whose last may have ended before these were written
         policy = learner.averaged(run.path, len(done) - 1)
         keep_latest(learner, done[-1], policy, latest)
+        log_round(tracker, rounds[-1])
     with tqdm(total=cfg.rounds, initial=len(done), desc="rounds", leave=False) as bar:
         for index in range(len(done), cfg.rounds):
             began, start, seed = time.process_time(), time.perf_counter(), cfg.seed + 1000 * (index + 1)
@@ -205,7 +206,7 @@ def main(cfg: DictConfig) -> None:
                     task.add(trajectories, now)
                 write_json(now.numbers, rounds[-1], checked=True)
                 keep_latest(learner, now, policy, latest)
-                tracker.log({f"round/{name}": value for name, value in rounds[-1].items()}, rounds[-1]["frames"])
+                log_round(tracker, rounds[-1])
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
     assert policy is not None
@@ -217,6 +218,11 @@ def main(cfg: DictConfig) -> None:
         zero_shot = {f"zero_shot/{task.scene.name}": judge(cfg, task, kept)[1]["return"] for task in others}
     metrics = report(run, tasks, rounds, judged, zero_shot)
     finish_run(cfg, run, tracker, metrics, checkpoints=latest, step=rounds[-1]["frames"])
+
+
+def log_round(tracker: Tracker, numbers: dict[str, Any]) -> None:
+    """Log the numbers of a round."""
+    tracker.log({f"round/{name}": value for name, value in numbers.items()}, numbers["frames"])
 
 
 def keep_latest(learner: ActorCritic, last: Round, policy: BoundedPolicy, latest: list[Path]) -> None:

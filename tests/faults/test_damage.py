@@ -26,6 +26,7 @@ from .damage import DAMAGES, damage
 
 PLACES, MOST = 18, 200  # places of each damage in a file, and tries of a kind of files
 PENDULUM = load_scene("pendulum")
+NUMBERS = {"error": 0.125, "steps": 7, "of": [1.5]}
 GENERATOR = torch.Generator().manual_seed(0)
 
 
@@ -115,8 +116,8 @@ KINDS = {
         tuple(how for how in DAMAGES if how.startswith(("flipped", "zeroed"))),
     ),
     "numbers": Kind(
-        lambda folder: write_json(folder / "metrics.json", {"error": 0.125, "steps": 7, "of": [1.5]}, checked=True),
-        lambda folder: read_json(folder / "metrics.json"),
+        lambda folder: write_json(folder / "metrics.json", NUMBERS, checked=True),
+        lambda folder: {name: read_json(folder / "metrics.json")[name] for name in NUMBERS},
     ),
     "options": Kind(lambda folder: (folder / "config.yaml").write_text(OPTIONS), _read_config),
     "log": Kind(_write_log, _read_log),
