@@ -94,12 +94,12 @@ class Bench:
         if not damage(place / file, how, draw):
             shutil.rmtree(place)
             return "as it was", []
+        damaged = _content(place / file)
         ended = self._run(case, place)
         if ended.code == 0:
-            # Nothing says what a log's numbers were: what is wrong stays there and nowhere else.
-            left = [
-                each for each in self._differences(case, place, whole) if file.suffix != ".csv" or ".csv" not in each
-            ]
+            # Nothing says what a log's numbers were, and some files no later run reads: they stay as they are.
+            stays = file.suffix == ".csv" or _content(place / file) == damaged
+            left = self._differences(case, place, whole, without=file if stays else None)
             wrong = [f"other numbers: {left[:5]}"] if left else []
         else:
             logs = "".join(log.read_text(errors="replace") for log in (place / FOLDER).rglob("log.txt"))
@@ -120,8 +120,13 @@ class Bench:
             shutil.rmtree(place)
         return wrong + _traceback(ended)
 
-    def _differences(self, case: Case, place: Path, whole: Whole) -> list[str]:
-        return differences(whole.numbers, numbers_of(place, exact=case.exact))
+    def _differences(self, case: Case, place: Path, whole: Whole, *, without: Path | None = None) -> list[str]:
+        if without is not None:
+            shutil.rmtree(place / without, ignore_errors=True)
+            (place / without).unlink(missing_ok=True)
+        found = differences(whole.numbers, numbers_of(place, exact=case.exact))
+        own = "" if without is None else without.relative_to(FOLDER).as_posix()
+        return [name for name in found if name.partition(": ")[0] != own]
 
     def _place(self, name: str) -> Path:
         self._count += 1
@@ -144,6 +149,11 @@ class Bench:
     def _counted(self, ended: Ended) -> Ended:
         self.processor += ended.processor
         return ended
+
+
+def _content(path: Path) -> bytes | None:
+    """Content of a file; None if there is none."""
+    return path.read_bytes() if path.is_file() else None
 
 
 def _traceback(ended: Ended) -> list[str]:

@@ -23,7 +23,7 @@ def bench(tmp_path_factory) -> Iterator[Bench]:
         yield Bench(server, tmp_path_factory.mktemp("runs"))
 
 
-@pytest.mark.parametrize("name", ["forward_model", "contacts", "shac", "mpc", "value", "svg", "compare"])
+@pytest.mark.parametrize("name", ["forward_model", "shac", "mpc", "value", "svg", "compare"])
 def test_a_struck_run_ends_in_the_same_numbers(name, bench):
     """Two of: killed, interrupted, told to end, out of disk; of two processes at once, the second is refused."""
     draw, whole = random.Random(name), bench.whole(name)
@@ -43,7 +43,6 @@ def test_a_run_on_a_full_disk_goes_on_once_there_is_room(bench, tmp_path):
     [
         ("mpc", "gn.safetensors", "flipped in the middle", "refused"),
         ("mpc", "config.yaml", "cut in the middle", "refused"),
-        ("mpc", "metrics.json", "emptied", "read"),
         ("value", "checkpoint/checkpoint.safetensors", "zeroed in part", "read"),
         ("shac", "rounds/001/numbers.json", "flipped in the middle", "refused"),
         ("shac", "rounds/000/policy.safetensors", "cut at its end", "read"),
