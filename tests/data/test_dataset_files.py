@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from torchrl_gn.atomic import read_json, write_json
 from torchrl_gn.data import DatasetError, create_dataset, load_dataset
 from torchrl_gn.scenes import Scene
 
@@ -49,9 +49,9 @@ def test_nothing_is_written_through_links(name: str, tmp_path: Path, pendulum: S
     """As a folder of somebody else's could have, whose collection is to be gone on with."""
     theirs = tmp_path / "theirs"
     create_dataset(tmp_path / "d", pendulum, **SIZES)
-    manifest = json.loads((tmp_path / "d" / "manifest.json").read_text())
+    manifest = read_json(tmp_path / "d" / "manifest.json")
     manifest["chunks"] = {split: [] for split in manifest["chunks"]}
-    (tmp_path / "d" / "manifest.json").write_text(json.dumps(manifest))
+    write_json(tmp_path / "d" / "manifest.json", manifest)
     link = tmp_path / "d" / name
     if link.exists():
         link.rename(theirs)
