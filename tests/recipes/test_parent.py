@@ -37,7 +37,9 @@ def test_what_a_child_says_and_how_it_ends():
 def test_a_child_ends_with_what_runs_it(tmp_path, number, kind):
     (tmp_path / "sleeper.py").write_text(SLEEPS if kind == "module" else ALONE + ENDS + SLEEPS)
     inner = [sys.executable, "sleeper.py"] if kind == "recipe" else [sys.executable, parent.__file__, "sleeper"]
-    outer = ALONE + f"from parent import run_child; run_child({inner!r})"
+    # Shells let what they start in the background ignore Ctrl-C, and so would its children.
+    outer = ALONE + "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    outer += f"from parent import run_child; run_child({inner!r})"
     with subprocess.Popen([sys.executable, "-c", outer], cwd=tmp_path, stderr=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 60
         while not (tmp_path / "pid").exists() or not (text := (tmp_path / "pid").read_text()):
