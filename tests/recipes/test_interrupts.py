@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from tqdm import tqdm
 from _common import tensor_files
 from _common.episodes import Episodes
 from _common.tensor_files import load_tensors
+from torchrl_gn.atomic import read_json
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.training import ScheduledOptimizer, checkpoint, load_pretrained
@@ -31,7 +31,7 @@ def numbers_of(folder: Path) -> tuple[dict, dict]:
     """Tensors of a finished run's checkpoint, and its metrics and losses, but for times."""
     tensors, _ = read_tensors(folder / "checkpoint" / "checkpoint.safetensors")
     del tensors["description"]  # it has times and the run folder
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_json(folder / "metrics.json")
     training = load_pretrained(folder).training
     kept = {name: value for name, value in metrics.items() if not any(time in name for time in TIMES)}
     return tensors, {**kept, "losses": training["curves"]["loss"], "validated": training["progress"]["validated"]}
