@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import json
 import re
 import statistics
 import sys
@@ -44,7 +43,7 @@ from tqdm import tqdm
 from _common import clean_exit, finish_run, open_run, parent, with_help
 from _common.gpu_parts import StepParts
 from _common.parent import run_child
-from torchrl_gn.atomic import write_json
+from torchrl_gn.atomic import read_json, write_json
 from torchrl_gn.cache import keep_inductor_private
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor, specialize
@@ -242,7 +241,7 @@ def run_recipe(cfg: DictConfig, name: str, place: Path, options: Sequence[str]) 
         return {**out, "failed": (done.stdout + done.stderr)[-2000:]}
     if warned := [line for line in done.stderr.splitlines() if "Warning" in line]:  # updates without graphs, say
         out["warned"] = "\n".join(warned)[:2000]
-    metrics = json.loads((place / "metrics.json").read_text())
+    metrics = read_json(place / "metrics.json")
     tqdm.write(done.stdout)
     return out | {key: value for key, value in metrics.items() if isinstance(value, (int, float))}
 

@@ -8,8 +8,10 @@ import os
 import resource
 import signal
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import mujoco
 import pytest
@@ -244,3 +246,23 @@ def files_end_at() -> Callable[[int], AbstractContextManager]:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
     return limited
+
+
+@pytest.fixture
+def ends() -> Callable[[int, float], bool]:
+    """Whether a process is gone within seconds: a signal takes effect once its receiver is scheduled."""
+
+    def gone(process: int) -> bool:
+        try:
+            state = Path(f"/proc/{process}/stat").read_text()
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        return state.rpartition(")")[2].split()[0] == "Z"
+
+    def within(process: int, seconds: float) -> bool:
+        deadline = time.monotonic() + seconds
+        while not gone(process) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        return gone(process)
+
+    return within

@@ -61,6 +61,27 @@ def inputs_of(scene: Scene, state, control) -> StepInputs:
     return StepInputs(canonical, ControlInputs(scene)(torch.as_tensor(control)), parameters)
 
 
+def check_gradients(scene, kinds, action, weights, *, count: int, tolerance: float) -> None:
+    """Weighted sums of features have finite gradients at rest, and those of differences in ``count`` poses."""
+
+    def total(state):
+        given = inputs_of(scene, state, action)
+        return torch.stack([(each * weights[: each.shape[-1]]).sum() for each in (kind(given) for kind in kinds)]).sum()
+
+    data = mujoco.MjData(scene.model)
+    mujoco.mj_forward(scene.model, data)
+    rest = torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy()).requires_grad_()
+    assert torch.autograd.grad(total(rest), rest)[0].isfinite().all()
+    for _, state in poses(scene, count):
+        change = torch.randn(scene.num_nodes, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
+
+        def step(size, state=state, change=change):
+            return total(BODY_STATE.apply(state, size * change))
+
+        assert torch.autograd.gradcheck(step, zero, atol=tolerance, rtol=tolerance)
+
+
 def bind(feature, scene: Scene):
     return feature.resolved(scene).bind(scene, scene.layout, Canonicalizer().bind(scene, scene.layout))
 

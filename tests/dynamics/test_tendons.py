@@ -17,7 +17,7 @@ from torchrl_gn.scenes.tendons import acting_tendons, tendon_joints, tendon_laws
 
 from .. import zoo
 from ..sizes import SMALL
-from .test_force_elements import bind, inputs_of, poses
+from .test_force_elements import bind, check_gradients, inputs_of, poses
 
 _KINDS = mujoco.mjtJoint
 
@@ -168,23 +168,7 @@ def test_gradients_are_right_and_finite_at_rest():
     scene = zoo.load("lines")
     kinds = [bind(Tendons(), scene), bind(Actuators(), scene)]
     weights = torch.linspace(-1, 1, 400, dtype=torch.float64)
-
-    def total(state):
-        given = inputs_of(scene, state, np.full(6, 0.3))
-        return torch.stack([(each * weights[: each.shape[-1]]).sum() for each in (kind(given) for kind in kinds)]).sum()
-
-    data = mujoco.MjData(scene.model)
-    mujoco.mj_forward(scene.model, data)
-    rest = torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy()).requires_grad_()
-    assert torch.autograd.grad(total(rest), rest)[0].isfinite().all()
-    for _, state in poses(scene, 8):
-        change = torch.randn(scene.num_nodes, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
-
-        def step(size, state=state, change=change):
-            return total(BODY_STATE.apply(state, size * change))
-
-        assert torch.autograd.gradcheck(step, zero, atol=1e-3, rtol=1e-3)
+    check_gradients(scene, kinds, np.full(6, 0.3), weights, count=8, tolerance=1e-3)
 
 
 @pytest.mark.slow

@@ -141,14 +141,8 @@ def _compile(function: Callable) -> Callable:
     if not torch.cuda.is_available():
         # The kernels of a small graph take less time than calling them from Python.
         options["cpp_wrapper"] = True
-    return torch.compile(function, fullgraph=True, dynamic=False, options=options, **_recompile_limits())
-
-
-def _recompile_limits() -> dict[str, Any]:
-    """Options of ``torch.compile`` for a function of its own with many shapes; none with a torch before 2.13."""
-    known = inspect.signature(torch.compile).parameters
-    wanted = {"recompile_limit": 1000, "isolate_recompiles": True}
-    return {name: value for name, value in wanted.items() if name in known}
+    limits: dict[str, Any] = {"recompile_limit": 1000, "isolate_recompiles": True}  # type checkers know no overload
+    return torch.compile(function, fullgraph=True, dynamic=False, options=options, **limits)
 
 
 def _input_guards(guards: Sequence[Any]) -> list[bool]:
