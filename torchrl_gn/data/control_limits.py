@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -14,6 +15,7 @@ from torchrl_gn.data.servo_targets import position_targets
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints
+from torchrl_gn.scenes.force_elements import winding_joints
 from torchrl_gn.scenes.scene import Scene
 
 _SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # slow ones, rad/s or m/s
@@ -37,13 +39,34 @@ class ControlLimits:
 
 def slow_targets(model: mujoco.MjModel) -> np.ndarray:
     """Fastest change ``[A]`` of slow position targets, in the controls' units a second: pi rad, 1 m or the bounds."""
-    fastest, at_joints = np.ptp(model.actuator_ctrlrange, axis=1), drive_joints(model)
-    for actuator in range(model.nu):
-        joint, slope = model.actuator_trnid[actuator, 0], model.actuator_biasprm[actuator, 1]
-        if slope and at_joints[actuator] and (speed := _SPEEDS.get(int(model.jnt_type[joint]))):
-            a_unit = abs(model.actuator_gear[actuator, 0] * slope / model.actuator_gainprm[actuator, 0])
+    fastest = np.ptp(model.actuator_ctrlrange, axis=1)
+    for actuator, joint, a_unit in _servos_at_joints(model):
+        if speed := _SPEEDS.get(int(model.jnt_type[joint])):
             fastest[actuator] = min(fastest[actuator], speed * a_unit)
     return fastest
+
+
+def quarter_turns(scene: Scene) -> np.ndarray:
+    """How far ``[A]`` position targets may be from where they hold the first pose, in the controls' units.
+
+    A quarter turn of joints that may make whole turns: bodies do not show these, so that what a servo does would not
+    follow from a state in which it were more than half a turn from its target. Infinite of others.
+    """
+    winds, room = winding_joints(scene), np.full(scene.model.nu, math.inf)
+    for actuator, joint, a_unit in _servos_at_joints(scene.model):
+        if winds[joint]:
+            room[actuator] = math.pi / 2 * a_unit
+    return room
+
+
+def _servos_at_joints(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:
+    """Position servos of joints: their number, the joint, and the change of control of a unit of its coordinate."""
+    at_joints = drive_joints(model)
+    for actuator in range(model.nu):
+        slope = model.actuator_biasprm[actuator, 1]
+        if slope and at_joints[actuator]:
+            a_unit = abs(model.actuator_gear[actuator, 0] * slope / model.actuator_gainprm[actuator, 0])
+            yield actuator, int(model.actuator_trnid[actuator, 0]), float(a_unit)
 
 
 def find_control_limits(simulator: Simulator, rest: np.ndarray, knot_interval: float) -> ControlLimits:

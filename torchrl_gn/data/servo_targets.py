@@ -38,7 +38,8 @@ def position_targets(
 ) -> np.ndarray:
     """Targets ``[n, T, A]`` from ``start`` ``[n, A]`` on, within a random interval around it.
 
-    Its ``width`` ``[n, A]`` is a share of the bounds. Targets change by at most ``fastest`` ``[n, A]`` a step.
+    Its ``width`` ``[n, A]`` is a share of the bounds, each ``[A]`` or ``[n, A]``. Targets change by at most ``fastest``
+    ``[n, A]`` a step.
     """
     from scipy.interpolate import CubicSpline  # here, as importing it takes a second
 
@@ -50,7 +51,7 @@ def position_targets(
     spline = CubicSpline(np.arange(knots), values, bc_type="clamped")  # at rest at both ends
     interval = np.maximum(knot_interval, _peak_slope(spline.c) / fastest)
     time = np.arange(steps)[:, None] / interval[:, None]
-    return np.clip(evaluate_cubics(spline.c, time), low, high)
+    return np.clip(evaluate_cubics(spline.c, time), low[..., None, :], high[..., None, :])
 
 
 def _peak_slope(coefficients: np.ndarray) -> np.ndarray:

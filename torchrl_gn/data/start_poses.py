@@ -34,8 +34,8 @@ class StartPoses:
 
     The reference pose is the keyframe ``home``, else ``stand``, else the first, else ``qpos0``; a joint beyond its
     limits moves to the nearest, or to their middle if it is far beyond. Half of the draws (``Scene.wide_starts``)
-    perturb it widely: joints uniform within their limits, unlimited hinges and balls in every direction. The others
-    stay within 30 % of that.
+    perturb it widely: joints uniform within their limits, unlimited hinges and balls in every direction, hinges of more
+    than a turn within half a turn, as bodies do not show more. The others stay within 30 % of that.
 
     - Free bodies turn about the vertical and shift by up to their size; bases of robots tilt by up to 0.5 rad. Without
       gravity, or where they can touch nothing fixed, they stay in place in any orientation.
@@ -143,8 +143,11 @@ class StartPoses:
         for joint in range(model.njnt):
             first, dof, (low, high) = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_range[joint]
             match model.jnt_type[joint], bool(model.jnt_limited[joint]):
-                case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE), True):
-                    changes[:, dof] = spread * (rng.uniform(low, high, n) - self._reference[first])
+                case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE) as of, True):
+                    here = self._reference[first]
+                    if of == kind.mjJNT_HINGE and high - low > 2 * np.pi:  # bodies do not show whole turns
+                        low, high = max(low, here - np.pi), min(high, here + np.pi)
+                    changes[:, dof] = spread * (rng.uniform(low, high, n) - here)
                 case kind.mjJNT_HINGE, False:
                     changes[:, dof] = spread * rng.uniform(-np.pi, np.pi, n)
                 case kind.mjJNT_BALL, limited:
