@@ -45,11 +45,10 @@ BOUNDS = {torch.float64: 1e-10, torch.float32: 1e-4}
 
 def cases() -> list:
     """Executor, system, model, batches, whether each sample has parameters of its own, and dtype."""
-    systems, batches = [*SYSTEMS, "joints", "crawler"], [(), (1,), (5,)]
-    found: list = []
-    for each in itertools.product(systems, MODELS):
-        if each[0] == "crawler" and each[1] != "gn":
-            continue
+    batches, found = [(), (1,), (5,)], []
+    # State maths are the system's and networks the core's: every one of both, not every pair.
+    pairs = [*itertools.product([*SYSTEMS, "joints", "crawler"], ["gn"]), *itertools.product(["swimmer6"], MODELS)]
+    for each in dict.fromkeys(pairs):
         for dtype in BOUNDS:
             found += [(executor, *each, batches, False, dtype) for executor in ("eager", "native")]
             found += [(executor, *each, [(5,), (2, 1)], True, dtype) for executor in ("eager", "native")]

@@ -312,13 +312,13 @@ def test_numbers_that_change_make_a_figure_stale(report, finished):
 
 
 @pytest.mark.slow
-def test_recipe_adds_writes_and_checks(run, report, finished):
+def test_recipe_adds_writes_and_checks(run, call, report, finished):
     folder = f"folder={report}"
     code, said, _ = run(f"add={finished}", "to=errors", folder, recipe="report")
     assert code == 0 and said.splitlines()[:2] == ["error", "far"]
-    code, _, errors = run("check=true", folder, recipe="report")
+    code, _, errors = call("check=true", folder, recipe="report")
     assert code == 1 and "README.md" in errors and "errors.png" in errors
-    assert run(folder, recipe="report")[0] == 0
-    assert run("check=true", folder, recipe="report")[0] == 0
+    assert call(folder, recipe="report")[0] == 0
+    assert call("check=true", folder, recipe="report")[0] == 0
     (report.parent / "images" / "results" / "errors.png").unlink()
-    assert run("check=true", folder, recipe="report")[0] == 1
+    assert call("check=true", folder, recipe="report")[0] == 1

@@ -52,7 +52,7 @@ def test_values_come_back_as_hydra_reads_them(compose):
 
 
 @pytest.mark.slow
-def test_a_robot_of_ones_own_learns_from_the_first_model_on(tmp_path, run):
+def test_a_robot_of_ones_own_learns_from_the_first_model_on(tmp_path, call):
     shutil.copy(PENDULUM, tmp_path / "my pole.xml")
     options = (
         f"system={override(str(tmp_path / 'my pole.xml'))}",
@@ -69,14 +69,13 @@ def test_a_robot_of_ones_own_learns_from_the_first_model_on(tmp_path, run):
         "training=['data.train=20','data.validation=5','data.test=5','model.hidden=8']",
         f"run_dir={tmp_path / 'run'}",
     )
-    code, output, errors = run(*options, recipe="plan_and_learn")
+    code, output, errors = call(*options, recipe="plan_and_learn")
     assert code == 0, errors
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert {f"{of}/mean_reward" for of in ("round 0", "round 1", "nothing")} <= set(metrics)
     assert "| nothing |" in output and (tmp_path / "run/executed1/gn.gif").exists()
     before = (tmp_path / "run/executed1/gn.safetensors").read_bytes()
-    for rounds in 1, 2:
-        code, output, errors = run(*options, f"rounds={rounds}", recipe="plan_and_learn")
-        assert code == 0, errors
+    code, output, errors = call(*options, "rounds=2", recipe="plan_and_learn")
+    assert code == 0, errors
     assert (tmp_path / "run/executed1/gn.safetensors").read_bytes() == before  # a finished round is kept
     assert "| round 2 |" in output and "| nothing |" in output
