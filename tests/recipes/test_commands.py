@@ -87,7 +87,9 @@ def test_commands_are_understood(page, tmp_path, monkeypatch, capsys):
                     main(words)
                 elif program not in ("ray", "git"):
                     place = next((index for index, word in enumerate(words) if word.startswith("recipes/")), None)
-                    if place is None:
+                    if words[0] == "-m":
+                        assert (ROOT / f"{words[1].replace('.', '/')}.py").is_file(), words
+                    elif place is None:
                         assert words[0] == "-" or (ROOT / words[0]).is_file(), words
                     else:
                         check_options(Path(words[place]).stem, words[place + 1 :])
