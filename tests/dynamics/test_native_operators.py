@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.dynamics import SpecializedPredictor, specialize
+from torchrl_gn.dynamics.executors.native.structure import seal
 from torchrl_gn.networks.packed_layers import PackedLayers
 
 from ..compiling import compiles
@@ -295,7 +296,11 @@ REFUSED = {
     "no structure": ({"structure": damaged(0, 0)}, "damaged"),
     "another format": ({"structure": damaged(1, 99)}, "of another version"),
     "cut off": ({"structure": lambda words: words[:-1]}, "damaged"),
-    "short": ({"structure": lambda words: words[:3]}, "contiguous int64"),
+    "short": ({"structure": lambda words: words[:3]}, "damaged"),
+    "another word": (
+        {"structure": lambda words: words + (torch.arange(len(words)) == len(words) - 1)},
+        "the sum of all",
+    ),
     "floating-point words": ({"structure": lambda words: words.double()}, "contiguous int64"),
     "words apart": ({"structure": lambda words: words.repeat_interleave(2)[::2]}, "contiguous int64"),
     "fewer weights": ({"weights": lambda weights: weights[1:]}, "packed weights do not fit"),
@@ -352,8 +357,102 @@ def test_states_and_actions_that_do_not_fit_are_refused(quick, inputs):
             OPS.rollout_adjoint(states, *rest, other, True, 1, False)
     with pytest.raises(ValueError, match="one step alone"):
         OPS.rollout_keeping(state, actions, *model(predictor).values(), 13, True, 1, 2)
-    with pytest.raises(ValueError, match="do not have the shapes given"):
-        OPS.pack(torch.zeros(14), [3, 5], True)
+    for gradient in (states.mT, states.half(), states[0]):
+        with pytest.raises(ValueError, match="gradient does not fit"):
+            OPS.rollout_adjoint(gradient, *rest, kept, True, 1, False)
+    with pytest.raises(ValueError, match="is of another call"):
+        OPS.rollout_adjoint(states, *rest, kept, True, 3, False)  # threads that share the samples otherwise
+    for keep in (-1, 3):
+        with pytest.raises(ValueError, match="0, 1 or 2"):
+            OPS.rollout_keeping(state, actions, *model(predictor).values(), 13, True, 1, keep)
+    with pytest.raises(ValueError, match="channels"):
+        rollout(predictor, state, actions, channels=2**62 + 13)
+
+
+@pytest.mark.parametrize("weights", [False, True])
+@pytest.mark.parametrize(
+    ("count", "shapes", "message"),
+    [
+        (14, [3, 5], "do not have the shapes given"),
+        (15, [3, 5, 7], "rows and columns"),
+        (0, [2, 8, -4, 4], r"\[-4, 4\]"),
+        (15, [-3, -5], r"\[-3, -5\]"),
+        (0, [2**32, 2**32], "No matrix to pack"),  # a product that is 0 in 64 bits
+        (0, [2**28, 2**28] * 256, "No matrix to pack"),
+    ],
+)
+def test_shapes_to_pack_that_do_not_fit_are_refused(count, shapes, message, weights):
+    for device in ("cpu", "meta"):
+        with pytest.raises(ValueError, match=message):
+            OPS.pack(torch.zeros(count, device=device), shapes, weights)
+
+
+def forged(words: torch.Tensor, part: str) -> torch.Tensor:
+    """Another structure with the right sum, as structure.h has its parts."""
+    words = words.clone()
+    network, maths = int(words[4]), int(words[5])
+    layers = int(words[network + 3])
+    gather = int(words[layers + 8])
+    places = {
+        "header": (4, 2**40),
+        "network": (network + 6, 2**40),  # numbers of a sample
+        "layer": (layers + 12, 16),  # place of its weights
+        "gather": (int(words[gather + 8]), 99),  # an item
+        "order of gradients": (gather + 5, 1 - int(words[gather + 5])),  # whether it overwrites
+        "state maths": (int(words[maths + 14]), 99),  # a channel that varies
+        "tape": (int(words[maths + 18]), 27),  # an instruction
+    }
+    index, value = places[part]
+    words[index] = value
+    seal(words.numpy())
+    return words
+
+
+@pytest.mark.parametrize("part", ["header", "network", "layer", "gather", "order of gradients", "state maths", "tape"])
+def test_a_structure_that_would_leave_its_memory_is_refused(quick, inputs, part):
+    predictor = quick("pendulum")
+    state, actions = inputs(predictor, 3)
+    with pytest.raises(ValueError, match=rf"damaged \((a|the) {part}\)"):
+        rollout(predictor, state, actions, structure=forged(predictor.executor.structure, part))
+
+
+def test_a_structure_is_checked_again_when_it_is_written_to(quick, inputs):
+    predictor = quick("pendulum")
+    state, actions = inputs(predictor, 3)
+    words = predictor.executor.structure.clone()
+    expected = rollout(predictor, state, actions, structure=words)
+    words.numpy()[100:] = -1  # of which torch does not know: the copy is used that was checked
+    assert torch.equal(rollout(predictor, state, actions, structure=words), expected)
+    words[100] = -1
+    with pytest.raises(ValueError, match="damaged"):
+        rollout(predictor, state, actions, structure=words)
+    words.copy_(predictor.executor.structure)
+    assert torch.equal(rollout(predictor, state, actions, structure=words), expected)
+
+
+def test_a_change_has_no_rollout(wide, inputs):
+    bound = wide("pendulum")
+    trained, (state, actions) = bound.prepared_for_training(), inputs(bound, 3)
+    core = trained.program.core
+    given = trained.executor.structure, core.weights, core.tables, core.sample_tables, core.numbers
+    for operator, rest in ((OPS.rollout, ()), (OPS.rollout_keeping, (1,))):
+        with pytest.raises(ValueError, match="has no rollout"):
+            operator(state, actions, *given, 12, True, 1, *rest)
+
+
+def test_tensors_without_memory_are_refused(quick, inputs):
+    """As sharded training leaves them: torch itself reads beyond their storage."""
+    predictor = quick("pendulum")
+    state, actions = inputs(predictor, 3)
+    given = {"state": state, "actions": actions, **model(predictor)}
+    for name, tensor in given.items():
+        for share in (0, 0.5):
+            if tensor is None or not tensor.numel():
+                continue
+            short = tensor.clone()
+            short.untyped_storage().resize_(int(share * short.untyped_storage().nbytes()))
+            with pytest.raises(ValueError, match="less memory than numbers"):
+                OPS.rollout(*(given | {name: short}).values(), 13, True, 1)
 
 
 def test_a_structure_is_the_same_wherever_it_lies(quick, inputs):
@@ -369,7 +468,7 @@ def test_each_call_may_have_its_own_threads(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 30)
     expected = pull(predictor, state, actions)[0]
-    for threads in (0, 1, 5, 100):
+    for threads in (0, 1, 5, 100, 2**63 - 1, -(2**63)):
         assert torch.equal(rollout(predictor, state, actions, threads=threads), expected)
 
 
@@ -380,3 +479,11 @@ def test_predictions_under_another_dispatch(quick, inputs):
     given = {name: None if each is None else each.to("meta") for name, each in model(predictor).items()}
     out = functools.partial(OPS.rollout, state.to("meta"))(actions.to("meta"), *given.values(), 13, True, 1)
     assert out.is_meta and out.shape == (3, 4, *state.shape[1:])
+    for name in given:
+        if given[name] is not None:
+            with pytest.raises(NotImplementedError, match="meta device"):
+                rollout(predictor, state, actions, **{name: given[name]})
+    for few in (state[0, 0, 0], state[0, 0], state[0]):
+        for many in (False, True):
+            with pytest.raises(ValueError, match="do not fit"):
+                OPS.rollout(few.to("meta"), actions.to("meta"), *given.values(), 13, many, 1)

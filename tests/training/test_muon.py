@@ -188,3 +188,23 @@ def test_what_is_no_matrix_and_bad_rates_are_named():
         Muon(matrix, lr=-1)
     with pytest.raises(ValueError, match="momentum=1 must be from 0 to below 1"):
         Muon(matrix, momentum=1)
+
+
+@pytest.mark.skipif(build.find_compiler() is None, reason="needs a C++ compiler")
+def test_matrices_in_the_memory_of_others_are_refused():
+    update, rest = muon.load_operators().muon_, (0.9, 0.1, [3.0, -4.0, 2.0], 1)
+    whole, grads, moments = torch.ones(7), [torch.ones(2, 3), torch.ones(2, 2)], [torch.ones(2, 3), torch.ones(2, 2)]
+    apart, behind = torch.ones(2, 3), torch.ones(2, 2)
+    for given in (
+        ([whole[:6].view(2, 3), whole[3:].view(2, 2)], grads, moments),
+        ([apart, behind], [grads[0], behind], moments),
+        ([apart, behind], grads, [apart, moments[1]]),
+        ([apart, apart], [grads[0]] * 2, [moments[0], torch.ones(2, 3)]),
+    ):
+        with pytest.raises(ValueError, match="share memory"):
+            update(*given, *rest)
+    with pytest.raises(RuntimeError, match="no_grad"):
+        update([apart.clone().requires_grad_()], grads[:1], moments[:1], *rest)
+    one = [torch.ones(2, 3) for _ in range(2)]
+    update(one, [grads[0]] * 2, [torch.ones(2, 3) for _ in range(2)], *rest)  # one gradient, which is only read
+    assert torch.equal(*one) and (one[0] != 1).any()

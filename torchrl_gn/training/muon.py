@@ -80,7 +80,6 @@ class Muon(torch.optim.Optimizer):
             changed = [parameters[index] for index in indices]
             gradients, means = [each.grad for each in changed], [moments[index] for index in indices]
             operators.muon_(changed, gradients, means, group["momentum"], group["lr"], polynomials, native_threads())
-            torch.autograd.graph.increment_version(changed)
         return rest
 
     def _update(self, parameters: Sequence[Tensor], moments: Sequence[Tensor], group: dict[str, Any]) -> None:

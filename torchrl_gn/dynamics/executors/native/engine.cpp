@@ -2,6 +2,7 @@
 
 #include "muon.h"
 #include "rollout.h"
+#include "structure_check.h"
 
 namespace gn {
 
@@ -24,6 +25,8 @@ bool has_bfloat16() {
   return false;
 #endif
 }
+
+void check(const int64_t* words, int64_t count) { StructureCheck::run(words, count); }
 
 bool run(const Structure& structure, const Weights& weights, const Call& call, bool adjoint) {
   return with_network(structure, weights, [&](const auto& network) { return run(structure, network, call, adjoint); });

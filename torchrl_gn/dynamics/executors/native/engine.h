@@ -29,8 +29,9 @@ struct MuonOptions {
   int64_t count;
 };
 
-// Errors are C++ exceptions: std::bad_alloc if there is no memory.
+// Errors are C++ exceptions: std::bad_alloc if there is no memory, std::invalid_argument of words that are no structure.
 bool has_bfloat16();
+void check(const int64_t* words, int64_t count);
 bool run(const Structure& structure, const Weights& weights, const Call& call, bool adjoint);
 int64_t stored_count(const Structure& structure, const Weights& weights, const Call& call);
 void muon(Type type, const std::vector<MuonMatrix>& matrices, const MuonOptions& options, int64_t threads);

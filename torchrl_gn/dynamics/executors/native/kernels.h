@@ -37,7 +37,7 @@ template <class T>
 struct Vector {
   typedef T type __attribute__((vector_size(kVectorBytes)));
   typedef T loose __attribute__((vector_size(kVectorBytes), aligned(sizeof(T)), may_alias));  // at any address
-  typedef std::conditional_t<sizeof(T) == 4, int32_t, int64_t> integer;
+  typedef std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> integer;  // bits of a NaN may overflow
   typedef integer integers __attribute__((vector_size(kVectorBytes)));
 
   static type load(const T* from) { return *reinterpret_cast<const loose*>(from); }

@@ -3,6 +3,7 @@
 // rollout(state [*B, N, C], actions [*B, (T,) A], ...) gives the next state, or with `many` the states [*B, T + 1, N, C].
 // `structure` is the array of structure.h; `weights` and `tables` are packed by pack(), `sample_tables` and `numbers`
 // by executor.py. Gradients are of first order, in state, actions, weights and tables.
+#include <ATen/EmptyTensor.h>
 #include <ATen/Parallel.h>
 #include <ATen/core/dispatch/Dispatcher.h>
 #include <ATen/core/grad_mode.h>
@@ -14,9 +15,13 @@
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
+#include <algorithm>
 #include <mutex>
 #include <new>
+#include <stdexcept>
 #include <tuple>
+#include <unordered_map>
+#include <utility>
 #include <vector>
 
 #include "engine.h"
@@ -28,6 +33,7 @@ using OptionalTensor = std::optional<Tensor>;
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
+constexpr int64_t kMostThreads = 1024, kMostSteps = int64_t(1) << 32;
 constexpr int64_t kMostStored = int64_t(1) << 28;  // bytes that are kept for a gradient; else steps are computed again
 
 // Memory of large results that is used again: fresh pages cost as much as filling them.
@@ -55,7 +61,15 @@ class Pool {
     size_t size;
   };
   static std::mutex& lock() { static auto* one = new std::mutex; return *one; }
-  static std::vector<Block>& free() { static auto* blocks = new std::vector<Block>; return *blocks; }
+  static constexpr size_t kKept = 2;
+  static std::vector<Block>& free() {
+    static auto* blocks = [] {
+      auto* none = new std::vector<Block>;
+      none->reserve(kKept + 1);  // add() must not fail: it is called as tensors end
+      return none;
+    }();
+    return *blocks;
+  }
   static std::pair<void*, size_t> find(size_t bytes) {
     {
       std::lock_guard<std::mutex> guard(lock());
@@ -74,7 +88,7 @@ class Pool {
   static void add(void* data, size_t size) {
     std::lock_guard<std::mutex> guard(lock());
     free().push_back({data, size});
-    if (free().size() > 2) {
+    if (free().size() > kKept) {
       std::free(free().front().data);
       free().erase(free().begin());
     }
@@ -88,17 +102,82 @@ struct Model {
   const Tensor& numbers;
 };
 
-gn::Structure words_of(const Tensor& structure) {
-  TORCH_CHECK_VALUE(structure.is_cpu() && structure.scalar_type() == at::kLong && structure.is_contiguous() &&
-                        structure.dim() == 1 && structure.numel() > int64_t(sizeof(gn::HeaderWords) / 8),
-                    "The structure of a native step must be contiguous int64 numbers on the processor.");
-  const gn::Structure words{structure.const_data_ptr<int64_t>()};
-  const gn::HeaderWords& header = words.header();
-  TORCH_CHECK_VALUE(header.magic == gn::kMagic && header.format == gn::kFormat &&
-                        header.operations == gn::kOperations && header.words == structure.numel(),
-                    "The structure of a native step is damaged, or of another version: specialise the model again.");
-  return words;
+// Refuses a tensor on the processor whose numbers do not all lie in its memory, which resizing a storage brings about.
+void check_memory(const Tensor& tensor) {
+  const size_t size = tensor.element_size(), offset = tensor.storage_offset(), count = tensor.numel();
+  const c10::Storage& storage = tensor.unsafeGetTensorImpl()->unsafe_storage();
+  const size_t bytes = tensor.is_contiguous()
+                           ? (offset + count) * size
+                           : at::detail::computeStorageNbytes(tensor.sizes(), tensor.strides(), size, offset);
+  const bool aligned = (reinterpret_cast<uintptr_t>(storage.data()) & (size - 1)) == 0;  // sizes are powers of two
+  TORCH_CHECK_VALUE(count == 0 || (bytes <= storage.nbytes() && aligned),
+                    "A tensor of the shape ", tensor.sizes(), " has less memory than numbers, or none aligned to them.");
 }
+
+// Structures that were checked, as copies that nobody can change. One that is written to is checked again, if torch knows
+// of it: not by numpy or in inference mode, for example, after which the copy is used.
+class Structures {
+ public:
+  // Until the same thread asks for another.
+  static gn::Structure of(const Tensor& structure) {
+    TORCH_CHECK_VALUE(structure.is_cpu() && structure.scalar_type() == at::kLong && structure.is_contiguous() &&
+                          structure.dim() == 1 && structure.numel() > 0,
+                      "The structure of a native step must be contiguous int64 numbers on the processor.");
+    check_memory(structure);
+    static thread_local Known last;  // found without waiting for other threads
+    const Known given{structure};
+    if (!last.is(given)) last = find(given, structure.storage());
+    return {last.words.const_data_ptr<int64_t>()};
+  }
+
+ private:
+  struct Known {
+    const int64_t* begin = nullptr;
+    int64_t count = 0;
+    uint32_t version = 0;
+    const c10::StorageImpl* storage = nullptr;
+    std::optional<c10::weak_intrusive_ptr<c10::StorageImpl>> kept;  // so that no other storage has its address
+    Tensor words;
+
+    Known() = default;
+    explicit Known(const Tensor& structure)
+        : begin(structure.const_data_ptr<int64_t>()),
+          count(structure.numel()),
+          version(structure.is_inference() ? 0 : structure.unsafeGetTensorImpl()->version_counter().current_version()),
+          storage(structure.unsafeGetTensorImpl()->unsafe_storage().unsafeGetStorageImpl()) {}
+    bool is(const Known& other) const {
+      return begin == other.begin && count == other.count && version == other.version && storage == other.storage;
+    }
+  };
+  static Known find(Known given, const c10::Storage& storage) {
+    {
+      std::lock_guard<std::mutex> guard(lock());
+      const auto found = known().find(given.begin);
+      if (found != known().end() && found->second.is(given)) return found->second;
+    }
+    given.kept = storage.getWeakStorageImpl();
+    given.words = Pool::empty({given.count}, at::kLong);
+    std::copy_n(given.begin, given.count, given.words.data_ptr<int64_t>());
+    try {
+      gn::check(given.words.const_data_ptr<int64_t>(), given.count);
+    } catch (const std::invalid_argument& part) {
+      TORCH_CHECK_VALUE(false, "The structure of a native step is damaged (", part.what(),
+                        "), or of another version: specialise the model again.");
+    }
+    std::lock_guard<std::mutex> guard(lock());
+    for (auto each = known().begin(); each != known().end();)
+      each = each->second.kept->expired() ? known().erase(each) : std::next(each);
+    known().insert_or_assign(given.begin, given);
+    return given;
+  }
+  static std::mutex& lock() { static auto* one = new std::mutex; return *one; }
+  static std::unordered_map<const int64_t*, Known>& known() {
+    static auto* all = new std::unordered_map<const int64_t*, Known>;
+    return *all;
+  }
+};
+
+bool needs(const Tensor& tensor) { return tensor.defined() && tensor.requires_grad(); }
 
 bool is_number(const Tensor& tensor) { return tensor.scalar_type() == at::kFloat || tensor.scalar_type() == at::kDouble; }
 
@@ -116,14 +195,16 @@ void check_model(const gn::Structure& words, const Model& model, int64_t batch) 
   const auto& own = model.sample_tables;
   const bool has_own = own.has_value() && own->defined();
   TORCH_CHECK_VALUE(has_own == (network.sample_tables > 0) &&
-                        (!has_own || (own->numel() == batch * network.sample_tables && own->is_contiguous() &&
-                                      own->scalar_type() == model.tables.scalar_type())),
+                        (!has_own || (own->numel() % batch == 0 && own->numel() / batch == network.sample_tables &&
+                                      own->is_contiguous() && own->scalar_type() == model.tables.scalar_type())),
                     "There must be tables of each sample.");
   const Tensor& numbers = model.numbers;
   TORCH_CHECK_VALUE(numbers.scalar_type() == at::kDouble && numbers.is_contiguous() && numbers.dim() == 2 &&
                         (numbers.size(0) == 1 || numbers.size(0) == batch) && numbers.size(1) == words.maths(0)->numbers,
                     "The numbers of the native step have another shape than its structure.");
   TORCH_CHECK_NOT_IMPLEMENTED(!paired || gn::has_bfloat16(), "This processor multiplies no bfloat16.");
+  for (const Tensor* each : {&model.weights, &model.tables, &numbers}) check_memory(*each);
+  if (has_own) check_memory(*own);
 }
 
 gn::Array array(const Tensor& tensor) {
@@ -136,7 +217,7 @@ gn::Weights weights_of(const Model& model) {
           model.weights.const_data_ptr(), model.tables.const_data_ptr()};
 }
 
-int64_t thread_count(int64_t threads) { return threads > 0 ? threads : at::get_num_threads(); }
+int64_t thread_count(int64_t threads) { return std::min(threads > 0 ? threads : at::get_num_threads(), kMostThreads); }
 
 // A call for contiguous states and actions: a start state each, or all states of a rollout.
 struct Prepared {
@@ -146,7 +227,7 @@ struct Prepared {
   gn::Call call{};
 
   Prepared(const Tensor& states, const Tensor& actions, const Model& model, bool starts_alone, bool many, int64_t threads)
-      : words(words_of(model.structure)), maths(*words.maths(0)), weights(weights_of(model)) {
+      : words(Structures::of(model.structure)), maths(*words.maths(0)), weights(weights_of(model)) {
     TORCH_CHECK_NOT_IMPLEMENTED(is_number(states) && is_number(actions) && states.numel() && states.is_cpu() &&
                                     actions.is_cpu(),
                                 "A native step is of float32 or float64 on the processor.");
@@ -155,8 +236,10 @@ struct Prepared {
                           states.size(-2) * maths.channels == maths.size && actions.size(-1) == maths.actions &&
                           states.sizes().slice(0, batch_dims) == actions.sizes().slice(0, batch_dims),
                       "States or actions do not fit the native step: ", states.sizes(), " and ", actions.sizes(), ".");
+    TORCH_CHECK_VALUE(maths.is_state || !many, "The change of a native step has no rollout.");
     call.steps = many ? actions.size(-2) : 1;
     TORCH_CHECK_NOT_IMPLEMENTED(call.steps, "A native rollout has a step.");
+    TORCH_CHECK_VALUE(call.steps <= kMostSteps, "A native rollout has at most ", kMostSteps, " steps.");
     const int64_t rows = sample_dims == 3 ? states.size(-3) : 1;
     TORCH_CHECK_VALUE(sample_dims == 2 || rows == call.steps + 1, "States do not fit the native step: a gradient needs all.");
     call.batch = states.numel() / (maths.size * rows);
@@ -171,7 +254,10 @@ struct Prepared {
     call.number_stride = model.numbers.size(0) > 1 ? model.numbers.size(1) : 0;
     if (words.network().sample_tables) call.sample_tables = model.sample_tables->const_data_ptr();
   }
-  int64_t stored_count() const { return gn::stored_count(words, weights, call); }
+  int64_t channels() const { return maths.result_size / (maths.size / maths.channels); }  // of a result
+  // With one number more, the last, that says how the others lie.
+  int64_t stored_count() const { return gn::stored_count(words, weights, call) + 1; }
+  double stored_order() const { return double(call.tile + (call.keeps_all ? 2 * gn::kTile : 0)); }
   void run(bool adjoint) const {
     TORCH_CHECK_NOT_IMPLEMENTED(gn::run(words, weights, call, adjoint), "The native step has no maths for such states.");
   }
@@ -189,11 +275,15 @@ enum Keep : int64_t { kNothing, kSlopes, kAll };
 // The result, and with `keep` what a gradient needs: slopes, for that in states, or the only step's activations too.
 Tensor run(const Tensor& state_, const Tensor& actions_, const Model& model, int64_t channels, bool many, int64_t threads,
            Keep keep, Tensor* stored) {
+  check_memory(state_), check_memory(actions_);
   const Tensor state = state_.contiguous(), actions = actions_.contiguous();
   Prepared prepared(state, actions, model, true, many, threads);
   gn::Call& call = prepared.call;
-  TORCH_CHECK_VALUE(prepared.maths.result_size == state.size(-2) * channels, "The native step gives no ", channels,
-                    " channels.");
+  const int64_t size = prepared.maths.result_size;
+  TORCH_CHECK_VALUE(0 < channels && channels <= size && state.size(-2) * channels == size, "The native step gives no ",
+                    channels, " channels.");
+  TORCH_CHECK_VALUE(kNothing <= keep && keep <= kAll, "A native step keeps nothing, slopes or all: 0, 1 or 2, not ",
+                    int64_t(keep), ".");
   const Tensor out = many || channels != state.size(-1)
                          ? Pool::empty(result_shape(state, actions, channels, many), state.scalar_type())
                          : at::empty_like(state);
@@ -205,6 +295,7 @@ Tensor run(const Tensor& state_, const Tensor& actions_, const Model& model, int
     if (keep == kAll || count * model.tables.element_size() <= kMostStored)
       *stored = Pool::take(count, model.tables.scalar_type());
     call.stored = stored->numel() ? stored->data_ptr() : nullptr;
+    if (stored->numel()) array(*stored).set(count - 1, prepared.stored_order());
   }
   prepared.run(false);
   return out;
@@ -235,13 +326,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
                                                            const OptionalTensor& sample_tables, const Tensor& numbers,
                                                            const Tensor& stored, bool many, int64_t threads,
                                                            bool of_weights) {
+  for (const Tensor* each : {&gradient_, &states_, &actions_, &stored}) check_memory(*each);
   const Tensor gradient = gradient_.contiguous(), states = states_.contiguous(), actions = actions_.contiguous();
   const Model model{structure, weights, tables, sample_tables, numbers};
   Prepared prepared(states, actions, model, false, many, threads);
-  const int64_t rows = prepared.call.steps + many;
-  TORCH_CHECK_VALUE(is_number(gradient) &&
-                        gradient.numel() == prepared.call.batch * rows * prepared.maths.result_size,
-                    "The gradient does not fit the native step: ", gradient.sizes(), ".");
+  std::vector<int64_t> wanted = states.sizes().vec();
+  wanted.back() = prepared.channels();
+  TORCH_CHECK_VALUE(is_number(gradient) && gradient.sizes() == wanted, "The gradient does not fit the native step: ",
+                    gradient.sizes(), " of ", gradient.scalar_type(), ".");
   const Tensor nothing = at::empty({0}, tables.options());
   std::vector<int64_t> shape = states.sizes().vec();
   if (many) shape.erase(shape.end() - 3);
@@ -257,8 +349,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
     call.keeps_all = stored.numel() > 0;
     call.tile = std::min(gn::kTile, call.batch);
   }
-  TORCH_CHECK_VALUE(stored.numel() == 0 || (stored.numel() == prepared.stored_count() &&
-                                            stored.scalar_type() == tables.scalar_type() && stored.is_contiguous()),
+  TORCH_CHECK_VALUE(stored.numel() == 0 || (stored.numel() == prepared.stored_count() && !(call.keeps_all && many) &&
+                                            stored.scalar_type() == tables.scalar_type() && stored.is_contiguous() &&
+                                            array(stored).get(stored.numel() - 1) == prepared.stored_order()),
                     "What the native step kept for its gradient is of another call.");
   if (stored.numel()) call.stored = stored.data_ptr();
   prepared.run(true);
@@ -267,13 +360,20 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
 
 int64_t panels(int64_t width) { return (width + gn::kPanel - 1) / gn::kPanel; }
 
-int64_t packed_count(at::IntArrayRef shapes, bool weights) {
-  int64_t count = 0;
-  for (size_t i = 0; i + 1 < shapes.size(); i += 2) {
+// How many numbers matrices [rows, columns] of `shapes` have, and how many once packed.
+std::pair<int64_t, int64_t> packed_counts(at::IntArrayRef shapes, bool weights) {
+  constexpr int64_t kMost = int64_t(1) << 28;  // of rows or columns, so that products are numbers
+  TORCH_CHECK_VALUE(shapes.size() % 2 == 0, "Shapes to pack are rows and columns of each matrix: not ", shapes.size(),
+                    " numbers.");
+  int64_t plain = 0, packed = 0;
+  for (size_t i = 0; i < shapes.size(); i += 2) {
     const int64_t rows = shapes[i], columns = shapes[i + 1];
-    count += gn::kPanel * (weights ? panels(rows) * columns + panels(columns) * rows : rows * panels(columns));
+    TORCH_CHECK_VALUE(0 <= rows && rows <= kMost && 0 <= columns && columns <= kMost && packed <= int64_t(1) << 61,
+                      "No matrix to pack has the shape [", rows, ", ", columns, "].");
+    plain += rows * columns;
+    packed += gn::kPanel * (weights ? panels(rows) * columns + panels(columns) * rows : rows * panels(columns));
   }
-  return count;
+  return {plain, packed};
 }
 
 // Matrices [rows, columns] of `shapes`, whose numbers come one after the other, as the engine reads them. Weights as
@@ -281,10 +381,10 @@ int64_t packed_count(at::IntArrayRef shapes, bool weights) {
 // with zeros to whole panels.
 Tensor pack(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
   constexpr int64_t P = gn::kPanel;
-  int64_t given = 0;
-  for (size_t i = 0; i + 1 < shapes.size(); i += 2) given += shapes[i] * shapes[i + 1];
+  const auto [given, count] = packed_counts(shapes, weights);
   TORCH_CHECK_VALUE(is_number(numbers) && numbers.numel() == given, "Numbers to pack do not have the shapes given.");
-  const Tensor plain = numbers.contiguous(), packed = at::zeros({packed_count(shapes, weights)}, numbers.options());
+  check_memory(numbers);
+  const Tensor plain = numbers.contiguous(), packed = Pool::empty({count}, numbers.scalar_type()).zero_();
   auto fill = [&](auto zero) {
     using T = decltype(zero);
     const T* from = plain.const_data_ptr<T>();
@@ -295,7 +395,7 @@ Tensor pack(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
           for (int64_t r = 0; r < std::min(P, rows - panel * P); r++)
             to[r] = from[(panel * P + r) * row_step + c * column_step];
     };
-    for (size_t i = 0; i + 1 < shapes.size(); i += 2) {
+    for (size_t i = 0; i < shapes.size(); i += 2) {
       const int64_t rows = shapes[i], columns = shapes[i + 1];
       if (weights) {
         put(rows, columns, columns, 1);
@@ -316,7 +416,7 @@ Tensor unpack(const Tensor& packed, at::IntArrayRef shapes, bool weights) {
   constexpr int64_t P = gn::kPanel;
   std::vector<Tensor> parts;
   int64_t at = 0;
-  for (size_t i = 0; i + 1 < shapes.size(); i += 2) {
+  for (size_t i = 0; i < shapes.size(); i += 2) {
     const int64_t rows = shapes[i], columns = shapes[i + 1];
     if (weights) {
       const Tensor own = packed.narrow(0, at, panels(rows) * P * columns).view({panels(rows), columns, P});
@@ -337,15 +437,39 @@ void muon(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
                         polynomials.size() % 3 == 0,
                     "Muon needs a gradient and a moment of each parameter, and three coefficients a polynomial.");
   std::vector<gn::MuonMatrix> matrices;
+  struct Span {
+    const char *begin, *end;
+    bool written;
+  };
+  std::vector<Span> spans;
   for (size_t i = 0; i < parameters.size(); ++i) {
     const Tensor& parameter = parameters[i];
-    for (const Tensor& each : {parameter, gradients[i], moments[i]})
-      TORCH_CHECK_VALUE(each.is_cpu() && each.dim() == 2 && each.is_contiguous() && each.sizes() == parameter.sizes() &&
-                            each.scalar_type() == parameters[0].scalar_type() && is_number(each) && each.numel() > 0,
+    for (const Tensor* each : {&parameter, &gradients[i], &moments[i]}) {
+      TORCH_CHECK_VALUE(each->is_cpu() && each->dim() == 2 && each->is_contiguous() &&
+                            each->sizes() == parameter.sizes() &&
+                            each->scalar_type() == parameters[0].scalar_type() && is_number(*each) && each->numel() > 0,
                         "Native Muon updates contiguous matrices of one dtype.");
+      TORCH_CHECK(!(at::GradMode::is_enabled() && needs(*each)),
+                  "Native Muon updates matrices in place, without gradients: call it under torch.no_grad().");
+      check_memory(*each);
+      const char* begin = static_cast<const char*>(each->const_data_ptr());
+      spans.push_back({begin, begin + each->nbytes(), each != &gradients[i]});
+    }
     matrices.push_back({parameter.data_ptr(), gradients[i].const_data_ptr(), moments[i].data_ptr(), parameter.size(0),
                         parameter.size(1)});
   }
+  std::sort(spans.begin(), spans.end(), [](const Span& a, const Span& b) { return a.begin < b.begin; });
+  Span last{nullptr, nullptr, false};  // of those before, that which ends last; gradients may lie on each other
+  const char* written = nullptr;       // and where those that are written end
+  for (const Span& each : spans) {
+    TORCH_CHECK_VALUE(each.begin >= (each.written ? last.end : written),
+                      "Matrices that native Muon updates share memory with others.");
+    if (each.end > last.end) last = each;
+    if (each.written) written = std::max(written, each.end);
+  }
+  for (const at::TensorList& some : {parameters, moments})
+    for (const Tensor& each : some)
+      if (!each.is_inference()) each.unsafeGetTensorImpl()->bump_version();
   const gn::MuonOptions options{momentum, rate, polynomials.data(), int64_t(polynomials.size() / 3)};
   const bool is_double = !parameters.empty() && parameters[0].scalar_type() == at::kDouble;
   gn::muon(is_double ? gn::kFloat64 : gn::kFloat32, matrices, options, thread_count(threads));
@@ -353,8 +477,21 @@ void muon(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
 
 // Shapes without numbers, for compilers.
 
-Tensor rollout_shape(const Tensor& state, const Tensor& actions, const Tensor&, const Tensor&, const Tensor&,
-                     const OptionalTensor&, const Tensor&, int64_t channels, bool many, int64_t) {
+// Refuses numbers among those without, and states or actions of too few dimensions.
+void check_shapes(const Tensor& states, int64_t state_dims, const Tensor& actions, int64_t action_dims,
+                  std::initializer_list<const Tensor*> others, const OptionalTensor& sample_tables) {
+  bool meta = states.is_meta() && actions.is_meta() && (!sample_tables.has_value() || sample_tables->is_meta());
+  for (const Tensor* each : others) meta = meta && each->is_meta();
+  TORCH_CHECK_NOT_IMPLEMENTED(meta, "Either all tensors of a native step are on the meta device, or none.");
+  TORCH_CHECK_VALUE(states.dim() >= state_dims && actions.dim() == states.dim() - state_dims + action_dims,
+                    "States or actions do not fit the native step: ", states.sym_sizes(), " and ",
+                    actions.sym_sizes(), ".");
+}
+
+Tensor rollout_shape(const Tensor& state, const Tensor& actions, const Tensor& structure, const Tensor& weights,
+                     const Tensor& tables, const OptionalTensor& sample_tables, const Tensor& numbers, int64_t channels,
+                     bool many, int64_t) {
+  check_shapes(state, 2, actions, 1 + many, {&structure, &weights, &tables, &numbers}, sample_tables);
   std::vector<c10::SymInt> shape = state.sym_sizes().vec();
   if (many) shape.insert(shape.end() - 2, actions.sym_size(-2) + 1);
   shape.back() = channels;
@@ -369,11 +506,14 @@ std::tuple<Tensor, Tensor> rollout_keeping_shape(const Tensor& state, const Tens
           at::empty({0}, tables.options())};
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint_shape(const Tensor&, const Tensor& states,
-                                                                 const Tensor& actions, const Tensor&,
+std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint_shape(const Tensor& gradient, const Tensor& states,
+                                                                 const Tensor& actions, const Tensor& structure,
                                                                  const Tensor& weights, const Tensor& tables,
-                                                                 const OptionalTensor&, const Tensor&, const Tensor&,
-                                                                 bool many, int64_t, bool of_weights) {
+                                                                 const OptionalTensor& sample_tables,
+                                                                 const Tensor& numbers, const Tensor& stored, bool many,
+                                                                 int64_t, bool of_weights) {
+  check_shapes(states, 2 + many, actions, 1 + many, {&gradient, &structure, &weights, &tables, &numbers, &stored},
+               sample_tables);
   std::vector<c10::SymInt> shape = states.sym_sizes().vec();
   if (many) shape.erase(shape.end() - 3);
   auto like = [&](const Tensor& tensor) {
@@ -384,7 +524,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint_shape(const Tensor&, 
 }
 
 Tensor pack_shape(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
-  return at::empty({packed_count(shapes, weights)}, numbers.options());
+  const auto [given, count] = packed_counts(shapes, weights);
+  TORCH_CHECK_VALUE(numbers.sym_numel() == given, "Numbers to pack do not have the shapes given.");
+  return at::empty({count}, numbers.options());
 }
 
 // Gradients.
@@ -406,8 +548,6 @@ struct FirstOrder : torch::autograd::Function<FirstOrder> {
                 " bind the model with reference=True.");
   }
 };
-
-bool needs(const Tensor& tensor) { return tensor.defined() && tensor.requires_grad(); }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> adjoint_autograd(const Tensor& gradient, const Tensor& states,
                                                             const Tensor& actions, const Tensor& structure,

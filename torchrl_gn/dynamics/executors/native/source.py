@@ -13,7 +13,7 @@ from torchrl_gn.dynamics.executors.native.build import SOURCES
 from torchrl_gn.networks.packed_layers import PackedLayers
 
 _ORDER = ("structure.h", "kernels.h", "network.h", "tape.h", "call.h", "threads.h", "rollout.h")
-_OPERATORS = {"engine.h", "muon.h"}  # what operators need beside it
+_OPERATORS = {"engine.h", "muon.h", "structure_check.h"}  # what operators need beside it
 _TYPES = {"i": "int32_t", "l": "int64_t", "f": "float", "d": "double"}
 
 

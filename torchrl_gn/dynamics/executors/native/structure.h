@@ -10,7 +10,7 @@
 namespace gn __attribute__((visibility("hidden"))) {  // libraries built for other processors may be loaded beside
 
 constexpr int64_t kMagic = 0x676e5f73746570;  // "gn_step"
-constexpr int64_t kFormat = 1;                // of these words; structure.py has the same
+constexpr int64_t kFormat = 2;                // of these words; structure.py has the same
 constexpr int kPanel = 16;  // columns of a panel of packed weights, whatever the processor's vectors hold
 
 struct BufferWords {
@@ -76,6 +76,7 @@ struct HeaderWords {
   int64_t magic, format, words, operations;  // words: of the whole array; operations: that a tape may have
   int64_t network;     // place of NetworkWords
   int64_t maths[2];    // places of MathsWords: for states with the usual constant channels, and for any; or -1
+  int64_t sum;         // of all other words, each times twice its place and one, modulo 2^64
 };
 
 // The array, with its parts by place.

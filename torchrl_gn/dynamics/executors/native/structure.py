@@ -15,8 +15,8 @@ from torchrl_gn.networks.layers import Gather, LayerList
 from torchrl_gn.networks.linear import ACTIVATIONS
 from torchrl_gn.networks.packed_layers import PANEL
 
-MAGIC, FORMAT = 0x676E5F73746570, 1  # as in structure.h
-_HEADER = 7
+MAGIC, FORMAT = 0x676E5F73746570, 2  # as in structure.h
+_HEADER = 8
 _GROUPS, _PHASES = 6, 2
 
 
@@ -25,8 +25,17 @@ def structure(layers: LayerList, special: StateMaths, general: StateMaths | None
     words = _Words(_HEADER)
     network = words.network(layers)
     maths = [-1 if each is None else words.maths(each, layers) for each in (special, general)]
-    header = [MAGIC, FORMAT, words.count, len(OPERATIONS), network, *maths]
-    return torch.from_numpy(np.concatenate([np.array(header, dtype=np.int64), *words.parts]))
+    header = [MAGIC, FORMAT, words.count, len(OPERATIONS), network, *maths, 0]
+    whole = np.concatenate([np.array(header, dtype=np.int64), *words.parts])
+    seal(whole)
+    return torch.from_numpy(whole)
+
+
+def seal(words: np.ndarray) -> None:
+    """Write the sum of a structure's words, by which the operators see whether one was changed."""
+    words[_HEADER - 1] = 0
+    factors = 2 * np.arange(len(words), dtype=np.uint64) + np.uint64(1)
+    words[_HEADER - 1] = (words.view(np.uint64) * factors).sum().view(np.int64)
 
 
 class _Words:

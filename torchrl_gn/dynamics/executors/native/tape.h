@@ -12,7 +12,7 @@ namespace gn {
 template <int W>
 struct Lanes {
   typedef double Double __attribute__((vector_size(W * sizeof(double))));
-  typedef int64_t Int __attribute__((vector_size(W * sizeof(int64_t))));
+  typedef uint64_t Int __attribute__((vector_size(W * sizeof(uint64_t))));  // bits of a NaN may overflow
 };
 
 template <class V>
