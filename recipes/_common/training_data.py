@@ -19,6 +19,8 @@ from torchrl_gn.dynamics import BoundPredictor, ForwardModel
 from torchrl_gn.scenes import Scene, has_variants
 from torchrl_gn.training import Workers
 
+# Trajectories by default (paper, SM "Datasets"), and of models that are slow to simulate and to train.
+_TRAIN, _TRAIN_LARGE, _LARGE = 10_000, 4_000, 16  # degrees of freedom
 _ROWS = 256  # trajectories that are looked at together
 
 
@@ -55,10 +57,15 @@ def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]
     tasks = []
     for scene in scenes:
         parametrized = cfg.parametrized and (len(scenes) == 1 or has_variants(scene))
-        variants = (cfg.data.variants or cfg.data.train) if parametrized else None
-        dataset = dataset_with_progress(folder, scene, cfg.data, variants=variants)
+        train = cfg.data.train or _default_count(scene)
+        variants = (cfg.data.variants or train) if parametrized else None
+        dataset = dataset_with_progress(folder, scene, {**cfg.data, "train": train}, variants=variants)
         tasks.append(Task(scene, dataset, mixture(cfg, dataset)))
     return tasks
+
+
+def _default_count(scene: Scene) -> int:
+    return _TRAIN if "system" in scene.origin or scene.model.nv <= _LARGE else _TRAIN_LARGE
 
 
 def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:

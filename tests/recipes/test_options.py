@@ -69,7 +69,7 @@ def test_lists_hold_what_one_may_be_and_null_is_left_to_the_recipe():
         ("system=null", "given, such as swimmer6"),
         ("system=5", "a name"),
         ("device=true", "a name"),
-        ("data.train=null", "given, such as 10000"),
+        ("data.validation=null", "given, such as 200"),
         ("unroll_fraction=half", "a number"),
         ("model.project=1", "true or false"),
         ("model.features.contacts=null", "given, such as True"),

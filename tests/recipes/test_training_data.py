@@ -85,3 +85,17 @@ def test_steps_of_episodes_that_are_not_finite_are_left_out(swung, tmp_path):
     write_tensors(file, {"state": episodes["state"]})
     with pytest.raises(ValueError, match="has no action: it is no file of episodes"):
         extra_trajectories(str(file), 2)
+
+
+def test_models_that_are_slow_to_simulate_have_fewer_trajectories_by_default():
+    legs = "".join(f'<body pos="{i} 0 1"><joint axis="0 1 0"/><geom size=".1"/></body>' for i in range(17))
+    counts = [
+        training_data._default_count(load_scene(each))
+        for each in (
+            "pendulum",
+            "swimmer20",
+            f"<mujoco><worldbody>{legs}</worldbody></mujoco>",
+            "tests/zoo/servo_arm.xml",
+        )
+    ]
+    assert counts == [10_000, 10_000, 4_000, 10_000]
