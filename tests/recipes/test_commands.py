@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^ *```sh\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`((?:python )?recipes/\w+\.py [^`]+)`")
-PROGRAMS = ("python", "torchrun", "torchrl-gn", "ray", "git")
+PROGRAMS = ("python", "torchrun", "torchrl-gn", "ray", "git", "pip")
 NESTED = {  # options that hold options of other recipes
     ("compare", "overrides"): "forward_model",
     ("mlp_baseline", "overrides"): "forward_model",
@@ -85,7 +85,7 @@ def test_commands_are_understood(page, tmp_path, monkeypatch, capsys):
             for program, *words in typed:
                 if program == "torchrl-gn":
                     main(words)
-                elif program not in ("ray", "git"):
+                elif program not in ("ray", "git", "pip"):
                     place = next((index for index, word in enumerate(words) if word.startswith("recipes/")), None)
                     if words[0] == "-m":
                         assert (ROOT / f"{words[1].replace('.', '/')}.py").is_file(), words
