@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:Inertia matrix is too close to singular:UserWarning"),
     pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenParameterWarning"),  # of one that moves little
 ]
-SEEDS = 40
+SEEDS = 20
 BLOCK = 50  # of a slow test
 
 

@@ -173,7 +173,7 @@ def test_the_loss_reads_every_samples_values(variants, samples, model, window):
     assert loss.in_keys == ["state", "action", ("next", "state"), "parameters"]
     parameters = torch.stack([bound.parameters_of(scene) for scene in variants])
     every = samples.clone().set("parameters", parameters.unsqueeze(1).expand(3, 2)).flatten()
-    batch = trajectory_buffer(every, batch_size=12, window=window, seed=0).sample()
+    batch = trajectory_buffer(every, batch_size=5, window=window, seed=0).sample()
     total = loss(batch)["loss_forward_model"]
     total.backward()
     assert all(p.grad is not None for p in model.core.first.parameters())

@@ -401,7 +401,7 @@ def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
     loss = ForwardModelLoss(model.bind(scene, parameters_key="parameters"))
     loss.fit_normalizers(trajectory_buffer(data.train, batch_size=200, seed=0).sample())
     for window in (1, 3):
-        batch = trajectory_buffer(data.train, batch_size=8, window=window, seed=1).sample()
+        batch = trajectory_buffer(data.train, batch_size=3, window=window, seed=1).sample()
         alone = []
         for sample in batch:
             own = data.scene_of("train", int(sample["index"].flatten()[0]))
