@@ -21,6 +21,7 @@ from torch import Tensor
 
 from tests import zoo
 from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics.executors import NativeExecutor
 from torchrl_gn.dynamics.executors.native.operators import load_operators
 from torchrl_gn.dynamics.executors.native.structure import seal
 
@@ -92,7 +93,7 @@ def good_calls() -> list[Call]:
             prepared = of_samples.prepared(parameters)
             kinds.append((prepared.executor, prepared.program, 13, 3))
         for executor, program, channels, count in kinds:
-            assert executor.reason is None
+            assert isinstance(executor, NativeExecutor) and executor.reason is None
             core = program.core
             given = {"structure": executor.structure}
             given |= {each: getattr(core, each) for each in ("weights", "tables", "sample_tables", "numbers")}
@@ -160,8 +161,10 @@ WRONG: dict[str, Callable[[Tensor], Tensor]] = (
         "behind others": lambda x: torch.cat((x.flatten()[:1], x.flatten()))[1:].view(x.shape),
         "one for all": lambda x: x[:1].expand_as(x),
         "misaligned": _misaligned,
-        "negative": lambda x: torch._neg_view(-x),
-        "efficient zeros": lambda x: torch._efficientzerotensor(x.shape, dtype=x.dtype),
+        "negative": lambda x: torch._neg_view(-x),  # pyright: ignore[reportPrivateImportUsage]
+        "efficient zeros": lambda x: torch._efficientzerotensor(  # pyright: ignore[reportPrivateImportUsage]
+            x.shape, dtype=x.dtype
+        ),
         "with a gradient": lambda x: plain(x).requires_grad_(),
         "computed": lambda x: plain(x).requires_grad_() * 1,
         "a parameter": lambda x: torch.nn.Parameter(plain(x)),
