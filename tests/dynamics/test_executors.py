@@ -57,7 +57,7 @@ def cases() -> list:
         ("pendulum", "gn", [()], False, torch.float64),
         ("pendulum", "recurrent", [(1,)], False, torch.float32),
         ("pendulum", "mlp", [(5,)], True, torch.float32),
-        ("swimmer6", "gn", [(5,)], True, torch.float32),
+        ("swimmer3", "gn", [(5,)], True, torch.float32),
     ]
     for executor in sorted(EXECUTORS.keys() - {"eager", "native"}):
         found += [pytest.param(executor, *each, marks=[pytest.mark.slow, compiles]) for each in few]
