@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import csv
 import gc
-import itertools
 import os
 import sys
 import tempfile
@@ -101,17 +100,18 @@ WORK: tuple[Callable[[int, Path], None], ...] = (learn, plan, differentiate)
 
 def soak(minutes: float, report: Callable[[Level], None]) -> list[Level]:
     """Levels every sixtieth part of ``minutes``, each reported as it comes."""
-    levels, start, every = [], time.monotonic(), minutes
+    levels: list[Level] = []
+    start, rounds = time.monotonic(), 0
     with tempfile.TemporaryDirectory(prefix="soak") as folder:
-        for rounds in itertools.count():
+        while True:
             seconds = time.monotonic() - start
-            if seconds >= len(levels) * every:
+            if seconds >= len(levels) * minutes:
                 levels.append(level(seconds, rounds))
                 report(levels[-1])
             if seconds >= 60 * minutes:
                 return levels
             WORK[rounds % len(WORK)](rounds // len(WORK), Path(folder))
-    raise AssertionError
+            rounds += 1
 
 
 def growth(levels: list[Level]) -> dict[str, float]:

@@ -10,6 +10,7 @@ import numpy as np
 from torchrl_gn.data.clearance import clearance, find_bases
 from torchrl_gn.scenes.actuator_kinds import activated_servos, holding_controls
 from torchrl_gn.scenes.collisions import colliding_geoms
+from torchrl_gn.scenes.force_elements import winding_joints
 from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import named, weld_roots
@@ -139,13 +140,13 @@ class StartPoses:
     def _perturbations(self, spread: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Changes of the reference pose ``[n, nv]``, as of ``mj_integratePos`` over one second."""
         model, kind, n = self.model, mujoco.mjtJoint, len(spread)
-        changes = np.zeros((n, model.nv))
+        changes, winds = np.zeros((n, model.nv)), winding_joints(self.scene)
         for joint in range(model.njnt):
             first, dof, (low, high) = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_range[joint]
             match model.jnt_type[joint], bool(model.jnt_limited[joint]):
-                case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE) as of, True):
+                case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE), True):
                     here = self._reference[first]
-                    if of == kind.mjJNT_HINGE and high - low > 2 * np.pi:  # bodies do not show whole turns
+                    if winds[joint]:  # bodies do not show whole turns
                         low, high = max(low, here - np.pi), min(high, here + np.pi)
                     changes[:, dof] = spread * (rng.uniform(low, high, n) - here)
                 case kind.mjJNT_HINGE, False:

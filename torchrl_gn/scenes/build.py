@@ -113,7 +113,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)  # MuJoCo before 3.4 has none
     try:
         spec = _copy(spec)
-        _shrink_textures(spec)
+        shrink_textures(spec, _TEXTURE)
         spec.option.disableflags |= int(flags.mjDSBL_WARMSTART)
         _converge(spec.option)
         spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
@@ -132,11 +132,11 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     return model, graph
 
 
-def _shrink_textures(spec: mujoco.MjSpec) -> None:
+def shrink_textures(spec: mujoco.MjSpec, pixels: int) -> None:
     """Draw generated textures small: the suite's take 80 ms and 12 MB of every model, most of what loading takes."""
     for texture in spec.textures:
         if texture.builtin != mujoco.mjtBuiltin.mjBUILTIN_NONE:
-            texture.width, texture.height = min(texture.width, _TEXTURE), min(texture.height, _TEXTURE)
+            texture.width, texture.height = min(texture.width, pixels), min(texture.height, pixels)
 
 
 def _converge(option: mujoco.MjOption) -> None:

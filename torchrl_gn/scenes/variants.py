@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.build import build_scene
+from torchrl_gn.scenes.build import build_scene, shrink_textures
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange, System, find_system
 
@@ -73,9 +73,7 @@ def _build(
     assert system.vary is not None
     standard = system.build()
     standard.compiler.usethread = False  # threads would take longer to start than the model to compile
-    for texture in standard.textures:
-        # Every model would render and keep full textures: 12 MB and most of the time.
-        texture.width = texture.height = 16  # pixels
+    shrink_textures(standard, 16)  # as there are thousands of variants, each with its own
     for values in rows:
         for key, value in values.items():
             if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
