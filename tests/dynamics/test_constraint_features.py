@@ -69,10 +69,7 @@ def test_violations_of_connects_and_welds_are_mujocos():
             )  # a quaternion has two signs
             assert either.min() < 1e-8
             np.testing.assert_allclose(there[12:15], np.clip(there[9:12] / 0.02, -1, 1), atol=1e-12)
-            spins = [
-                data.sensordata[scene.sensor_slice].reshape(-1, 13)[node, 10:]
-                for node in (graph[pair].first, graph[pair].second)
-            ]
+            spins = [data.sensordata.reshape(-1, 13)[node, 10:] for node in (graph[pair].first, graph[pair].second)]
             np.testing.assert_allclose(there[15:18], spins[0] - spins[1], atol=1e-8)
 
 
@@ -85,7 +82,7 @@ def test_a_welds_rotation_is_its_small_angle_and_rate():
     found = []
     for _ in range(2):
         mujoco.mj_forward(model, data)
-        state = torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy())
+        state = torch.from_numpy(data.sensordata.reshape(scene.num_nodes, 13).copy())
         found.append(feature(inputs_of(scene, state, data.ctrl))[2 * pair].numpy())
         mujoco.mj_integratePos(model, data.qpos, data.qvel, step)
     assert np.abs(found[0][9:12]).max() < 1e-6  # the weld keeps the poses of the model

@@ -70,7 +70,7 @@ def check_gradients(scene, kinds, action, weights, *, count: int, tolerance: flo
 
     data = mujoco.MjData(scene.model)
     mujoco.mj_forward(scene.model, data)
-    rest = torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy()).requires_grad_()
+    rest = torch.from_numpy(data.sensordata.reshape(scene.num_nodes, 13).copy()).requires_grad_()
     assert torch.autograd.grad(total(rest), rest)[0].isfinite().all()
     for _, state in poses(scene, count):
         change = torch.randn(scene.num_nodes, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -190,7 +190,7 @@ def test_a_servo_whose_joint_winds_is_near_its_target():
     data.qpos[:] = model.qpos0
     data.qpos[0], data.ctrl[0] = 7.0, 7.02
     mujoco.mj_forward(model, data)
-    state = torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy())
+    state = torch.from_numpy(data.sensordata.reshape(scene.num_nodes, 13).copy())
     found = feature(inputs_of(scene, state, data.ctrl))[0, :4]
     np.testing.assert_allclose(found, [1.0, 1.0, 0.4, 1.0], atol=1e-9)
     assert data.qfrc_actuator[0] == pytest.approx(1.0)
@@ -217,7 +217,7 @@ def test_gradients_are_finite_at_rest_and_right_elsewhere(name):
 
     data = mujoco.MjData(scene.model)
     mujoco.mj_forward(scene.model, data)
-    rest = torch.from_numpy(data.sensordata[scene.sensor_slice].reshape(scene.num_nodes, 13).copy()).requires_grad_()
+    rest = torch.from_numpy(data.sensordata.reshape(scene.num_nodes, 13).copy()).requires_grad_()
     control = torch.zeros(scene.num_actions, dtype=torch.float64, requires_grad=True)
     for gradient in torch.autograd.grad(total(rest, control), (rest, control), allow_unused=True):
         assert gradient is None or gradient.isfinite().all()

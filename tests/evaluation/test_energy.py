@@ -20,6 +20,6 @@ def test_kinetic_energy_is_mujocos(name):
     for _ in range(5):
         data.qpos[:], data.qvel[:] = model.qpos0 + rng.normal(size=model.nq), rng.normal(size=model.nv)
         mujoco.mj_forward(model, data)
-        state = torch.as_tensor(data.sensordata[scene.sensor_slice].reshape(-1, 13))
+        state = torch.as_tensor(data.sensordata.reshape(-1, 13))
         armature = 0.5 * float(model.dof_armature @ data.qvel**2)
         assert float(kinetic_energy(state, scene)) == pytest.approx(data.energy[1] - armature, rel=1e-9)

@@ -216,6 +216,26 @@ def test_sleeping_and_disabled_sensors_are_undone():
     assert not flags.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
 
 
+def test_sensors_are_left_out_and_decide_nothing():
+    sensors = """<sensor><rangefinder site="eye"/><accelerometer site="eye"/><jointpos joint="a"/>
+      <plugin plugin="mujoco.sensor.touch_grid" objtype="site" objname="eye"><config key="size" value="2 2"/>
+        <config key="fov" value="40 40"/><config key="gamma" value="0"/><config key="nchannel" value="1"/></plugin>
+    </sensor>"""
+    site = GOOD.replace('<joint name="a"', '<site name="eye"/><joint name="a"', 1)
+    plugin = "<extension><plugin plugin='mujoco.sensor.touch_grid'/></extension>"
+    given = site.replace("<worldbody>", f"{plugin}<worldbody>").replace("</mujoco>", f"{sensors}</mujoco>")
+    assert mujoco.MjModel.from_xml_string(given).nsensor == 4
+    with_sensors, without = load_scene(given), load_scene(site)
+    assert with_sensors.model.nsensor == without.model.nsensor == 4 * without.num_nodes
+    ends = []
+    for model in (with_sensors.model, without.model):
+        data = mujoco.MjData(model)
+        data.ctrl[:] = 1.0
+        mujoco.mj_step(model, data, nstep=20)
+        ends.append(np.concatenate((data.qpos, data.qvel, data.sensordata)))
+    np.testing.assert_array_equal(*ends)
+
+
 WARM_STARTED = """<mujoco><option timestep="0.004" iterations="1" ls_iterations="5" tolerance="1e-4"/><worldbody>
   <geom type="plane" size="5 5 .1"/>
   <body pos="0 0 .2"><freejoint/><geom type="box" size=".3 .2 .2" mass="5"/>

@@ -17,7 +17,7 @@ def _simulate(scene: Scene, qpos: np.ndarray, steps: int, seed: int) -> np.ndarr
     states = []
     for _ in range(steps + 1):
         mujoco.mj_forward(scene.model, data)
-        states.append(data.sensordata[scene.sensor_slice].reshape(-1, 13).copy())
+        states.append(data.sensordata.reshape(-1, 13).copy())
         data.ctrl[:] = rng.uniform(scene.action_low, scene.action_high)
         mujoco.mj_step(scene.model, data, scene.substeps)
     return np.array(states)

@@ -199,7 +199,7 @@ def _simulate(scene: Scene, qpos: np.ndarray, qvel: np.ndarray) -> torch.Tensor:
     states = []
     for _ in range(20):
         mujoco.mj_forward(scene.model, data)
-        states.append(data.sensordata[scene.sensor_slice].reshape(-1, 13).copy())
+        states.append(data.sensordata.reshape(-1, 13).copy())
         data.ctrl[:] = rng.uniform(scene.action_low, scene.action_high)
         mujoco.mj_step(scene.model, data, scene.substeps)
     return torch.as_tensor(np.array(states))

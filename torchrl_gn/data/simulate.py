@@ -242,7 +242,6 @@ def _check_topology(scenes: tuple[Scene, ...]) -> None:
             "substeps",
             "physics_size",
             "senders",
-            "sensor_slice",
             "mocap_poses",
         ):
             ours, theirs = getattr(first, what), getattr(scene, what)

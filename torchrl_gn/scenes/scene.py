@@ -65,7 +65,7 @@ class Scene:
     """
 
     name: str
-    model: mujoco.MjModel  # its last sensors are the frame sensors of the nodes; warm starts are off
+    model: mujoco.MjModel  # its sensors are those of the nodes' frames; warm starts are off
     node_names: tuple[str, ...]  # "world" first
     joint_names: tuple[str, ...]  # [J] in the order of the edges
     actuator_names: tuple[str, ...]  # in the order of mjData.ctrl
@@ -178,14 +178,9 @@ class Scene:
         """Numbers ``C`` in a node's state: position 3, quaternion 4, velocities 6, ``K`` activations."""
         return self.layout.size
 
-    @property
-    def sensor_slice(self) -> slice:
-        """Slice of ``mjData.sensordata`` that, reshaped to ``[..., N, 13]``, holds the poses and velocities."""
-        return slice(self.model.nsensordata - 13 * self.num_nodes, self.model.nsensordata)
-
     def states(self, sensors: np.ndarray, physics: np.ndarray) -> np.ndarray:
         """States ``[*B, N, C]`` of ``mjData.sensordata`` ``[*B, S]`` and physics ``[*B, S']`` of the same time."""
-        bodies = sensors[..., self.sensor_slice].reshape(*sensors.shape[:-1], self.num_nodes, 13)
+        bodies = sensors.reshape(*sensors.shape[:-1], self.num_nodes, 13)
         if not self.model.na:
             return bodies
         first = 1 + self.model.nq + self.model.nv
