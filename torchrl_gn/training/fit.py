@@ -52,7 +52,7 @@ def fit(
     lr: float | None = None,
     batch_size: int = 200,
     noise: float = 0.0,
-    size_floor: float | None = 0.02,
+    size_floor: float | None = 0.2,
     seed: int = 0,
     progress: bool = True,
 ) -> History:
@@ -73,7 +73,7 @@ def fit(
             for example ``lambda weights: torch.optim.AdamW(weights, lr=1e-3)``.
         lr: peak learning rate, instead of the preset's.
         noise: standard deviation of the input noise, in standard deviations of each component.
-        size_floor: weighs calm samples more, see :class:`~torchrl_gn.objectives.ForwardModelLoss`; None (paper): all
+        size_floor: weighs wild samples less, see :class:`~torchrl_gn.objectives.ForwardModelLoss`; None (paper): all
             weigh alike.
         seed: seed of batches and noise. Weights are made before, with torch's global generator.
 
