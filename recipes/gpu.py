@@ -233,11 +233,13 @@ def measure_cores(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
 
 def run_recipe(cfg: DictConfig, name: str, place: Path, options: Sequence[str]) -> dict[str, Any]:
     """Numbers of a recipe on the device and the seconds of its process, or how it failed."""
+    place = place.resolve()  # from the folder that the recipe runs in, too
     command = [sys.executable, str(ROOT / f"recipes/{name}.py"), f"device={cfg.device}", f"run_dir={place}"]
     start = time.perf_counter()
     done = run_child([*command, f"seed={cfg.seed}", *options], cwd=ROOT)
     out: dict[str, Any] = {"whole_seconds": time.perf_counter() - start}
     if done.returncode:
+        tqdm.write(f"{name} failed: {(done.stdout + done.stderr)[-2000:]}")
         return {**out, "failed": (done.stdout + done.stderr)[-2000:]}
     if warned := [line for line in done.stderr.splitlines() if "Warning" in line]:  # updates without graphs, say
         out["warned"] = "\n".join(warned)[:2000]
@@ -250,7 +252,7 @@ def measure_training(cfg: DictConfig, keep: Callable[[dict], None], folder: Path
     """Seconds and errors of recipes/forward_model.py, a run for each set of options."""
     out: dict[str, Any] = {}
     for index, options in enumerate(cfg.training):
-        given = [f"data.folder={folder / 'data'}", *options.split()]
+        given = [f"data.folder={folder.resolve() / 'data'}", *options.split()]
         numbers = run_recipe(cfg, "forward_model", folder / f"training{index}", given)
         out |= {f"{options}/{key}": value for key, value in numbers.items()}
         keep(out)
