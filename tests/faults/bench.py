@@ -15,9 +15,10 @@ from typing import Any
 
 from torchrl_gn.training.run_folder import CONFIG_FILE, LOCK_FILE
 
+from ..copies import OUTSIDE
 from .cases import CASES, PREPARATION, PREPARED, Case, differences, numbers_of
 from .damage import damage
-from .server import FOLDER, OUTSIDE, Ended, Server, Strike
+from .server import FOLDER, Ended, Server, Strike
 
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 FULL = "full disk"  # as the name of a strike

@@ -4,6 +4,6 @@ from __future__ import annotations
 
 import sys
 
-from .server import RECIPES
+from ..copies import RECIPES
 
 sys.path.append(str(RECIPES))

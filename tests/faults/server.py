@@ -1,14 +1,12 @@
-"""Run recipes in copies of a process that has imported everything, which takes seconds, and strike them.
+"""Run recipes in copies of a process that has imported everything, see ``tests/copies.py``, and strike them.
 
 A process forks for each order, a line of JSON, and answers with the copy's id; for ``{"wait": id}`` with its exit code.
-The copy is a recipe as a user starts it, but for Hydra's command line and for the content of pictures, which takes
-longer than all else. Recipes that others start are copies too.
+The content of pictures, which takes longer than all else, is not drawn.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import os
 import resource
@@ -16,18 +14,16 @@ import select
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import IO, Any
+from typing import Any
 
-ROOT = Path(__file__).parents[2]
-RECIPES = ROOT / "recipes"
+from ..copies import RECIPES, import_all, load, run
+
+ROOT = RECIPES.parent
 FOLDER = "run"  # of a run, in the working folder of its process
-OUTSIDE = "interrupted outside of the recipe"
 _OPERATIONS = ("open", "os.rename", "os.remove", "os.mkdir")  # audit events of files; open is of reading, too
 
 
@@ -97,7 +93,7 @@ class Server:
     """The process that is copied."""
 
     def __init__(self) -> None:
-        command = [sys.executable, __file__]
+        command = [sys.executable, "-m", "tests.faults.server"]
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         # One thread, as copies of a process have no other; nothing here starts one.
         environment = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline"}
@@ -155,17 +151,6 @@ def serving() -> Iterator[Server]:
         server.close()
 
 
-def _load(recipe: str) -> ModuleType:
-    """A recipe's module."""
-    if (name := f"recipe_{recipe}") in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, RECIPES / f"{recipe}.py")
-    assert spec is not None and spec.loader is not None
-    sys.modules[name] = module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def _watch_operations(order: dict[str, Any]) -> Callable[[], int]:
     """Count file operations in the run folder, and strike before one of them; return the count."""
     folder, own, count = str(Path(order["place"], FOLDER)) + os.sep, os.getpid(), 0
@@ -193,85 +178,23 @@ def _run(order: dict[str, Any]) -> None:
     if (limit := order["largest_file"]) is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     for name, value in order["settings"].items():
-        setattr(_load(order["recipe"]), name, value)
+        setattr(load(order["recipe"]), name, value)
     operations = _watch_operations(order)
-    code = _main(order["recipe"], order["options"])
+    code = run(order["recipe"], order["options"])
     with contextlib.suppress(OSError):
         Path(f"operations.{os.getpid()}").write_text(str(operations()))
     os._exit(code)
 
 
-def _main(recipe: str, options: Sequence[str]) -> int:
-    """Call a recipe's main function as its process would; return the exit code."""
-    import hydra
-    from hydra.core.global_hydra import GlobalHydra
-    from tqdm import tqdm
-
-    tqdm.set_lock(threading.RLock())  # not one of all copies, which one that is killed could keep
-    GlobalHydra.instance().clear()  # of the recipe that started this one
-    code = 0
-    try:
-        # Shells let what they start in the background ignore Ctrl-C.
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        with hydra.initialize_config_dir(str(RECIPES / "config"), version_base=None):
-            config = hydra.compose(recipe, overrides=list(options))
-        _load(recipe).main(config)
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else 1
-    except KeyboardInterrupt:
-        sys.stderr.write(f"{OUTSIDE}\n")
-        code = 130
-    except BaseException as error:
-        sys.excepthook(type(error), error, error.__traceback__)
-        code = 1
-    sys.stdout.flush()
-    sys.stderr.flush()
-    return code
-
-
-class _Child:
-    """A recipe that another one starts, for ``subprocess.Popen``."""
-
-    def __init__(self, command: Sequence[str], *, stdout: IO, stderr: IO, cwd: Path, start_new_session: bool) -> None:
-        from _common import parent
-
-        ours, theirs = os.pipe()
-        self.number = os.fork()
-        if not self.number:
-            if start_new_session:
-                os.setsid()
-            os.dup2(ours, 0)
-            os.dup2(stdout.fileno(), 1)
-            os.dup2(stderr.fileno(), 2)
-            os.closerange(3, 1000)  # other children's pipes, and locks of run folders
-            os.environ[parent._VARIABLE] = "1"
-            os.chdir(cwd)
-            os._exit(_main(Path(command[1]).stem, command[2:]))
-        os.close(ours)
-        self.stdin = os.fdopen(theirs, "wb")
-
-    def wait(self) -> int:
-        return os.waitstatus_to_exitcode(os.waitpid(self.number, 0)[1])
-
-    def terminate(self) -> None:
-        os.kill(self.number, signal.SIGTERM)
-
-
 def _prepare() -> None:
     """Import all recipes, and replace what takes long and decides nothing."""
-    import matplotlib.backends.backend_agg  # noqa: F401
+    import_all()
     from matplotlib.figure import Figure
 
-    from _common import sweeps
     from torchrl_gn.evaluation import video
 
-    for path in sorted(RECIPES.glob("*.py")):
-        if path.stem != "gpu":
-            _load(path.stem)
     Figure.savefig = lambda self, file, **options: Path(file).write_bytes(b"figure" * 1000)  # type: ignore
     video._write_gif = lambda path, frames, seconds: path.write_bytes(b"video" * 1000)  # type: ignore
-    sweeps.start_child = _Child  # type: ignore
 
 
 def _serve() -> None:
