@@ -15,6 +15,7 @@ from _common.sweeps import override
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.scenes import load_scene
 
+from ..faults.server import serving
 from .conftest import ROOT
 
 ROBOTS = sorted(path.stem for path in (ROOT / "recipes/config/robot").glob("*.yaml"))
@@ -52,7 +53,7 @@ def test_values_come_back_as_hydra_reads_them(compose):
 
 
 @pytest.mark.slow
-def test_a_robot_of_ones_own_learns_from_the_first_model_on(tmp_path, call):
+def test_a_robot_of_ones_own_learns_from_the_first_model_on(tmp_path):
     shutil.copy(PENDULUM, tmp_path / "my pole.xml")
     options = (
         f"system={override(str(tmp_path / 'my pole.xml'))}",
@@ -67,15 +68,15 @@ def test_a_robot_of_ones_own_learns_from_the_first_model_on(tmp_path, call):
         "baselines=[nothing]",
         "planning=['gn.iterations=1','gn.warm_up=1','gn.samples=2']",
         "training=['data.train=20','data.validation=5','data.test=5','model.hidden=8']",
-        f"run_dir={tmp_path / 'run'}",
     )
-    code, output, errors = call(*options, recipe="plan_and_learn")
-    assert code == 0, errors
+    with serving() as server:  # a round starts several recipes, which are copies
+        first = server.run("plan_and_learn", options, tmp_path)
+        assert first.code == 0, first.said
+        before = (tmp_path / "run/executed1/gn.safetensors").read_bytes()
+        second = server.run("plan_and_learn", (*options, "rounds=2"), tmp_path)
+        assert second.code == 0, second.said
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
-    assert {f"{of}/mean_reward" for of in ("round 0", "round 1", "nothing")} <= set(metrics)
-    assert "| nothing |" in output and (tmp_path / "run/executed1/gn.gif").exists()
-    before = (tmp_path / "run/executed1/gn.safetensors").read_bytes()
-    code, output, errors = call(*options, "rounds=2", recipe="plan_and_learn")
-    assert code == 0, errors
+    assert {f"{of}/mean_reward" for of in ("round 0", "round 1", "round 2", "nothing")} <= set(metrics)
+    assert "| nothing |" in first.said and (tmp_path / "run/executed1/gn.gif").exists()
     assert (tmp_path / "run/executed1/gn.safetensors").read_bytes() == before  # a finished round is kept
-    assert "| round 2 |" in output and "| nothing |" in output
+    assert "| round 2 |" in second.said and "| nothing |" in second.said
