@@ -61,7 +61,7 @@ def test_a_model_of_many_variants_is_refused(scenes, make_model, tmp_path):
 
 
 def build(*arguments) -> None:
-    subprocess.run([str(COMPILER), "-O3", *map(str, arguments)], check=True, capture_output=True)
+    subprocess.run([str(COMPILER), *map(str, arguments)], check=True, capture_output=True)
 
 
 def pointer(tensor: torch.Tensor) -> ctypes.c_void_p:
@@ -80,7 +80,6 @@ def steps_of(library, state, actions, threads=1):
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
-        pytest.param("pendulum", torch.float32, marks=pytest.mark.slow),
         pytest.param("swimmer6", torch.float64, marks=pytest.mark.slow),
         pytest.param("jaco", torch.float32, marks=pytest.mark.slow),
     ],
@@ -91,9 +90,9 @@ def test_c_functions_are_the_native_executor_bit_for_bit(fit, make_model, random
     folder = export_c(bound, tmp_path / "twin")
     assert sorted(file.name for file in folder.iterdir()) == ["main.c", "twin.cpp", "twin.h"]
     flags = ["-Wall", "-Wextra", "-Werror", "-Wno-psabi"]
-    build(
-        "-std=c++17", *flags, *instruction_flags(), "-shared", "-fPIC", folder / "twin.cpp", "-o", tmp_path / "twin.so"
-    )
+    # As the executor is built: less optimised, gradients are others in their last bits.
+    shared = ("-shared", "-fPIC", folder / "twin.cpp", "-o", tmp_path / "twin.so")
+    build("-O3", "-std=c++17", *flags, *instruction_flags(), *shared)
     library = ctypes.CDLL(str(tmp_path / "twin.so"))
 
     rest = torch.tensor((ctypes.c_double * (13 * scene.num_nodes)).in_dll(library, "twin_rest")[:], dtype=torch.float64)
