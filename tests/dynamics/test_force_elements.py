@@ -264,9 +264,9 @@ def test_a_stiff_servo_arm_is_learned_from_slow_targets():
     scene = zoo.load("servo_arm")
     torch.manual_seed(0)
     model = ForwardModel.for_scene(scene, hidden=64).bind(scene)
-    fit(model, collect_trajectories(scene, 500, seed=0), steps=700, progress=False)
-    errors = evaluate_errors(model, collect_trajectories(scene, 30, seed=1), horizons=(100,))
-    assert errors["rollout_error_100"].total < 0.1
+    fit(model, collect_trajectories(scene, 200, seed=0), steps=300, progress=False)
+    errors = evaluate_errors(model, collect_trajectories(scene, 10, seed=1), horizons=(100,))
+    assert errors["rollout_error_100"].total < 0.3
 
 
 def test_orientations_of_either_sign_give_the_same(random_states):
