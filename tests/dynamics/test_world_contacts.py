@@ -226,16 +226,19 @@ def test_samples_bring_points_and_surfaces_of_their_own():
 HILLS = '<asset><hfield name="h" nrow="3" ncol="3" size="2 2 .3 .1" elevation="0 1 0 1 0 1 0 0 1"/></asset>'
 
 
-@pytest.mark.parametrize("kind", ["sphere", "capsule", "box", "cylinder", "hills"])
+FLAT = HILLS.replace("0 1 0 1 0 1 0 0 1", "0 0 0 0 0 0 0 0 0")
+
+
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "box", "cylinder", "hills", "flat"])
 def test_native_steps_are_those_of_torch(fit, kind, random_states):
-    """All surfaces but height fields, whose cells depend on the state, have a scalar form."""
-    hills = kind == "hills"
+    """All surfaces but height fields with hills, whose cells depend on the state, have a scalar form."""
+    hills, field = kind == "hills", kind in ("hills", "flat")
     world = (
         WORLD
         + '<geom type="cylinder" size=".2 .3" pos=".8 .8 0"/><geom type="ellipsoid" size=".2 .3 .1" pos="-1 1 0"/>'
     )
-    world = world + '<geom type="hfield" hfield="h"/>' * hills
-    given = scene(BODIES["sphere" if hills else kind], world, HILLS * hills)
+    world = world + '<geom type="hfield" hfield="h"/>' * field
+    given = scene(BODIES["sphere" if field else kind], world, (HILLS if hills else FLAT) * field)
     torch.manual_seed(0)
     model = fit(ForwardModel.for_scene(given, **SMALL), given).bind(given)
     predictor = specialize(model, executor="native")

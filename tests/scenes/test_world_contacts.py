@@ -39,6 +39,19 @@ def test_what_mujoco_filters_cannot_touch():
     assert both.touches.sum(1).tolist() == [1] * 8 + [2]
 
 
+def test_a_flat_height_field_is_a_box():
+    field = '<asset><hfield name="h" nrow="3" ncol="3" size="2 1 .3 .2" elevation="{}"/></asset>'
+    place = '<geom type="hfield" hfield="h" pos="1 2 3" axisangle="1 0 0 30" surfacevel=".1 .2 .3 .4 .5 .6"/>'
+    flat, hilly = (scene(place, more=field.format(each)) for each in ("0 0 0 0 0 0 0 0 0", "0 1 0 1 0 1 0 0 1"))
+    (box,), (heights,) = flat.world_contacts.surfaces, hilly.world_contacts.surfaces
+    assert (box.kind, heights.kind) == ("box", "heights") and box.shape is None
+    turned, down = heights.constants[3:12].reshape(3, 3), np.array([0, 0, -0.1])  # half of the depth below the field
+    np.testing.assert_allclose(box.constants[:3], heights.constants[:3] + turned @ down, atol=1e-12)
+    np.testing.assert_allclose(box.constants[12:16], [2, 1, 0.1, 0], atol=1e-12)
+    linear, angular = heights.constants[16:19], heights.constants[19:]
+    np.testing.assert_allclose(box.constants[16:], [*(linear + np.cross(angular, down)), *angular], atol=1e-12)
+
+
 def test_a_base_that_carries_a_robot_is_no_surface():
     link = '<body pos="0 0 .3">{}<geom size=".05" pos=".2 0 0"/></body>'
     arm = f'<body name="base"><geom name="foot" size=".1"/>{link}</body>'

@@ -44,6 +44,7 @@ def find_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surfa
     """A geom as a surface; None of signed distance fields and of meshes without hull. Kinematics are done."""
     kind = _KIND.get(int(model.geom_type[geom]))
     size, rounding, shape, reduced = model.geom_size[geom].copy(), 0.0, None, False
+    velocity, middle = surface_velocities(model)[geom], np.zeros(3)
     match mujoco.mjtGeom(model.geom_type[geom]):
         case _GEOM.mjGEOM_SPHERE:
             size, rounding = np.zeros(3), size[0]
@@ -55,14 +56,18 @@ def find_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surfa
                 shape, reduced = shape[:MOST_FACES], len(shape) > MOST_FACES
         case _GEOM.mjGEOM_HFIELD:
             size, shape = _height_field(model, int(model.geom_dataid[geom]))
+            if (shape == shape[0, 0]).all():  # a box, which the native executor knows
+                depth = float(model.hfield_size[model.geom_dataid[geom], 3])
+                middle[2], size[2] = (shape[0, 0] - depth) / 2, (shape[0, 0] + depth) / 2
+                kind, shape = "box", None
         case _GEOM.mjGEOM_PLANE:
             size = np.zeros(3)  # of the picture alone
     if kind is None or (kind == "hull" and shape is None):
         return None
-    pose = data.geom_xpos[geom], data.geom_xmat[geom]
-    return Surface(
-        geom, kind, np.concatenate((*pose, size, [rounding], surface_velocities(model)[geom])), shape, reduced
-    )
+    turned = data.geom_xmat[geom]
+    pose = data.geom_xpos[geom] + turned.reshape(3, 3) @ middle, turned
+    velocity = velocity + np.concatenate((np.cross(velocity[3:], middle), np.zeros(3)))
+    return Surface(geom, kind, np.concatenate((*pose, size, [rounding], velocity)), shape, reduced)
 
 
 def hull_vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
