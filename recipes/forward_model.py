@@ -155,7 +155,7 @@ def evaluate(
         sequences = collect_trajectories(scene, count, cfg.data.length, cfg.data.seed, split=3, **options)
         if "pace" in options:
             if any(torch.equal(sequences["action"], each) for each in drawn.setdefault(scene.name, [])):
-                continue  # fast controls of legs' motors are calm ones
+                continue  # two paces are the same: calm and fast of legs' motors, fast and full of quick servos
             drawn[scene.name].append(sequences["action"])
         tables[name] = evaluate_errors(model.bind(scene), sequences, horizons=horizons)
     for scene in [task.scene for task in tasks if "system" not in task.scene.origin]:

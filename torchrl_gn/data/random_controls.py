@@ -125,7 +125,7 @@ def random_controls(
 
 
 def has_paces(simulator: Simulator, knot_interval: float = 10.0) -> bool:
-    """Whether calm and fast random controls of a scene differ."""
+    """Whether random controls of a scene depend on their pace."""
     simulator = simulator.without_mocap_actions
     limits = _limits(simulator, knot_interval)
     kinds = {actuator_kind(simulator.scene.model, actuator) for actuator in range(simulator.scene.model.nu)}
