@@ -34,14 +34,19 @@ def load(recipe: str) -> ModuleType:
 
 
 def import_all() -> None:
-    """Import all recipes, to be copied from then on."""
+    """Import all recipes, to be copied from then on, also when others start them."""
     import matplotlib.backends.backend_agg  # noqa: F401
 
     for path in sorted(RECIPES.glob("*.py")):
         load(path.stem)
     from _common import parent, sweeps
 
-    parent.start_child = sweeps.start_child = _start_child  # type: ignore
+    start_program = parent.start_child
+
+    def start_child(command: Sequence[str], **options: Any) -> _Copy | subprocess.Popen:
+        return (_Copy if Path(command[1]).parent == RECIPES else start_program)(command, **options)
+
+    parent.start_child = sweeps.start_child = start_child  # type: ignore
     assert os.listdir("/proc/self/task") == [str(os.getpid())], "copies of a process have one of its threads alone"
 
 
@@ -73,16 +78,6 @@ def run(recipe: str, options: Sequence[str]) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
     return code
-
-
-def _start_child(command: Sequence[str], **options: Any) -> _Copy | subprocess.Popen:
-    """As ``start_child`` of ``_common/parent.py``; other programs than recipes are started, not copied."""
-    from _common import parent
-
-    if Path(command[1]).parent == RECIPES:
-        return _Copy(command, **options)
-    environment = (options.pop("env", None) or os.environ) | {parent._VARIABLE: "1"}
-    return subprocess.Popen(command, stdin=subprocess.PIPE, env=environment, **options)
 
 
 class _Copy:

@@ -44,7 +44,7 @@ def find_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surfa
     """A geom as a surface; None of signed distance fields and of meshes without hull. Kinematics are done."""
     kind = _KIND.get(int(model.geom_type[geom]))
     size, rounding, shape, reduced = model.geom_size[geom].copy(), 0.0, None, False
-    velocity, middle = surface_velocities(model)[geom], np.zeros(3)
+    middle = np.zeros(3)  # of the surface in the geom's frame
     match mujoco.mjtGeom(model.geom_type[geom]):
         case _GEOM.mjGEOM_SPHERE:
             size, rounding = np.zeros(3), size[0]
@@ -64,10 +64,10 @@ def find_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surfa
             size = np.zeros(3)  # of the picture alone
     if kind is None or (kind == "hull" and shape is None):
         return None
-    turned = data.geom_xmat[geom]
-    pose = data.geom_xpos[geom] + turned.reshape(3, 3) @ middle, turned
-    velocity = velocity + np.concatenate((np.cross(velocity[3:], middle), np.zeros(3)))
-    return Surface(geom, kind, np.concatenate((*pose, size, [rounding], velocity)), shape, reduced)
+    rotation, (linear, angular) = data.geom_xmat[geom], np.split(surface_velocities(model)[geom], 2)
+    pose = data.geom_xpos[geom] + rotation.reshape(3, 3) @ middle, rotation
+    velocity = linear + np.cross(angular, middle), angular
+    return Surface(geom, kind, np.concatenate((*pose, size, [rounding], *velocity)), shape, reduced)
 
 
 def hull_vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
