@@ -253,6 +253,18 @@ def test_an_interrupt_stops_the_compiler(fresh, hangs, ends):
     assert ends(hangs(KeyboardInterrupt)[1], 5)
 
 
+def test_a_compiler_ends_with_the_process_that_started_it(tmp_path, ends):
+    place = tmp_path / "process"
+    command = ["sh", "-c", f"sleep 100 & echo $! > '{place}'; wait"]  # as g++ does
+    code = f"import time; from torchrl_gn.dynamics.executors.native import build; build._run([{command}], time.monotonic() + 99)"
+    running = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)})
+    while running.poll() is None and not (place.exists() and place.read_text().endswith("\n")):
+        time.sleep(0.01)
+    running.kill()
+    running.wait()
+    assert ends(int(place.read_text()), 5)
+
+
 def test_a_compiler_that_hangs_at_its_version(monkeypatch):
     monkeypatch.setattr(build, "_ANSWER", 0.2)
     with pytest.raises(NoCompilerError, match="compiler sh was stopped after 0 s"):

@@ -10,6 +10,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 from torchrl_gn.envs import observation_env, suite_env
 from torchrl_gn.scenes import ObservationGraph
+from torchrl_gn.training.experience import episode_state, load_episode_state
 
 
 @pytest.fixture
@@ -150,3 +151,55 @@ def test_actions_of_other_ranges_are_refused():
     graph = ObservationGraph.swimmer(3)
     with pytest.raises(ValueError, match=r"Task lqr lqr_2_1 has actions of -1e\+10 to 1e\+10; policies give -1 to 1"):
         observation_env(graph, "lqr", "lqr_2_1")
+
+
+def test_running_episodes_go_on_elsewhere_as_they_would_have():
+    """Also over an end, after which the next start is drawn as it would have been."""
+
+    def make(seed: int):
+        return observation_env(ObservationGraph.swimmer(4), "swimmer", "swimmer4", num_envs=2, steps=9, seed=seed)
+
+    def go_on(env, start, actions) -> torch.Tensor:
+        return torch.stack([observe(env, start, action) for action in actions])
+
+    def observe(env, state, action) -> torch.Tensor:
+        after, later = env.step_and_maybe_reset(state.set("action", action))
+        state.update(later)
+        return after["next", "observation"]
+
+    env = make(0)
+    actions = 2 * torch.rand(20, *env.action_spec.shape, generator=torch.Generator().manual_seed(0)) - 1
+    state = env.reset()
+    go_on(env, state, actions[:13])  # the second episode runs
+    saved = episode_state(env)
+    assert {len(episode["actions"]) for episode in saved.values()} == {13 - 9}
+    other = make(5)
+    load_episode_state(other, saved)
+    start = other.reset()
+    assert torch.equal(start["observation"], state["observation"])
+    assert torch.equal(go_on(env, state, actions[13:]), go_on(other, start, actions[13:]))
+    assert not torch.equal(other.reset()["observation"], start["observation"])  # the next is a new one
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"random": torch.zeros(3, dtype=torch.int64)},
+        {"random": torch.full((624,), 2**32)},
+        {"drawn": [2**20, 0, 0.0]},  # numpy would read behind its numbers
+        {"drawn": [-1, 0, 0.0]},
+        {"drawn": [1, 2, 0.0]},
+        {"actions": torch.zeros(9, 3).double()},  # as many as an episode has
+        {"actions": torch.full((1, 3), torch.nan).double()},
+        {"actions": torch.zeros(1, 4).double()},
+        {"actions": [[0.0]]},
+    ],
+)
+def test_forged_episodes_are_refused(forged):
+    env = suite_env("swimmer", "swimmer4", steps=9)
+    env.reset()
+    saved = episode_state(env)
+    with pytest.raises(ValueError, match="a running episode is not one of this task"):
+        load_episode_state(env, {"worker0": saved["worker0"] | forged})
+    with pytest.raises(ValueError, match=r"training\.episodes"):
+        load_episode_state(env, {"worker1": saved["worker0"]})

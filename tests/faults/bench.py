@@ -66,7 +66,7 @@ class Bench:
                 wrong.append(f"a second process ends with {second.code}: {second.said[-800:]}")
             if wrong:
                 raise AssertionError(f"{name}: {'; '.join(wrong)}")
-            self._whole[name] = Whole(place, ended, numbers_of(place, exact=CASES[name].exact))
+            self._whole[name] = Whole(place, ended, numbers_of(place))
         return self._whole[name]
 
     def strike(self, name: str, strikes: Sequence[Strike | int]) -> list[str]:
@@ -100,7 +100,7 @@ class Bench:
         if ended.code == 0:
             # Nothing says what a log's numbers were, and some files no later run reads: they stay as they are.
             stays = file.suffix == ".csv" or _content(place / file) == damaged
-            left = self._differences(case, place, whole, without=file if stays else None)
+            left = self._differences(place, whole, without=file if stays else None)
             wrong = [f"other numbers: {left[:5]}"] if left else []
         else:
             logs = "".join(log.read_text(errors="replace") for log in (place / FOLDER).rglob("log.txt"))
@@ -116,16 +116,16 @@ class Bench:
         ended = self._run(case, place)
         if ended.code:
             return [f"lost: it ends with {ended.code}: {ended.said[-800:]}"]
-        wrong = [f"different: {found[:8]}"] if (found := self._differences(case, place, whole)) else []
+        wrong = [f"different: {found[:8]}"] if (found := self._differences(place, whole)) else []
         if not wrong and not os.path.ismount(place / FOLDER):
             shutil.rmtree(place)
         return wrong + _traceback(ended)
 
-    def _differences(self, case: Case, place: Path, whole: Whole, *, without: Path | None = None) -> list[str]:
+    def _differences(self, place: Path, whole: Whole, *, without: Path | None = None) -> list[str]:
         if without is not None:
             shutil.rmtree(place / without, ignore_errors=True)
             (place / without).unlink(missing_ok=True)
-        found = differences(whole.numbers, numbers_of(place, exact=case.exact))
+        found = differences(whole.numbers, numbers_of(place))
         own = "" if without is None else without.relative_to(FOLDER).as_posix()
         return [name for name in found if name.partition(": ")[0] != own]
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import (
     CatTensors,
     DMControlWrapper,
@@ -104,7 +106,54 @@ def _load(domain: str, task: str, seed: int) -> Any:
     return suite.load(domain, task, {"random": seed})
 
 
-def _make(domain: str, task: str, timestep: float | None, steps: int | None, *, seed: int) -> DMControlWrapper:
+class _SuiteEnv(DMControlWrapper):
+    """A task of the suite that saves and resumes its running episode: the draws before its start, and its actions.
+
+    Tasks keep targets and counts where they like, so that the episode is played again rather than set.
+    """
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env, device=torch.device("cpu"))
+        self._random = env.task.random.get_state()
+        self._actions: list[Tensor] = []
+        self._resumed: dict[str, Any] | None = None
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
+        resumed, self._resumed = self._resumed, None
+        if resumed is not None:
+            self._env.task.random.set_state(("MT19937", resumed["random"].numpy().astype(np.uint32), *resumed["drawn"]))
+        self._random, self._actions = self._env.task.random.get_state(), []
+        start = super()._reset(tensordict, **options)
+        for action in () if resumed is None else resumed["actions"]:
+            start = self._step(TensorDict({self.action_key: action})).select(*start.keys())
+        return start
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._actions.append(tensordict[self.action_key].clone())
+        return super()._step(tensordict)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The running episode, which the next reset after :meth:`set_extra_state` plays again."""
+        _, random, *drawn = self._random
+        actions = torch.stack(self._actions) if self._actions else torch.empty(0, *self.action_spec.shape)
+        return {"random": torch.from_numpy(random.astype(np.int64)), "drawn": drawn, "actions": actions.double()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """ValueError if it is no episode of this task."""
+        random, drawn, actions = (state.get(name) for name in ("random", "drawn", "actions"))
+        like = isinstance(random, Tensor) and random.dtype == torch.int64 and random.shape == (624,)
+        like = like and bool(((random >= 0) & (random < 2**32)).all())
+        # numpy does not check the first, a place in the numbers.
+        like = like and isinstance(drawn, list) and [type(each) for each in drawn] == [int, int, float]
+        like = like and 0 <= drawn[0] <= 624 and drawn[1] in (0, 1) and np.isfinite(drawn[2])
+        like = like and isinstance(actions, Tensor) and actions.dtype == torch.float64
+        like = like and actions.shape[1:] == self.action_spec.shape and bool(actions.isfinite().all())
+        if not like or len(actions) >= self._env._step_limit:
+            raise ValueError("a running episode is not one of this task")
+        self._resumed = state
+
+
+def _make(domain: str, task: str, timestep: float | None, steps: int | None, *, seed: int) -> _SuiteEnv:
     loaded = _load(domain, task, seed)
     step = loaded.control_timestep() if timestep is None else timestep
     physics_step = loaded.physics.timestep()
@@ -114,4 +163,4 @@ def _make(domain: str, task: str, timestep: float | None, steps: int | None, *, 
     limit = loaded._step_limit * loaded.control_timestep() if steps is None else (steps - 0.5) * step
     *_, control = _suite()
     env = control.Environment(loaded.physics, loaded.task, time_limit=limit, control_timestep=step)
-    return DMControlWrapper(env, device=torch.device("cpu"))
+    return _SuiteEnv(env)

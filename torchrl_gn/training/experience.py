@@ -11,11 +11,13 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training.nested_state import require_like
+
+_EPISODE = "_extra_state"  # torch's name of what a module saves beside tensors
 
 
 def make_collector(
@@ -52,6 +54,33 @@ def device_of(policy: TensorDictModuleBase) -> torch.device | None:
 def _seeded(make: Callable[[], EnvBase], seed: int) -> EnvBase:
     env = make()
     env.set_seed(seed)
+    return env
+
+
+def episode_state(env: EnvBase) -> dict[str, Any]:
+    """Return the running episodes of environments by name; nothing of closed ones and those that cannot resume."""
+    serial = _without_transforms(env)
+    return {} if serial.is_closed else _episodes(serial)
+
+
+def load_episode_state(env: EnvBase, state: dict[str, Any]) -> None:
+    """Let the next reset go on with the episodes of :func:`episode_state`; ValueError if they are none of ``env``."""
+    serial = _without_transforms(env)
+    names = _episodes(serial)
+    require_like(dict.fromkeys(names, {}), state, "training.episodes")
+    if names:
+        serial.load_state_dict({name: {_EPISODE: state[name]} for name in names})
+
+
+def _episodes(env: EnvBase) -> dict[str, Any]:
+    if not isinstance(env, SerialEnv):
+        return {}
+    return {name: state[_EPISODE] for name, state in env.state_dict().items() if _EPISODE in state}
+
+
+def _without_transforms(env: EnvBase) -> EnvBase:
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
     return env
 
 

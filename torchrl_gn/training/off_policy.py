@@ -23,7 +23,14 @@ from torchrl_gn.finite import require_finite
 from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.policies import Agent
-from torchrl_gn.training.experience import buffer_state, device_of, load_buffer_state, make_collector
+from torchrl_gn.training.experience import (
+    buffer_state,
+    device_of,
+    episode_state,
+    load_buffer_state,
+    load_episode_state,
+    make_collector,
+)
 from torchrl_gn.training.nested_state import require_amounts, require_like
 from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
 
@@ -68,7 +75,9 @@ class OffPolicyTrainer:
         max_norm: norm that the joint gradient is clipped to.
         compile: compile losses and gradients: minutes at the second update, faster ones after it. None: where
             torch and a C++ compiler can.
-        seed: seed of the replay buffer, and of the environments of a resumed run.
+        seed: seed of the replay buffer; also of the environments of a resumed run if they cannot resume their episodes.
+
+    A resumed run ends in the numbers of a whole one where ``env`` are of :func:`~torchrl_gn.envs.suite_env`.
     """
 
     def __init__(
@@ -117,6 +126,9 @@ class OffPolicyTrainer:
         self.frames, self.updates, self.seconds, self.owed = 0, 0, 0.0, 0.0
         self.curve = LearningCurve()
         self.seed = seed
+        self._recent: dict[str, list[float]] = {}  # losses of the batch's updates
+        self._episodes: dict[str, Any] = {}  # as of the last whole batch
+        self._draws = self._drawn()  # as of the last whole step, as an interrupt may come after some of the next one
         self._weights = [p for group in optimizer.param_groups for p in group["params"]]
         if compile is not False:
             try:
@@ -132,6 +144,7 @@ class OffPolicyTrainer:
 
         Ctrl-C and SIGTERM, at once while experience is collected or judged, never come in the middle of a change.
         """
+        self._draws = self._drawn()
         if not self.curve.frames:
             self._evaluate()
         if self.owed >= 1 or self._evaluation_is_due:  # interrupted between a batch and its updates
@@ -141,12 +154,13 @@ class OffPolicyTrainer:
         collector = make_collector(
             self.env,
             self.exploration_policy,
-            # New episodes on resuming: the same seed would repeat the first ones.
-            seed=self.seed + self.frames if self.frames else None,
+            # New episodes on resuming, if they cannot go on: the same seed would repeat the first ones.
+            seed=self.seed + self.frames if self.frames and not self._episodes else None,
             frames_per_batch=self.per_batch,
             total_frames=self.total - self.frames,
             init_random_frames=max(0, self.random_frames - self.frames),
         )
+        torch.set_rng_state(self._draws["global"])  # it makes trials
         threads = torch.get_num_threads()
         try:
             start, batches = time.perf_counter(), iter(collector)
@@ -164,15 +178,15 @@ class OffPolicyTrainer:
 
     def _learn(self, start: float) -> LearningProgress:
         """Make the updates owed, and evaluate if due; ``start`` is when collecting began."""
-        losses: dict[str, list[float]] = {}
         while self.owed >= 1:
             with held():
                 for name, value in self.update().items():
-                    losses.setdefault(name, []).append(value)
+                    self._recent.setdefault(name, []).append(value)
                 self.owed -= 1
         self.seconds += time.perf_counter() - start
         evaluation = self._evaluate() if self._evaluation_is_due else None
-        means = {name: sum(values) / len(values) for name, values in losses.items()}
+        means = {name: sum(values) / len(values) for name, values in self._recent.items()}
+        self._recent = {}
         return LearningProgress(self.frames, self.updates, self.seconds, means, evaluation)
 
     @property
@@ -192,6 +206,11 @@ class OffPolicyTrainer:
             self.frames += len(steps)
             if self.frames > self.random_frames:
                 self.owed += self.updates_per_frame * len(steps)
+            self._episodes = episode_state(self.env) if isinstance(self.env, EnvBase) else {}
+            self._draws = self._drawn()
+
+    def _drawn(self) -> dict[str, torch.Tensor]:
+        return {"buffer": self.generator.get_state(), "global": torch.get_rng_state()}
 
     @without_autocast
     def update(self) -> dict[str, float]:
@@ -211,16 +230,21 @@ class OffPolicyTrainer:
             self.optimizer.step()
             self.target.step()
             self.updates += 1
+            self._draws = self._drawn()
         return values
 
     def _first_loss(self, batch: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Compute the losses eagerly, and compile them for later updates."""
+        """Compute the losses eagerly, the first time, and compile them for later updates."""
         # TorchRL's losses create modules at their first call, after which all would compile again. The warning is about
         # an option that tensordict reads and torch has deprecated.
         warnings.filterwarnings("ignore", "torch._dynamo.config.inline_inbuilt_nn_modules", FutureWarning)
         keep_inductor_private()
-        self._loss = torch.compile(self._total_loss, fullgraph=True, dynamic=False)
-        return self._total_loss(batch)
+        self._loss, draws = torch.compile(self._total_loss, fullgraph=True, dynamic=False), torch.get_rng_state()
+        first = self._total_loss(batch)
+        if not self.updates:
+            return first
+        torch.set_rng_state(draws)
+        return self._loss(batch)  # a resumed run's first, as in a whole one
 
     def _total_loss(self, batch: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Return the sum of all losses, and each by name, detached."""
@@ -238,16 +262,19 @@ class OffPolicyTrainer:
             for name in ("frames", "updates", "seconds"):
                 getattr(self.curve, name).append(getattr(self, name))
             self.curve.returns.append(value)
+            self._draws = self._drawn()
         return value
 
     def state_dict(self) -> dict[str, Any]:
-        """State to resume from, without the agent; running episodes are not kept."""
+        """State to resume from, without the agent."""
         return {
             "losses": [dict(loss.state_dict()) for loss in self.losses],
             "optimizer": self.optimizer.state_dict(),
             "target_counter": self.target.counter,
             "buffer": buffer_state(self.buffer),
-            "generators": {"buffer": self.generator.get_state(), "global": torch.get_rng_state()},
+            "generators": self._draws,
+            "episodes": self._episodes,
+            "recent": self._recent,
             "curve": vars(self.curve),
             "progress": {name: getattr(self, name) for name in ("frames", "updates", "seconds", "owed")},
         }
@@ -260,7 +287,8 @@ class OffPolicyTrainer:
         own = self.state_dict()
         curve = {name: [] for name in own["curve"]}
         # Optimiser and buffer are checked as they are loaded.
-        require_like({**own, "optimizer": {}, "buffer": {}, "curve": curve}, state)
+        require_like({**own, "optimizer": {}, "buffer": {}, "curve": curve, "episodes": {}, "recent": {}}, state)
+        require_like(dict.fromkeys(state["recent"], []), state["recent"], "training.recent")
         require_amounts(state["progress"])
         if len({len(state["curve"][name]) for name in curve}) > 1:
             raise ValueError("training.curve has lists of several lengths")
@@ -272,9 +300,13 @@ class OffPolicyTrainer:
         load_optimizer(self.optimizer, state["optimizer"])
         self.target.counter = state["target_counter"]
         load_buffer_state(self.buffer, state["buffer"], self.capacity, self.agent.graph)
+        if state["episodes"] and isinstance(self.env, EnvBase):
+            load_episode_state(self.env, state["episodes"])
+            self._episodes = state["episodes"]
         self.generator.set_state(state["generators"]["buffer"])
         torch.set_rng_state(state["generators"]["global"])
         self.curve = LearningCurve(**{name: list(state["curve"][name]) for name in curve})
+        self._recent = {name: list(values) for name, values in state["recent"].items()}
         for name in own["progress"]:
             setattr(self, name, state["progress"][name])
 

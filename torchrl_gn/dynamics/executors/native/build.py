@@ -164,6 +164,16 @@ def instruction_flags() -> list[str]:
     return sets.get(torch.backends.cpu.get_cpu_capability(), [])
 
 
+# A command whose session is killed once the standard input closes, as it does with the process that started it.
+_WATCHED = """
+exec 3<&0 </dev/null
+(read -r line <&3; kill -9 0) & watch=$!
+"$@" 3<&-; code=$?
+kill -9 $watch
+exit $code
+"""
+
+
 def _run(commands: Sequence[Sequence[str]], deadline: float) -> list[str]:
     """What commands write, which run at once; none goes on after the deadline, a failure or an interrupt."""
     begin, running = time.monotonic(), []
@@ -173,7 +183,11 @@ def _run(commands: Sequence[Sequence[str]], deadline: float) -> list[str]:
             try:
                 # A session of their own, as compilers start processes that outlive them.
                 process = subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=files[0], stderr=files[1], start_new_session=True
+                    ["sh", "-c", _WATCHED, "sh", *command],
+                    stdin=subprocess.PIPE,
+                    stdout=files[0],
+                    stderr=files[1],
+                    start_new_session=True,
                 )
             except OSError as error:
                 raise _failure(command, str(error)) from error
@@ -199,6 +213,8 @@ def _kill(process: subprocess.Popen) -> None:
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
 
 
 def _failure(command: Sequence[str], text: str) -> NoCompilerError:
