@@ -31,7 +31,7 @@ from tqdm import tqdm
 from _common import as_list, clean_exit, open_log, refuse_other_options, with_help
 from _common.sweeps import FORWARD_MODEL, Run, mean_and_half_range, refuse_changes, report_sweep, run_all
 from _common.swimming import find_gait, swim, swim_by_policy
-from torchrl_gn.data import create_dataset
+from torchrl_gn.data import create_dataset, save_tensors
 from torchrl_gn.evaluation import evaluate_errors, rollout_video
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, load_pretrained
@@ -102,7 +102,7 @@ def main(cfg: DictConfig) -> None:
         swimming = {name: swim(scene, gait, cfg.swimming[name], cfg.length, rng) for name in ("train", "test")}
         metrics["gait/distance"] = far
         metrics |= {f"gait/{name}": float(value) for name, value in zip(("height", "Hz", "lag"), gait, strict=True)}
-    swimming["train"].memmap(str(place), copy_existing=True)
+    save_tensors(place, swimming["train"])
     state = swimming["test"]["state"][0]
     rollout_video(scene, state, state, folder.file("swimming.gif"))
 

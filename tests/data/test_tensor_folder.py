@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -10,7 +11,9 @@ import pytest
 import torch
 from tensordict import LazyStackedTensorDict, NonTensorData, TensorDict
 
-from torchrl_gn.data import open_tensors
+from torchrl_gn.data import open_tensors, save_tensors
+
+from ..faults.bench import can_mount, disk
 
 GENERATOR = torch.Generator().manual_seed(0)
 DTYPES = [
@@ -41,6 +44,36 @@ def folder(tmp_path) -> Path:
     tensors = {"state": torch.rand(4, 3, generator=GENERATOR), "inner": {"action": torch.arange(8.0).view(4, 2)}}
     TensorDict(tensors, [4]).memmap(str(tmp_path / "d"))
     return tmp_path / "d"
+
+
+def test_what_is_saved_is_opened_also_over_what_was_there(folder):
+    for factor in (1, 2):
+        numbers = factor * torch.rand(7, 2, generator=GENERATOR)
+        save_tensors(folder, TensorDict({"state": numbers, "inner": {"action": numbers[:, 0].double()}}, [7]))
+        found = open_tensors(folder)
+        assert found.batch_size == (7,) and torch.equal(found["state"], numbers)
+        assert torch.equal(found["inner", "action"], numbers[:, 0].double())
+
+
+def test_without_room_nothing_ends_but_the_call(tmp_path, files_end_at):
+    large = TensorDict({"state": torch.ones(5000, 3)}, [5000])
+    with (
+        files_end_at(20_000),
+        pytest.raises(OSError, match=r"d cannot be written: .*\. Make room and run the same again"),
+    ):
+        save_tensors(tmp_path / "d", large)
+    save_tensors(tmp_path / "d", large)
+    assert torch.equal(open_tensors(tmp_path / "d")["state"], large["state"])
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4, 0.8])
+def test_on_a_full_disk_nothing_ends_but_the_call(tmp_path, share):
+    if not can_mount(tmp_path):
+        pytest.skip("needs leave to mount a disk in memory")
+    data = TensorDict({name: torch.ones(5000, 3) for name in "abc"}, [5000])
+    with disk(tmp_path / "small", int(share * 3 * 60_000)), pytest.raises(OSError) as caught:
+        save_tensors(tmp_path / "small" / "d", data)
+    assert caught.value.errno == errno.ENOSPC
 
 
 def contents(folder: Path) -> dict[Path, bytes]:

@@ -18,7 +18,7 @@ from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.cuda import CudaExecutor, nvrtc, source
 from torchrl_gn.dynamics.executors.cuda.nvrtc import THREADS
 from torchrl_gn.dynamics.executors.native.build import find_compiler
-from torchrl_gn.scenes import sample_variants
+from torchrl_gn.scenes import load_scene, sample_variants
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C++ compiler")
 
@@ -107,6 +107,31 @@ def test_rollouts_and_gradients_are_those_of_torch(host, wide, inputs, name, dty
     for a, b in zip(found, wanted, strict=True):
         torch.testing.assert_close(a.double(), b, **tolerance)
     torch.testing.assert_close(step, found[0][:, :, 1])
+
+
+_HILLS = """<mujoco><asset><hfield name="h" nrow="3" ncol="3" size="2 2 .3 .1" elevation="0 1 0 1 0 1 0 0 1"/></asset>
+<worldbody><geom type="hfield" hfield="h"/>
+<body name="ball"><freejoint/><geom type="sphere" size=".1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.slow
+def test_heights_below_a_body_are_looked_up(host, fit):
+    scene = load_scene(_HILLS)
+    torch.manual_seed(0)
+    model = fit(ForwardModel.for_scene(scene, latent=4, hidden=8), scene).double().requires_grad_(False)
+    program = specialize(model.bind(scene), executor="eager").program()
+    state = torch.as_tensor(scene.reference_state).repeat(12, 1, 1)
+    generator = torch.Generator().manual_seed(0)
+    state[:, 1, :3] = 1.8 * torch.rand(12, 3, generator=generator, dtype=torch.float64) - 0.9
+    state[:, 1, 2] = 0.3
+    actions = state.new_zeros(12, 2, 0)
+    executor = CudaExecutor(program, make=host)
+    assert executor.reason is None
+    runs = (eager, executor)
+    for a, b in zip(
+        *(_pull(lambda *given, r=r: r.rollout(program, *given)[0], state, actions) for r in runs), strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
 
 
 def test_without_cudas_compiler_torch_runs_it(wide, inputs, monkeypatch):

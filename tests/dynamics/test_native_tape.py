@@ -30,6 +30,7 @@ OPERATIONS = {
     "less_c": lambda k, a, *_: float(a < k),
     "greater_c": lambda k, a, *_: float(a > k),
     "equal_c": lambda k, a, *_: float(a == k),
+    "floor": lambda k, a, *_: np.floor(a),
     "add": lambda k, a, b, *_: a + b,
     "sub": lambda k, a, b, *_: a - b,
     "mul": lambda k, a, b, *_: a * b,
@@ -55,7 +56,11 @@ def run(tape: Tape, *groups: np.ndarray) -> list[np.ndarray]:
     for end, outputs in zip(tape.phases, tape.outputs, strict=True):
         for code, out, a, b, c, _, k in tape.instructions[start:end].tolist():
             operands = (registers[each] for each in (a, b, c))
-            registers[out] = OPERATIONS[NAMES[code]](tape.constants[k], *operands)
+            if NAMES[code] == "look_up":
+                table = tape.constants[k + 1 : k + 1 + int(tape.constants[k])]
+                registers[out] = table[int(np.clip(next(operands), 0, len(table) - 1))]
+            else:
+                registers[out] = OPERATIONS[NAMES[code]](tape.constants[k], *operands)
         found.append(registers[outputs])
         start = end
     return found
@@ -70,7 +75,7 @@ def symbols(graph: Expressions, values: torch.Tensor, varying: torch.Tensor) -> 
 
 
 def test_every_operation_is_known_here():
-    assert set(OPERATIONS) | {"input"} == set(CODES)
+    assert set(OPERATIONS) | {"input", "look_up"} == set(CODES)
 
 
 def test_constants_vanish():
@@ -120,6 +125,32 @@ def mixture(x: torch.Tensor) -> torch.Tensor:
         torch.linalg.cross(x[:3], x[3:]).sum() + quaternion.product(x[:4], x[2:]).sum(),
     ]
     return torch.stack(parts)
+
+
+@pytest.mark.parametrize("value", [0.3, 1.7, 2.0, -0.4, 5.5])
+def test_numbers_of_a_table_are_looked_up(value):
+    """By a place that depends on the state, such as the cell of a height field; equal tables are one."""
+    table = torch.tensor([4.0, -1, 2, 7], dtype=torch.float64)
+
+    def chosen(x: torch.Tensor) -> torch.Tensor:
+        place = torch.minimum(x.floor().clamp(min=0), torch.tensor(3.0)).long()
+        return torch.stack((x * table[place], table.clone()[place]))
+
+    graph = Expressions()
+    inputs = graph.inputs(0, 1)
+    (found,) = trace(lambda x: (chosen(x[0]),), np.array(inputs, dtype=object))
+    slope = gradient(graph, found.tolist(), [1.0, 1.0], inputs)
+    tape = assemble(graph, [inputs], [found.tolist(), slope])
+    x = torch.tensor(value, dtype=torch.float64)
+    values, slopes = run(tape, x.numpy().reshape(1))
+    assert values.tolist() == chosen(x).tolist() and slopes.tolist() == chosen(x)[1:].tolist()
+    assert len(graph.tables) == 1
+
+
+def test_a_varying_place_in_what_varies_has_no_scalar_form():
+    array = np.array(Expressions().inputs(0, 2), dtype=object)
+    with pytest.raises(UntraceableError, match="varying indices of anything but a list of constants"):
+        trace(lambda x: (x[x[:1].floor().long()],), array)
 
 
 @pytest.mark.parametrize("seed", range(4))

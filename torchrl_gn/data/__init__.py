@@ -32,5 +32,6 @@ from torchrl_gn.data.start_poses import StartPoses as StartPoses
 from torchrl_gn.data.start_poses import StartPoseWarning as StartPoseWarning
 from torchrl_gn.data.start_states import sample_start_states as sample_start_states
 from torchrl_gn.data.tensor_folder import open_tensors as open_tensors
+from torchrl_gn.data.tensor_folder import save_tensors as save_tensors
 from torchrl_gn.data.uncontrolled import UncontrolledSceneWarning as UncontrolledSceneWarning
 from torchrl_gn.scenes.actuator_kinds import actuator_kind as actuator_kind

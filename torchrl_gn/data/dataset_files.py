@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import zlib
 from contextlib import AbstractContextManager, nullcontext
 from importlib.metadata import version
@@ -14,8 +13,8 @@ import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
-from torchrl_gn.atomic import naming_full_disk, parse_json, remove_leftovers, sync_all, write_json
-from torchrl_gn.data.tensor_folder import open_tensors
+from torchrl_gn.atomic import parse_json, remove_leftovers, sync_all, write_json
+from torchrl_gn.data.tensor_folder import create_tensors, open_tensors
 
 FORMAT = 6
 SPLITS = ("train", "validation", "test")
@@ -114,11 +113,7 @@ class DatasetFiles:
                 raise DatasetError(f"{place}: a link, through which nothing is written. {_REMEDY}")
         if not chunks:
             size = self.manifest["request"]["sizes"][split]
-            _make_files(cast(TensorDict, rows[:1]).expand(size), folder)
-            for file in folder.rglob("*.memmap") if hasattr(os, "posix_fallocate") else ():
-                # A full disk raises here; later it would kill the process.
-                with naming_full_disk(file), open(file, "r+b") as stream:
-                    os.posix_fallocate(stream.fileno(), 0, file.stat().st_size)
+            create_tensors(folder, cast(TensorDict, rows[:1]).expand(size))
         TensorDict.load_memmap(folder, allow_pickle=False)[first : first + len(rows)] = rows
         sync_all(folder)
         layout = {file.relative_to(folder).as_posix(): file for file in sorted(folder.rglob("meta.json"))}
@@ -154,17 +149,6 @@ class DatasetFiles:
                     where = f"{folder / name}: sequences {first} to {first + len(rows) - 1}"
                     raise DatasetError(f"{where} do not have their checksum: damaged. {_REMEDY}")
         return data
-
-
-def _make_files(like: TensorDict, folder: Path) -> None:
-    """Map tensors of a shape from new files; OSError if these would be larger than files may be."""
-    try:
-        like.memmap_like(str(folder))
-    except RuntimeError as error:
-        if (number := re.search(r"unable to resize file .*\((\d+)\)$", str(error))) is None:
-            raise
-        what = f"{folder} cannot be written: {os.strerror(int(number[1]))}. Make room and run the same again"
-        raise OSError(int(number[1]), what) from error
 
 
 def _wrong(manifest: dict) -> str | None:

@@ -1,4 +1,4 @@
-"""Read folders of memory-mapped TensorDicts: tensors alone, without pickle, and without writing to them."""
+"""Folders of memory-mapped TensorDicts: read without pickle and without writing to them, written with room on disk."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+
+from torchrl_gn.atomic import naming_full_disk, sync_all
 
 _DTYPES = {
     str(dtype): dtype
@@ -37,6 +39,31 @@ def open_tensors(folder: str | os.PathLike) -> TensorDict:
     folder = Path(folder)
     _, batch = _layout(folder)
     return TensorDict(dict(_tensors(folder, batch, ())), batch_size=batch)
+
+
+def save_tensors(folder: str | os.PathLike, data: TensorDict) -> None:
+    """Write tensors to a folder that :func:`open_tensors` reads, over what was there; OSError without room for them."""
+    folder = Path(folder)
+    create_tensors(folder, data)
+    TensorDict.load_memmap(folder, allow_pickle=False).copy_(data)
+    sync_all(folder)
+
+
+def create_tensors(folder: Path, like: TensorDict) -> None:
+    """Make the files of tensors of a shape, with room on disk for them; OSError without.
+
+    Without room, a write to a mapped file would kill the process.
+    """
+    try:
+        like.memmap_like(str(folder))
+    except RuntimeError as error:
+        if (number := re.search(r"unable to (?:resize|write to|stretch) file .*\((\d+)\)$", str(error))) is None:
+            raise
+        what = f"{folder} cannot be written: {os.strerror(int(number[1]))}. Make room and run the same again"
+        raise OSError(int(number[1]), what) from error
+    for file in folder.rglob("*.memmap") if hasattr(os, "posix_fallocate") else ():
+        with naming_full_disk(file), open(file, "r+b") as stream:
+            os.posix_fallocate(stream.fileno(), 0, file.stat().st_size)
 
 
 def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Tensor]]:

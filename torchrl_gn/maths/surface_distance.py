@@ -83,7 +83,7 @@ def from_heights(point: Tensor, heights: Tensor, half: Tensor, nowhere: float) -
     rows, columns = heights.shape
     last = torch.tensor([columns - 1, rows - 1], dtype=half.dtype, device=half.device)
     place = (point[..., :2] / half + 1) * 0.5 * last
-    cell = torch.minimum(place.floor().clamp(min=0), last - 1)
+    cell = torch.minimum(torch.where(place > 0, place.floor(), 0.0), last - 1)  # of NaN, too, there is one
     u, v = (place - cell).unbind(-1)
     column, row = cell.long().unbind(-1)
     flat, start = heights.flatten(), row * columns + column
@@ -94,5 +94,5 @@ def from_heights(point: Tensor, heights: Tensor, half: Tensor, nowhere: float) -
     slope = torch.stack((along, across), dim=-1) * (0.5 * last / half)
     normal = torch.cat((-slope, torch.ones_like(slope[..., :1])), dim=-1)
     normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    inside = (point[..., :2].abs() <= half).all(-1)
-    return torch.where(inside, (point[..., 2] - height) * normal[..., 2], nowhere), normal
+    beside = (point[..., :2].abs() - half).amax(-1) > 0
+    return torch.where(beside, nowhere, (point[..., 2] - height) * normal[..., 2]), normal

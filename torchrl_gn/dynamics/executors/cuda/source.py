@@ -30,6 +30,8 @@ _EXPRESSIONS = {
     "less_c": "{a} < {k} ? 1.0 : 0.0",
     "greater_c": "{a} > {k} ? 1.0 : 0.0",
     "equal_c": "{a} == {k} ? 1.0 : 0.0",
+    "floor": "floor({a})",
+    "look_up": "look_up(table_{table}, {a})",
     "add": "{a} + {b}",
     "sub": "{a} - {b}",
     "mul": "{a} * {b}",
@@ -84,11 +86,11 @@ def kernel_sources(name: str, maths: StateMaths, layout: Layout, types: KernelTy
     )
     kinds = "\n".join(f"typedef {kind} {letter};" for letter, kind in zip("SAW", astuple(types), strict=True))
     head = f'extern "C" __global__ void __launch_bounds__({THREADS}) {name}'
-    sources = []
+    sources, tables = [], _tables(tape)
     for lines in parts:
         body = "\n  ".join(lines)
         sources.append(
-            f"{_PRELUDE}\n{kinds}\n\n{head}(long long n, long long stride, {parameters}) {{\n"
+            f"{_PRELUDE}\n{kinds}\n{tables}\n{head}(long long n, long long stride, {parameters}) {{\n"
             f"  const long long s = blockIdx.x * {THREADS}ll + threadIdx.x;\n  if (s >= n) return;\n  {body}\n}}\n"
         )
     return sources, tape.registers if len(sources) > 1 else 0
@@ -195,10 +197,11 @@ def _statements(
             _NAMES[int(each["code"])],
             [int(each[name]) for name in "abc"],
             float(tape.constants[each["k"]]),
+            int(each["k"]),
         )
         for each in tape.instructions
     ]
-    instructions = [(out, code, operands[: OPERATIONS[code]], k) for out, code, operands, k in instructions]
+    instructions = [(out, code, operands[: OPERATIONS[code]], *k) for out, code, operands, *k in instructions]
     last = {out: position for position, (out, *_) in enumerate(instructions)}
     stores: dict[int, list[str]] = {}
     for index, register in enumerate(tape.outputs[0]):
@@ -210,7 +213,7 @@ def _statements(
     for part in reversed(parts):
         leaves.append(read_later & {instructions[position][0] for position in part})
         for position in reversed(part):
-            out, _, operands, _ = instructions[position]
+            out, _, operands, *_ = instructions[position]
             read_later.discard(out)
             read_later |= {each for each in operands if each not in inputs}
     leaves.reverse()
@@ -223,19 +226,28 @@ def _statements(
                 lines += [inputs[register], *stores[register]]
                 known.add(register)
         for position in part:
-            out, code, operands, k = instructions[position]
+            out, code, operands, k, table = instructions[position]
             for register in operands:
                 if register not in known:
                     lines.append(inputs.get(register, f"r{register} = scratch[{register} * n + s];"))
             known |= {out, *operands}
             names = dict(zip("abc", (f"r{register}" for register in operands), strict=False))
-            lines.append(f"r{out} = {_EXPRESSIONS[code].format(k=_number(k), **names)};")
+            lines.append(f"r{out} = {_EXPRESSIONS[code].format(k=_number(k), table=table, **names)};")
             if last[out] == position:
                 lines += stores.get(out, [])
         lines += [f"scratch[{register} * n + s] = r{register};" for register in sorted(left)]
         declared = f"double {', '.join(f'r{each}' for each in sorted(known))};" if known else ""
         found.append([declared, *lines])
     return found
+
+
+def _tables(tape: Tape) -> str:
+    """The tables that a tape chooses from, by their places among its constants."""
+    found = []
+    for start in np.unique(tape.instructions["k"][tape.instructions["code"] == CODES["look_up"]]).tolist():
+        numbers = tape.constants[start : start + 1 + int(tape.constants[start])]
+        found.append(f"__device__ const double table_{start}[] = {{{', '.join(map(_number, numbers.tolist()))}}};\n")
+    return "".join(found)
 
 
 def _zeros(name: str, maths: StateMaths, at: Layout) -> list[str]:
@@ -260,6 +272,11 @@ _PRELUDE = """\
 // NaN if either is.
 __device__ __forceinline__ double larger(double a, double b) { return (a < b) | (b != b) ? b : a; }
 __device__ __forceinline__ double smaller(double a, double b) { return (b < a) | (b != b) ? b : a; }
+// Number x of a table, which begins with its size; the nearest one beyond its ends, the first for NaN.
+__device__ __forceinline__ double look_up(const double* table, double x) {
+  const double last = *table - 1.0, place = x < last ? x : last;
+  return table[1 + (place > 0.0 ? (long long)place : 0)];
+}
 
 struct bfloat16 {
   unsigned short bits;

@@ -18,14 +18,15 @@ OPERATIONS = {
     for arity, names in enumerate(
         (
             "constant input",
-            "add_c sub_c mul_c div_c sqrt sin cos abs max_c min_c less_c greater_c equal_c",
+            "add_c sub_c mul_c div_c sqrt sin cos abs max_c min_c less_c greater_c equal_c floor look_up",
             "add sub mul div atan2 max min less madd_c",
             "where madd nmadd",
         )
     )
     for name in names.split()
 }
-"""``sub_c`` is constant - x and ``div_c`` constant / x; ``madd`` is a * b + c, ``nmadd`` c - a * b."""
+"""``sub_c`` is constant - x and ``div_c`` constant / x; ``madd`` is a * b + c, ``nmadd`` c - a * b; ``look_up`` is the
+number of a table, the constant, that an index names."""
 
 
 class UntraceableError(RuntimeError):
@@ -40,6 +41,7 @@ class Expressions:
     def __init__(self) -> None:
         self.nodes: list[tuple[str, tuple[int, ...], float]] = []  # operation, operands, constant
         self._known: dict[tuple, int] = {}
+        self.tables: list[np.ndarray] = []  # constants that expressions choose from, each [size] float64
 
     def make(self, operation: str, operands: tuple[int, ...] = (), constant: float = 0.0) -> Scalar:
         key = operation, operands, constant
@@ -48,6 +50,14 @@ class Expressions:
         if index == count:
             self.nodes.append(key)
         return Scalar(self, index)
+
+    def table(self, values: np.ndarray) -> int:
+        """Number of a table of constants ``[size]``."""
+        for number, each in enumerate(self.tables):
+            if np.array_equal(each, values):
+                return number
+        self.tables.append(np.array(values, dtype=np.float64))
+        return len(self.tables) - 1
 
     def inputs(self, name: int, count: int) -> list[Scalar]:
         """New inputs of a group."""
@@ -148,7 +158,7 @@ def _function(operation: str, of_number: Callable[[float], float]) -> Callable[[
     return apply
 
 
-sqrt, sin, cos = (_function(name, getattr(np, name)) for name in ("sqrt", "sin", "cos"))
+sqrt, sin, cos, floor = (_function(name, getattr(np, name)) for name in ("sqrt", "sin", "cos", "floor"))
 absolute = _function("abs", abs)
 
 
@@ -163,6 +173,13 @@ def where(condition: Any, a: Any, b: Any) -> Any:
     graph = condition.graph
     a, b = (each if isinstance(each, Scalar) else graph.make("constant", (), float(each)) for each in (a, b))
     return graph.make("where", (condition.index, a.index, b.index))
+
+
+def look_up(values: np.ndarray, index: Any) -> Any:
+    """``values[index]`` of constants ``[size]``, where the index is a whole number; the nearest one's beyond them."""
+    if isinstance(index, Scalar):
+        return index._one("look_up", index.graph.table(values))
+    return float(values[int(index)])
 
 
 def _extreme(name: str, of_numbers: Callable) -> Callable[[Any, Any], Any]:
@@ -240,6 +257,8 @@ _PULL: dict[str, Callable[..., tuple[Any, ...]]] = {
     "less_c": lambda g, out, c, a: (0.0,),
     "greater_c": lambda g, out, c, a: (0.0,),
     "equal_c": lambda g, out, c, a: (0.0,),
+    "floor": lambda g, out, c, a: (0.0,),
+    "look_up": lambda g, out, c, a: (0.0,),
     "add": lambda g, out, c, a, b: (g, g),
     "sub": lambda g, out, c, a, b: (g, -g),
     "mul": lambda g, out, c, a, b: (g * b, g * a),

@@ -161,6 +161,11 @@ def _slice(a: Array, dim: int = 0, start: int | None = None, end: int | None = N
 
 
 def _index(a: Any, indices: Sequence[Any]) -> Array:
+    if any(isinstance(each, np.ndarray) for each in indices):
+        if isinstance(a, np.ndarray) or a.ndim != 1:
+            raise NotImplementedError("varying indices of anything but a list of constants")
+        values = a.numpy(force=True)
+        return as_object(np.frompyfunc(lambda index: ex.look_up(values, index), 1, 1)(indices[0]))
     keys = tuple(slice(None) if each is None else np.asarray(each.numpy(force=True)) for each in indices)
     return as_object(to_array(a)[keys])
 
@@ -228,6 +233,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "sqrt": _elementwise(ex.sqrt, 1),
     "sin": _elementwise(ex.sin, 1),
     "cos": _elementwise(ex.cos, 1),
+    "floor": _elementwise(ex.floor, 1),
     "atan": lambda a: _elementwise(ex.atan2, 2)(a, 1.0),
     "abs": _elementwise(ex.absolute, 1),
     "atan2": _elementwise(ex.atan2, 2),

@@ -10,7 +10,7 @@
 namespace gn __attribute__((visibility("hidden"))) {  // libraries built for other processors may be loaded beside
 
 constexpr int64_t kMagic = 0x676e5f73746570;  // "gn_step"
-constexpr int64_t kFormat = 2;                // of these words; structure.py has the same
+constexpr int64_t kFormat = 3;                // of these words; structure.py has the same
 constexpr int kPanel = 16;  // columns of a panel of packed weights, whatever the processor's vectors hold
 
 struct BufferWords {
@@ -102,7 +102,8 @@ struct Instruction {
   uint32_t k;
 };
 
-constexpr int64_t kOperations = 27;  // of OPERATIONS in expressions.py
+constexpr int64_t kLookUp = 16;      // the one with a table
+constexpr int64_t kOperations = 29;  // of OPERATIONS in expressions.py
 
 // A tape in the memory of its structure.
 struct Tape {

@@ -15,7 +15,7 @@ from torchrl_gn.networks.layers import Gather, LayerList
 from torchrl_gn.networks.linear import ACTIVATIONS
 from torchrl_gn.networks.packed_layers import PANEL
 
-MAGIC, FORMAT = 0x676E5F73746570, 2  # as in structure.h
+MAGIC, FORMAT = 0x676E5F73746570, 3  # as in structure.h
 _HEADER = 8
 _GROUPS, _PHASES = 6, 2
 

@@ -248,6 +248,12 @@ class StructureCheck {
       constants = std::max<int64_t>(constants, each.k);
     }
     list(tape.constants, constants + 1);
+    for (int64_t i = 0; i < tape.ends[1]; ++i) {
+      if (instructions[i].code != kLookUp) continue;
+      const double size = structure_.doubles(tape.constants)[instructions[i].k];
+      require(1 <= size && size <= kMost && size == static_cast<double>(static_cast<int64_t>(size)));
+      list(tape.constants, instructions[i].k + 1 + static_cast<int64_t>(size));
+    }
     for (size_t group = 0; group < inputs.size(); ++group) indices(tape.inputs[group], inputs[group], -1, tape.registers);
     for (int phase : {0, 1}) indices(tape.outputs[phase], outputs[phase], 0, tape.registers);
   }

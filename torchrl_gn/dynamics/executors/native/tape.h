@@ -66,6 +66,12 @@ inline typename Lanes<W>::Double sine(typename Lanes<W>::Double x, int64_t quart
   return select<V>(out < -1, V{} - 1.0, out);
 }
 
+// Number x of a table, which begins with its size; the nearest one beyond its ends, the first for NaN.
+inline double look_up(const double* table, double x) {
+  const double last = *table - 1, place = x < last ? x : last;
+  return table[1 + (place > 0 ? static_cast<int64_t>(place) : 0)];
+}
+
 // r holds registers of C vectors of W lanes each.
 template <int W, int C>
 void run_tape(const Tape& tape, int phase, double* registers) {
@@ -77,7 +83,7 @@ void run_tape(const Tape& tape, int phase, double* registers) {
   // In the order of OPERATIONS in expressions.py. A jump at the end of every instruction: the processor learns what follows which.
   static const void* const labels[] = {
       &&CONSTANT, &&INPUT, &&ADD_C, &&SUB_C, &&MUL_C, &&DIV_C, &&SQRT, &&SIN, &&COS, &&ABS, &&MAX_C, &&MIN_C, &&LESS_C,
-      &&GREATER_C, &&EQUAL_C, &&ADD, &&SUB, &&MUL, &&DIV, &&ATAN2, &&MAX, &&MIN, &&LESS, &&MADD_C, &&WHERE, &&MADD, &&NMADD,
+      &&GREATER_C, &&EQUAL_C, &&FLOOR, &&LOOK_UP, &&ADD, &&SUB, &&MUL, &&DIV, &&ATAN2, &&MAX, &&MIN, &&LESS, &&MADD_C, &&WHERE, &&MADD, &&NMADD,
   };
 #define NEXT                   \
   if (at == end) return;       \
@@ -88,7 +94,8 @@ void run_tape(const Tape& tape, int phase, double* registers) {
     const V* const a = r + C * at->a;                 \
     const V* const b = r + C * at->b;                 \
     const V* const c = r + C * at->c;                 \
-    const V k = V{} + constants[at->k];          \
+    const double* const table = constants + at->k;    \
+    const V k = V{} + *table;                         \
     (void)a, (void)b, (void)c, (void)k;               \
     ++at;                                             \
     for (int i = 0; i < C; ++i) out[i] = expression;  \
@@ -112,6 +119,8 @@ void run_tape(const Tape& tape, int phase, double* registers) {
   INSTRUCTION(LESS_C, select<V>(a[i] < k, one, zero))
   INSTRUCTION(GREATER_C, select<V>(a[i] > k, one, zero))
   INSTRUCTION(EQUAL_C, select<V>(a[i] == k, one, zero))
+  INSTRUCTION(FLOOR, each_lane(a[i], [](double x) { return __builtin_floor(x); }))
+  INSTRUCTION(LOOK_UP, each_lane(a[i], [table](double x) { return look_up(table, x); }))
   INSTRUCTION(ADD, a[i] + b[i])
   INSTRUCTION(SUB, a[i] - b[i])
   INSTRUCTION(MUL, a[i] * b[i])

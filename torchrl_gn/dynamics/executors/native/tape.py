@@ -26,7 +26,7 @@ class Tape:
     """
 
     instructions: np.ndarray  # [I] INSTRUCTION
-    constants: np.ndarray  # [K] float64
+    constants: np.ndarray  # [K] float64; of a table its size, then its numbers
     phases: tuple[int, ...]  # where each phase ends
     inputs: tuple[np.ndarray, ...]  # registers of each group of inputs, int32; -1: never read
     outputs: tuple[np.ndarray, ...]  # registers of each phase's outputs
@@ -57,17 +57,23 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
     if count > _MOST_REGISTERS:
         raise UntraceableError(f"The state maths of this scene needs {count} registers.")
 
-    known: dict[float, int] = {}
     instructions = np.zeros(len(order), dtype=INSTRUCTION)
     instructions["code"] = [CODES[nodes[index][0]] for index in order]
     instructions["out"] = places[len(used) : -1]
     for name, row in zip("abc", operands, strict=True):
         instructions[name] = places[row]
-    instructions["k"] = [known.setdefault(nodes[index][2], len(known)) for index in order]
+    single = [nodes[index][2] for index in order if nodes[index][0] != "look_up"]
+    known = {value: place for place, value in enumerate(dict.fromkeys(single or [0.0]))}
+    starts = len(known) + np.cumsum([0, *(1 + len(each) for each in graph.tables)])
+    instructions["k"] = [
+        starts[int(constant)] if operation == "look_up" else known[constant]
+        for operation, _, constant in (nodes[index] for index in order)
+    ]
+    tables = [number for each in graph.tables for number in (len(each), *each.tolist())]
     places = np.where(is_read, places[value_of], -1).astype(np.int32)
     return Tape(
         instructions=instructions,
-        constants=np.array(list(known) or [0.0]),
+        constants=np.array([*known, *tables]),
         phases=tuple(ends),
         inputs=tuple(places[np.array([each.index for each in group], dtype=np.int64)] for group in groups),
         outputs=tuple(places[np.array(outputs, dtype=np.int64)] for outputs in results),
