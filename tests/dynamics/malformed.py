@@ -24,6 +24,7 @@ from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.executors import NativeExecutor
 from torchrl_gn.dynamics.executors.native.operators import load_operators
 from torchrl_gn.dynamics.executors.native.structure import seal
+from torchrl_gn.dynamics.executors.native.tape import CODES
 
 REFUSALS = ValueError, NotImplementedError, RuntimeError, TypeError, IndexError, MemoryError
 FAULTS = "INTERNAL ASSERT", "std::", "vector::", "bad allocation"
@@ -226,7 +227,9 @@ def _structure(words: Tensor, draw: random.Random) -> Changed:
         elif how == "bit":
             array[index] ^= np.int64(1) << np.int64(draw.randrange(63))
         elif how == "half":  # one of an instruction's fields
-            array.view(np.uint16)[4 * index + draw.randrange(4)] = draw.choice((0, 1, 26, 27, 1000, 0xFFFF))
+            array.view(np.uint16)[4 * index + draw.randrange(4)] = draw.choice(
+                (0, 1, CODES["look_up"], len(CODES) - 1, len(CODES), 1000, 0xFFFF)
+            )
         else:
             other = {"size": draw.choice(SIZES), "near": int(array[index]) + draw.choice((-1, 1))}
             array[index] = np.array(other.get(how, int(array[draw.randrange(len(array))]))).astype(np.int64)

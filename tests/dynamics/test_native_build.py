@@ -256,7 +256,8 @@ def test_an_interrupt_stops_the_compiler(fresh, hangs, ends):
 def test_a_compiler_ends_with_the_process_that_started_it(tmp_path, ends):
     place = tmp_path / "process"
     command = ["sh", "-c", f"sleep 100 & echo $! > '{place}'; wait"]  # as g++ does
-    code = f"import time; from torchrl_gn.dynamics.executors.native import build; build._run([{command}], time.monotonic() + 99)"
+    code = "import time; from torchrl_gn.dynamics.executors.native import build; "
+    code += f"build._run([{command}], time.monotonic() + 99)"
     running = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)})
     while running.poll() is None and not (place.exists() and place.read_text().endswith("\n")):
         time.sleep(0.01)

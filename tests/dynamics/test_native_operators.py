@@ -13,6 +13,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.dynamics import SpecializedPredictor, specialize
 from torchrl_gn.dynamics.executors.native.structure import seal
+from torchrl_gn.dynamics.executors.native.tape import CODES
 from torchrl_gn.networks.packed_layers import PackedLayers
 
 from ..compiling import compiles
@@ -400,7 +401,8 @@ def forged(words: torch.Tensor, part: str) -> torch.Tensor:
         "gather": (int(words[gather + 8]), 99),  # an item
         "order of gradients": (gather + 5, 1 - int(words[gather + 5])),  # whether it overwrites
         "state maths": (int(words[maths + 14]), 99),  # a channel that varies
-        "tape": (int(words[maths + 18]), 27),  # an instruction
+        "tape": (int(words[maths + 18]), len(CODES)),  # an instruction
+        "tape of a table": (int(words[maths + 18]), CODES["look_up"]),  # which its constant does not begin
     }
     index, value = places[part]
     words[index] = value
@@ -408,11 +410,13 @@ def forged(words: torch.Tensor, part: str) -> torch.Tensor:
     return words
 
 
-@pytest.mark.parametrize("part", ["header", "network", "layer", "gather", "order of gradients", "state maths", "tape"])
+@pytest.mark.parametrize(
+    "part", ["header", "network", "layer", "gather", "order of gradients", "state maths", "tape", "tape of a table"]
+)
 def test_a_structure_that_would_leave_its_memory_is_refused(quick, inputs, part):
     predictor = quick("pendulum")
     state, actions = inputs(predictor, 3)
-    with pytest.raises(ValueError, match=rf"damaged \((a|the) {part}\)"):
+    with pytest.raises(ValueError, match=rf"damaged \((a|the) {part.removesuffix(' of a table')}\)"):
         rollout(predictor, state, actions, structure=forged(predictor.executor.structure, part))
 
 

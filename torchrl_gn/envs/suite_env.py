@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from functools import cache, partial
@@ -140,17 +141,23 @@ class _SuiteEnv(DMControlWrapper):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """ValueError if it is no episode of this task."""
-        random, drawn, actions = (state.get(name) for name in ("random", "drawn", "actions"))
-        like = isinstance(random, Tensor) and random.dtype == torch.int64 and random.shape == (624,)
-        like = like and bool(((random >= 0) & (random < 2**32)).all())
-        # numpy does not check the first, a place in the numbers.
-        like = like and isinstance(drawn, list) and [type(each) for each in drawn] == [int, int, float]
-        like = like and 0 <= drawn[0] <= 624 and drawn[1] in (0, 1) and np.isfinite(drawn[2])
-        like = like and isinstance(actions, Tensor) and actions.dtype == torch.float64
-        like = like and actions.shape[1:] == self.action_spec.shape and bool(actions.isfinite().all())
-        if not like or len(actions) >= self._env._step_limit:
+        random, drawn, actions = state.get("random"), state.get("drawn"), state.get("actions")
+        if not (_is_random(random, drawn) and self._are_actions(actions)):
             raise ValueError("a running episode is not one of this task")
         self._resumed = state
+
+    def _are_actions(self, actions: Any) -> bool:
+        like = isinstance(actions, Tensor) and actions.dtype == torch.float64
+        like = like and actions.shape[1:] == self.action_spec.shape and bool(actions.isfinite().all())
+        return like and len(actions) < self._env._step_limit
+
+
+def _is_random(numbers: Any, drawn: Any) -> bool:
+    """Whether these are what ``numpy.random.RandomState.get_state`` gives, of which numpy checks hardly anything."""
+    like = isinstance(numbers, Tensor) and numbers.dtype == torch.int64 and numbers.shape == (624,)
+    like = like and bool(((numbers >= 0) & (numbers < 2**32)).all())
+    like = like and isinstance(drawn, list) and [type(each) for each in drawn] == [int, int, float]
+    return like and 0 <= drawn[0] <= 624 and drawn[1] in (0, 1) and math.isfinite(drawn[2])
 
 
 def _make(domain: str, task: str, timestep: float | None, steps: int | None, *, seed: int) -> _SuiteEnv:
