@@ -41,6 +41,8 @@ publish checkpoint=runs/forward_model file=runs/published.safetensors sequences=
 
 benchmark_scaling system=pendulum batches=[20] steps=2 warm_up=1 repeats=1 trajectories=5 run_dir=runs/scaling
 
+benchmark_features systems=[pendulum] hidden=8 batches=[1] rounds=1 seconds=0.01 run_dir=runs/features
+
 benchmark_simulation repeats=1 steps=20 rollouts=4 batch=4 run_dir=runs/benchmark
 
 benchmark_training system=pendulum steps=2 warm_up=1 trajectories=5 run_dir=runs/benchmark_training
