@@ -116,6 +116,37 @@ def test_the_number_of_threads_does_not_matter(quick, inputs, name, dtype):
         torch.set_num_threads(1)
 
 
+@pytest.mark.parametrize("many", [False, True])
+def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, monkeypatch, many):
+    """Also over several axes of a batch; gradients of actions and states come in parts, too."""
+    predictor = specialize(wide("swimmer6"))
+    state, actions = inputs(predictor, 30, 3)
+    actions, executor = actions if many else actions[..., 0, :], predictor.executor
+    call = predictor.rollout if many else predictor.step
+
+    def found() -> list[torch.Tensor]:
+        given = [each.clone().requires_grad_() for each in (state, actions)]
+        out = call(*given)[0]
+        return [out, *torch.autograd.grad((out * out.detach().cos()).sum(), given)]
+
+    expected, parts, operator = found(), [], executor._operator
+    monkeypatch.setattr(executor, "longest", 1)
+    monkeypatch.setattr(executor, "_operator", lambda first, *more: parts.append(len(first)) or operator(first, *more))
+    assert equal(found(), expected) and sum(parts) == 90 and len(parts) == -(-90 // (24 * torch.get_num_threads()))
+
+
+def test_ctrl_c_ends_a_long_call_between_its_parts(wide, inputs, monkeypatch, ctrl_c):
+    predictor, parts = specialize(wide("swimmer6")), []
+    state, actions = inputs(predictor, 24 * torch.get_num_threads() * 5)
+    executor = predictor.executor
+    operator = ctrl_c(executor._operator, 2)
+    monkeypatch.setattr(executor, "longest", 1)
+    monkeypatch.setattr(executor, "_operator", lambda first, *more: parts.append(len(first)) or operator(first, *more))
+    with pytest.raises(KeyboardInterrupt):
+        predictor.rollout(state, actions)
+    assert len(parts) == 2
+
+
 def test_threads_may_change_between_a_prediction_and_its_gradient(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 50)

@@ -31,6 +31,8 @@ from torchrl_gn.processor import native_threads
 _NUMBERS = (torch.float32, torch.float64)  # of states, actions, weights
 _FEW = 0.05  # share of components that are constant, of bodies that move: without them a tape is about as long
 _TENSORS = (Tensor, torch.nn.Parameter)
+_TILE = 24  # samples that C++ handles together
+_SECOND = 1.5e10  # multiplications that a thread makes in about a second
 
 
 class NativeExecutor:
@@ -59,6 +61,9 @@ class NativeExecutor:
         self.shapes = LayerShapes(layers)
         self.parameters = ParameterInputs.of(program)
         self.channels = program.layout.delta_size if change else program.layout.size
+        self.numbers = len(program.reference) * program.layout.size  # of a state
+        work = sum(layer.count * layer.weight.numel() for layer in layers.layers)
+        self.longest = int(_SECOND / (work + 1))  # steps of all samples that a thread makes in about a second
         try:
             with preparation(len(program.reference)):
                 self._load()
@@ -168,9 +173,29 @@ class NativeExecutor:
         try:
             if compiling:  # and takes no number of threads into its graph: 0 are torch's
                 return torch.ops.torchrl_gn.rollout.default(state, actions, *packed, many, 0)
-            return self._operator(state, actions, *packed, many, native_threads())
+            steps, threads = actions.shape[-2] if many and actions.ndim > 1 else 1, native_threads()
+            if steps * state.numel() > self.longest * self.numbers:
+                return self._in_parts(state, actions, packed, many, threads)
+            return self._operator(state, actions, *packed, many, threads)
         except NotImplementedError:  # other dtypes and devices, no sample, states without traced state maths
             return None
+
+    def _in_parts(self, state: Tensor, actions: Tensor, packed: tuple, many: bool, threads: int) -> Tensor:
+        """As the operator, in parts of about a second, as Python hears Ctrl-C between them alone."""
+        _, weights, tables, sample_tables, numbers, _ = packed
+        batch, steps = actions.shape[: -2 if many else -1], actions.shape[-2] if many else 1
+        size = _TILE * (threads or torch.get_num_threads()) * max(1, self.longest // (_TILE * steps))
+        # Sums over samples, for the weights, do not depend on the number of threads.
+        whole = sample_tables is not None or len(numbers) > 1 or weights.requires_grad or tables.requires_grad
+        if whole or not batch or state.shape[:-2] != batch or batch.numel() <= size:
+            return self._operator(state, actions, *packed, many, threads)
+        parts = []
+        for given in zip(state.flatten(0, -3).split(size), actions.flatten(0, len(batch) - 1).split(size), strict=True):
+            part = self._operator(*given, *packed, many, threads)
+            if part.requires_grad:
+                part.register_hook(lambda gradient: None)  # Python, between the gradients of parts
+            parts.append(part)
+        return torch.cat(parts).unflatten(0, batch)
 
     def _trace(self, program: StepProgram, layers: LayerList) -> Tensor:
         """The structure, compared with torch's own numbers; UntraceableError if they differ or have no scalar form."""
