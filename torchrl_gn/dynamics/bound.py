@@ -44,7 +44,7 @@ _PAYS = 512
 
 
 class UnseenParameterWarning(UserWarning):
-    """A scene has a physical parameter that the model never saw vary in training."""
+    """A scene has a physical parameter, or can move in a way, that the model never saw vary in training."""
 
 
 class BoundPredictor(Predictor):
@@ -402,7 +402,7 @@ def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
 
 
 def _warn_of_unseen(predictor: BoundPredictor, values: PhysicalParameters, name: str, *, stacklevel: int) -> None:
-    """Warn, or raise ValueError with ``strict``, where a scene differs in a parameter constant in training."""
+    """Warn, or raise ValueError with ``strict``, of what a scene has or can that never varied in training."""
     model, unseen = predictor.model, []
     if predictor.movable.is_meta:  # there are no numbers to compare with
         return
@@ -415,19 +415,23 @@ def _warn_of_unseen(predictor: BoundPredictor, values: PhysicalParameters, name:
         differs = ((given - mean).abs() > 1e-6 * mean.abs().clamp(min=1e-12)).reshape(-1, given.shape[-1]).any(0)
         for index in (normalizer.constant & differs).nonzero().flatten().tolist():
             unseen.append(getattr(model.parameter_names, part)[index])
-    residual = model.residual_normalizer
+    residual, messages = model.residual_normalizer, []
+    if unseen:
+        messages.append(
+            f"Scene {name!r} has values that the model never saw, in features that never varied in its"
+            f" training: {', '.join(unseen)}. They are ignored and predictions may be wrong."
+        )
     if model.physics is None and bool((residual.count > 0).any()):
         fixed = (predictor.movable & residual.constant).any(0).tolist()
-        unseen += itertools.compress(_change_names(model.layout), fixed)
-    if not unseen:
-        return
-    message = (
-        f"Scene {name!r} has values that the model never saw, in features that never varied in its"
-        f" training: {', '.join(unseen)}. They are ignored and predictions may be wrong."
-    )
-    if predictor.strict:
-        raise ValueError(message)
-    warnings.warn(message, UnseenParameterWarning, stacklevel=stacklevel)
+        if same := list(itertools.compress(_change_names(model.layout), fixed)):
+            messages.append(
+                f"Bodies of scene {name!r} can move in ways that were always the same in the model's training and are"
+                f" predicted so: {', '.join(same)}."
+            )
+    if messages and predictor.strict:
+        raise ValueError(" ".join(messages))
+    if messages:
+        warnings.warn(" ".join(messages), UnseenParameterWarning, stacklevel=stacklevel)
 
 
 def _change_names(layout: StateLayout) -> list[str]:
