@@ -55,6 +55,30 @@ def test_what_is_saved_is_opened_also_over_what_was_there(folder):
         assert torch.equal(found["inner", "action"], numbers[:, 0].double())
 
 
+def test_what_was_not_saved_to_its_end_is_refused(folder, files_end_at):
+    data = TensorDict({"state": torch.rand(7, 2, generator=GENERATOR)}, [7])
+    save_tensors(folder, data)
+    with files_end_at(150), pytest.raises(OSError):
+        save_tensors(folder, torch.cat([data] * 50))
+    with pytest.raises(ValueError, match=r"d: its writing was cut short; write it again\."):
+        open_tensors(folder)
+
+
+@pytest.mark.parametrize(
+    ("sums", "message"),
+    [
+        ([1], "'' is no name of a file"),
+        ({"../state.memmap": 1}, r"'\.\./state\.memmap' is no name of a file"),
+        ({"other.memmap": 1}, r"other\.memmap: no such file"),
+        ({"state.memmap": "1"}, r"state\.memmap: does not have its checksum"),
+    ],
+)
+def test_forged_checksums_are_refused(folder, sums, message):
+    (folder / "checksums.json").write_text(json.dumps(sums))
+    with pytest.raises(ValueError, match=message):
+        open_tensors(folder)
+
+
 def test_without_room_nothing_ends_but_the_call(tmp_path, files_end_at):
     large = TensorDict({"state": torch.ones(5000, 3)}, [5000])
     with (

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.atomic import read_json, write_json
-from torchrl_gn.data import create_dataset, load_dataset, open_tensors
+from torchrl_gn.data import create_dataset, load_dataset, open_tensors, save_tensors
 from torchrl_gn.data.dataset_files import DatasetError
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.scenes import load_scene
@@ -28,6 +28,9 @@ PLACES, MOST = 18, 200  # places of each damage in a file, and tries of a kind o
 PENDULUM = load_scene("pendulum")
 NUMBERS = {"error": 0.125, "steps": 7, "of": [1.5]}
 GENERATOR = torch.Generator().manual_seed(0)
+TENSORS = TensorDict(
+    {"state": torch.rand(4, 3, generator=GENERATOR), "inner": {"action": torch.rand(4, 2, generator=GENERATOR)}}, [4]
+)
 
 
 @dataclass(frozen=True)
@@ -66,11 +69,7 @@ def _read_dataset(folder: Path) -> Any:
 
 
 def _write_tensors(folder: Path) -> None:
-    tensors = {
-        "state": torch.rand(4, 3, generator=GENERATOR),
-        "inner": {"action": torch.rand(4, 2, generator=GENERATOR)},
-    }
-    TensorDict(tensors, [4]).memmap(str(folder / "d"))
+    TENSORS.memmap(str(folder / "d"))
 
 
 OPTIONS = "# A run of mpc\nsystem: pendulum\nseed: 0\nlr: 0.001\ngn:\n  samples: 64\n  noise: 0.25\nplanner:\n- gn\n"
@@ -110,7 +109,10 @@ KINDS = {
     "data set": Kind(
         lambda folder: create_dataset(folder / "d", PENDULUM, 4, 2, 2, steps=3, variants=2), _read_dataset
     ),
-    "folder of tensors": Kind(  # of other programs, without checksums
+    "folder of tensors": Kind(
+        lambda folder: save_tensors(folder / "d", TENSORS), lambda folder: open_tensors(folder / "d").to_dict()
+    ),
+    "folder of another program": Kind(  # without checksums
         _write_tensors,
         lambda folder: open_tensors(folder / "d").to_dict(),
         tuple(how for how in DAMAGES if how.startswith(("flipped", "zeroed"))),

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_gn.atomic import naming_full_disk, sync_all
+from torchrl_gn.atomic import naming_full_disk, read_json, sync_all, write_json
 
 _DTYPES = {
     str(dtype): dtype
@@ -23,7 +24,8 @@ _DTYPES = {
         *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool),
     )
 }
-_LAYOUT = "meta.json"
+_LAYOUT, _SUMS = "meta.json", "checksums.json"
+_UNFINISHED: dict[str, int] = {}  # checksums of a folder whose writing has begun
 _LARGEST = 2**20  # bytes of a layout, which has a line for each tensor
 _DEEPEST = 20  # folders in folders, and dimensions
 
@@ -34,19 +36,52 @@ def open_tensors(folder: str | os.PathLike) -> TensorDict:
     ``TensorDict.load_memmap`` would run the code of pickles beside them, and lengthen files that are too short.
 
     Raises:
-        ValueError: if the folder holds anything but tensors, or a file is missing, or not as long as its tensor.
+        ValueError: if the folder holds anything but tensors, or a file is missing or not as long as its tensor, or, of
+            :func:`save_tensors`, not as its checksum.
     """
     folder = Path(folder)
+    if (folder / _SUMS).is_file():
+        _check_sums(folder)
     _, batch = _layout(folder)
     return TensorDict(dict(_tensors(folder, batch, ())), batch_size=batch)
 
 
 def save_tensors(folder: str | os.PathLike, data: TensorDict) -> None:
-    """Write tensors to a folder that :func:`open_tensors` reads, over what was there; OSError without room for them."""
+    """Write tensors to a folder that :func:`open_tensors` reads, over what was there, with checksums.
+
+    OSError without room for them: the folder is then refused until it is written again.
+    """
     folder = Path(folder)
+    write_json(folder / _SUMS, _UNFINISHED, checked=True)
     create_tensors(folder, data)
     TensorDict.load_memmap(folder, allow_pickle=False).copy_(data)
     sync_all(folder)
+    files = sorted((*folder.rglob("*.memmap"), *folder.rglob(_LAYOUT)))
+    write_json(folder / _SUMS, {file.relative_to(folder).as_posix(): _crc32(file) for file in files}, checked=True)
+
+
+def _check_sums(folder: Path) -> None:
+    """Raise ValueError, naming it, for a file that is not as :func:`save_tensors` wrote it."""
+    sums = read_json(folder / _SUMS)
+    if sums == _UNFINISHED:
+        raise ValueError(f"{folder}: its writing was cut short; write it again.")
+    for name, expected in sums.items() if isinstance(sums, dict) else [("", None)]:
+        if not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", name):
+            raise ValueError(f"{folder / _SUMS}: {name!r} is no name of a file.")
+        file = folder / name
+        if not file.is_file() or file.is_symlink():
+            raise ValueError(f"{file}: no such file.")
+        if _crc32(file) != expected:
+            what = f"{file}: does not have its checksum: damaged, or written by another program"
+            raise ValueError(f"{what} (delete {_SUMS} beside it then).")
+
+
+def _crc32(file: Path) -> int:
+    total = 0
+    with open(file, "rb") as stream:
+        while part := stream.read(2**24):
+            total = zlib.crc32(part, total)
+    return total
 
 
 def create_tensors(folder: Path, like: TensorDict) -> None:
