@@ -135,6 +135,20 @@ def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, monkey
     assert equal(found(), expected) and sum(parts) == 90 and len(parts) == -(-90 // (24 * torch.get_num_threads()))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_long_rollouts_of_few_samples_are_made_in_parts_with_the_same_numbers(wide, inputs, monkeypatch, dtype):
+    """States of single precision would be rounded between the parts, so these are made whole."""
+    predictor = specialize(wide("swimmer6"))
+    state, actions = (each.to(dtype) for each in inputs(predictor, 2, 3, steps=7))
+    expected, executor, parts = predictor.rollout(state, actions)[0], predictor.executor, []
+    operator = executor._operator
+    monkeypatch.setattr(executor, "longest", 48)  # two steps of a tile
+    monkeypatch.setattr(executor, "numbers", 1)  # for which these are many
+    monkeypatch.setattr(executor, "_operator", lambda *given: parts.append(given[1].shape[1]) or operator(*given))
+    assert torch.equal(predictor.rollout(state, actions)[0], expected)
+    assert parts == ([2, 2, 2, 1] if dtype == torch.float64 else [7])
+
+
 def test_ctrl_c_ends_a_long_call_between_its_parts(wide, inputs, monkeypatch, ctrl_c):
     predictor, parts = specialize(wide("swimmer6")), []
     state, actions = inputs(predictor, 24 * torch.get_num_threads() * 5)

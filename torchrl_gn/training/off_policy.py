@@ -77,7 +77,7 @@ class OffPolicyTrainer:
             torch and a C++ compiler can.
         seed: seed of the replay buffer; also of the environments of a resumed run if they cannot resume their episodes.
 
-    A resumed run ends in the numbers of a whole one where ``env`` are of :func:`~torchrl_gn.envs.suite_env`.
+    On the CPU a resumed run ends in the numbers of a whole one if ``env`` is of :func:`~torchrl_gn.envs.suite_env`.
     """
 
     def __init__(

@@ -185,17 +185,25 @@ class NativeExecutor:
         _, weights, tables, sample_tables, numbers, _ = packed
         batch, steps = actions.shape[: -2 if many else -1], actions.shape[-2] if many else 1
         size = _TILE * (threads or torch.get_num_threads()) * max(1, self.longest // (_TILE * steps))
+        # States in float64 go from call to call as they are; gradients would be summed in another order.
+        learns = torch.is_grad_enabled() and (state.requires_grad or actions.requires_grad)
+        span = steps if learns or state.dtype != torch.float64 else max(1, self.longest // _TILE)
         # Sums over samples, for the weights, do not depend on the number of threads.
         whole = sample_tables is not None or len(numbers) > 1 or weights.requires_grad or tables.requires_grad
-        if whole or not batch or state.shape[:-2] != batch or batch.numel() <= size:
+        if whole or not batch or state.shape[:-2] != batch:
             return self._operator(state, actions, *packed, many, threads)
         parts = []
-        for given in zip(state.flatten(0, -3).split(size), actions.flatten(0, len(batch) - 1).split(size), strict=True):
-            part = self._operator(*given, *packed, many, threads)
+        for start, given in zip(
+            state.flatten(0, -3).split(size), actions.flatten(0, len(batch) - 1).split(size), strict=True
+        ):
+            part = self._operator(start, given[:, :span] if many else given, *packed, many, threads)
             if part.requires_grad:
                 part.register_hook(lambda gradient: None)  # Python, between the gradients of parts
-            parts.append(part)
-        return torch.cat(parts).unflatten(0, batch)
+            spans = [part]
+            for later in given[:, span:].split(span, 1) if many and span < steps else ():
+                spans.append(self._operator(spans[-1][:, -1], later, *packed, many, threads)[:, 1:])
+            parts.append(torch.cat(spans, 1) if len(spans) > 1 else part)
+        return (torch.cat(parts) if len(parts) > 1 else parts[0]).unflatten(0, batch)
 
     def _trace(self, program: StepProgram, layers: LayerList) -> Tensor:
         """The structure, compared with torch's own numbers; UntraceableError if they differ or have no scalar form."""
