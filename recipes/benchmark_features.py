@@ -85,14 +85,14 @@ def main(cfg: DictConfig) -> None:
             chosen = torch.arange(batch) % (len(data) * cfg.steps)
             found = measure(cfg, models, states.flatten(0, 1)[chosen], actions.flatten(0, 1)[chosen])
             rounds = [dict(zip(found, each, strict=True)) for each in zip(*found.values(), strict=True)]
-            costs = {name: median(each["all"] - each[name] for each in rounds) for name in found if name != "all"}
+            features = [each for each in found if each not in ("all", "bodies")]
+            costs = {name: median(each["all"] - each[name] for each in rounds) for name in features}
             ratio = median(each["all"] / each["bodies"] for each in rounds)
             whole, bodies = median(found["all"]), median(found["bodies"])
             name = f"{scene.name}/batch {batch}"
             metrics |= {f"{name}/ms": whole, f"{name}/bodies_ms": bodies, f"{name}/ratio": ratio}
-            of_each = {each: cost for each, cost in costs.items() if each != "bodies"}
-            metrics |= {f"{name}/{each}_ms": cost for each, cost in of_each.items()}
-            parts = ", ".join(f"{each} {cost:.3f}" for each, cost in of_each.items())
+            metrics |= {f"{name}/{each}_ms": cost for each, cost in costs.items()}
+            parts = ", ".join(f"{each} {cost:.3f}" for each, cost in costs.items())
             lines.append(
                 f"{scene.name:16}{scene.num_nodes:>6}{batch:>6}{whole:>9.3f}{bodies:>14.3f}{ratio:>7.2f}  {parts}"
             )
