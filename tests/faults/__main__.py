@@ -15,14 +15,18 @@ from .damage import DAMAGES
 from .server import serving
 
 
-def main() -> int:
+def parse(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=list(CASES), choices=list(CASES), metavar="RECIPE")
-    parser.add_argument("--kinds", nargs="*", default=["strike", "full", "damage"])
+    parser.add_argument("--kinds", nargs="*", default=["strike", "full", "damage"], choices=["strike", "full", "damage"])
     parser.add_argument("--folder", type=Path, default=None, help="where what failed stays")
-    given = parser.parse_args()
+    return parser.parse_args(words)
+
+
+def main() -> int:
+    given = parse(sys.argv[1:])
     folder = given.folder or Path(tempfile.mkdtemp(prefix="faults"))
     folder.mkdir(parents=True, exist_ok=True)
     done: Counter[tuple[str, str]] = Counter()

@@ -124,11 +124,15 @@ def growth(levels: list[Level]) -> dict[str, float]:
     }
 
 
-def main() -> int:
+def parse(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--csv", type=Path, default=None, help="where the levels are written, as they come")
-    given = parser.parse_args()
+    return parser.parse_args(words)
+
+
+def main() -> int:
+    given = parse(sys.argv[1:])
     if given.csv is not None:
         given.csv.write_text("seconds,rounds,memory,threads,files\n")
 

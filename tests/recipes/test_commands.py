@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -52,6 +54,13 @@ def commands(script: str, folder: Path) -> list[list[str]]:
     return [line.split("\x1f")[:-1] for line in log.read_text().splitlines()]
 
 
+def module(name: str) -> ModuleType:
+    """What ``python -m`` runs: a package is run by its ``__main__``."""
+    found = importlib.util.find_spec(name)
+    assert found is not None, f"python -m finds no {name}"
+    return importlib.import_module(f"{name}.__main__" if found.submodule_search_locations else name)
+
+
 def check_options(recipe: str, options: list[str]) -> None:
     """Hydra refuses options that there are not, and names of experiments, presets and tasks."""
     config = hydra.compose(recipe, overrides=options)
@@ -88,7 +97,7 @@ def test_commands_are_understood(page, tmp_path, monkeypatch, capsys):
                 elif program not in ("ray", "git", "pip"):
                     place = next((index for index, word in enumerate(words) if word.startswith("recipes/")), None)
                     if words[0] == "-m":
-                        assert (ROOT / f"{words[1].replace('.', '/')}.py").is_file(), words
+                        module(words[1]).parse(words[2:])
                     elif place is None:
                         assert words[0] == "-" or (ROOT / words[0]).is_file(), words
                     else:
