@@ -44,6 +44,7 @@ def check_rollout(tensordict: TensorDictBase) -> None:
     assert found.get("discount", torch.float32) == torch.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("core", ["gn", *(pytest.param(core, marks=pytest.mark.slow) for core in ("mlp", "recurrent"))])
 def test_forward_models(trajectories, core, tmp_path):
     scene = gn.load_scene(SCENE)
@@ -106,6 +107,7 @@ def test_policies_of_states(trajectories, kind):
     check_rollout(gn.SceneEnv(scene, seed=0).rollout(2, policy.double()))  # as loading does, bounds and all
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:No target network updater")
 @pytest.mark.parametrize("policy", ["mlp", "graph"])
 def test_agents_of_float32_observations(observation_graphs, transitions, policy):

@@ -95,6 +95,7 @@ def test_imports_point_one_way(file):
     assert not wrong, f"torchrl_gn.{part} must not import torchrl_gn.{', '.join(sorted(wrong))}"
 
 
+@pytest.mark.slow
 def test_no_module_imports_itself_through_others():
     """Without what is imported for types, or later by a function."""
 
@@ -112,6 +113,7 @@ def is_for_types(node: ast.AST) -> bool:
     return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
 
 
+@pytest.mark.slow
 def test_what_is_imported_is_declared():
     """What only a dependency of a dependency brings would one day fail a plain install."""
     lines = metadata.requires("torchrl_gn") or []
@@ -296,6 +298,7 @@ RETIRED = {
 }
 
 
+@pytest.mark.slow
 def test_retired_words_come_back_nowhere():
     root = PACKAGE.parent
     places = (

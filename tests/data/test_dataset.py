@@ -98,6 +98,7 @@ def test_on_disk_as_in_memory(tmp_path: Path, pendulum: Scene) -> None:
     assert _digest(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_chunks_made_elsewhere_are_the_same(tmp_path: Path, pendulum: Scene) -> None:
     def elsewhere(function, items):
         """As a pool of processes has them: copies, made anew for every piece of work."""
@@ -150,6 +151,7 @@ def test_interrupted_resumes_to_identical_data(
     assert whole == parts
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
 def test_killed_resumes_to_identical_data(tmp_path: Path, pendulum: Scene) -> None:
     script = f"""if True:

@@ -57,6 +57,7 @@ def model(tmp_path: Path) -> ForwardModel:
     return model
 
 
+@pytest.mark.slow
 def test_a_data_set_of_before_serves_a_model_of_before(tmp_path, model, monkeypatch):
     before = load_dataset(tmp_path / "d")
     bound = model.bind(before.scene, parameters_key="parameters")
@@ -73,6 +74,7 @@ def test_a_data_set_of_before_serves_a_model_of_before(tmp_path, model, monkeypa
         assert evaluate_errors(again, opened.test, horizons=(5,)).to_metrics() == table.to_metrics()
 
 
+@pytest.mark.slow
 def test_data_collected_now_serve_a_model_of_before(tmp_path, model, monkeypatch):
     before = load_dataset(tmp_path / "d")
     expected = train_loss(model.bind(before.scene, parameters_key="parameters"), before.train)
@@ -95,6 +97,7 @@ def test_data_collected_now_serve_a_model_of_before(tmp_path, model, monkeypatch
     assert quick.own_parameters()["nodes"].shape[-1] == len(made.features.nodes)
 
 
+@pytest.mark.slow
 def test_columns_in_another_order_are_put_right_when_a_data_set_is_opened(tmp_path, model, monkeypatch):
     before = load_dataset(tmp_path / "d")
     expected = train_loss(model.bind(before.scene, parameters_key="parameters"), before.train)
@@ -122,6 +125,7 @@ def test_what_is_missing_is_named(tmp_path, model, monkeypatch):
         fresh.bind(load_scene("pendulum"))
 
 
+@pytest.mark.slow
 def test_an_unfinished_data_set_is_finished_with_the_columns_it_was_started_with(tmp_path, monkeypatch):
     for module in (collect, dataset):
         monkeypatch.setattr(module, "CHUNK", 4)

@@ -120,6 +120,7 @@ TURNING = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pace", ["calm", "fast", "mixed"])
 def test_servos_of_joints_of_more_than_a_turn_stay_within_half_a_turn_of_their_targets(pace) -> None:
     """Bodies do not show whole turns: farther away a servo may push either way in the same state."""

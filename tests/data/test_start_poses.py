@@ -198,6 +198,7 @@ REACH = """<mujoco model="reach"><worldbody>
   <equality><weld body1="target" body2="hand" relpose="0 0 0 1 0 0 0"/></equality></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchrl_gn.data.UncontrolledSceneWarning")
 @pytest.mark.parametrize("distance", [0.6, 0.99, 1.5])
 def test_a_weld_to_a_far_target_winds_no_joint_up(distance):

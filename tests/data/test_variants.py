@@ -72,6 +72,7 @@ def test_joined_bodies_stay_joined(system: str) -> None:
         assert np.ptp(states[:, 1:, :7], axis=0).max() > 1e-3  # and something moves
 
 
+@pytest.mark.slow
 def test_starts_are_of_the_variants_own_model() -> None:
     scenes = sample_variants("cheetah", 30, 0)
     data = collect_trajectories(scenes, 30, 1)
@@ -95,6 +96,7 @@ def test_variants_are_stable() -> None:
         assert executed["stable"].all(), system
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_chunks")
 @pytest.mark.parametrize("count", [1, 3, 100])
 def test_on_disk_as_in_memory(tmp_path: Path, count: int) -> None:
@@ -127,6 +129,7 @@ def _digest(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_chunks")
 @pytest.mark.parametrize("after", [2, 4])
 def test_interrupted_resumes_to_identical_data(tmp_path: Path, after: int) -> None:

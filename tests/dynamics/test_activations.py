@@ -103,6 +103,7 @@ def trained(activated):
     return model, data
 
 
+@pytest.mark.slow
 def test_predictions_in_cpp_are_torchs(activated, trained):
     model, data = trained
     native, eager = (specialize(model.bind(activated), executor=name) for name in ("native", "eager"))
@@ -121,6 +122,7 @@ def test_predictions_in_cpp_are_torchs(activated, trained):
     assert (found[1][1].abs().amax(0) > 0).all()
 
 
+@pytest.mark.slow
 def test_errors_leave_out_what_follows_by_a_law(activated, trained):
     model, data = trained
     table = evaluate_errors(model.bind(activated), data[:4], horizons=[5])
@@ -148,6 +150,7 @@ PID = """<mujoco model="pid"><extension><plugin plugin="mujoco.pid"><instance na
   <actuator><plugin joint="x" plugin="mujoco.pid" instance="pid" actdim="1" ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_plugins_activation_is_shown_and_learned():
     scene = load_scene(PID)
     assert scene.activations.known.tolist() == [False] and scene.state_size == 14
@@ -217,6 +220,7 @@ def test_mujoco_as_physics_takes_them_along(activated, trained):
     torch.testing.assert_close(change[..., 12:], (found - data["state"][:4, 5])[..., 13:], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learned", [False, True])
 def test_ilqg_plans_through_activations(activated, trained, learned):
     env = ModelEnv(trained[0].bind(activated), reward, seed=0) if learned else SceneEnv(activated, reward, seed=0)

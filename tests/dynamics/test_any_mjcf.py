@@ -59,6 +59,7 @@ def difference(model: ForwardModel, scene: Scene, states: Tensor, actions: Tenso
     return float((found - expected).norm() / ((expected - before).norm() + rounding))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", ["eager", "native"])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-5)])
 @pytest.mark.parametrize("name", ["quadrotor", "gripper", "tendon_arm", "machine"])
@@ -103,6 +104,7 @@ def refusal(message: str, text: str) -> str:
     return re.sub(r"'\w*'|[\d.-]+", "#", message.replace("\n", " "))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 6), reason="compiling raises the solver's warnings there"
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -47,6 +48,7 @@ def test_a_modules_other_inputs_are_its_hidden_state():
     check(("robot",))
 
 
+@pytest.mark.slow
 def test_a_predictor_of_nested_keys_is_itself(scenes, make_model, random_states, random_actions):
     scene = scenes["swimmer6"]
     model = make_model(scene)

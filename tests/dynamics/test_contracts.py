@@ -229,6 +229,7 @@ def test_changed_weights(case, kind, change):
     tried.check_changed(before)
 
 
+@pytest.mark.slow
 def test_a_functional_call_has_the_weights_that_it_is_given(case, fitted):
     tried = case("bound")
     others = fitted(1)
@@ -258,6 +259,7 @@ class Rollout(nn.Module):
 # What is done to a specialised predictor is done to its weights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["native", "eager"])
 def test_the_buffers_of_another_snapshot(case, specialised, fitted, kind):
     tried, given = case(kind), specialised(kind, 1)
@@ -298,6 +300,7 @@ def _saved(model) -> io.BytesIO:
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_copies(case, kind, how):
@@ -391,6 +394,7 @@ def test_second_derivatives_of_many(case):
         torch.autograd.grad(first.sum(), weight, allow_unused=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transform", [torch.func.jacrev, torch.func.jacfwd])
 @pytest.mark.parametrize("kind", KINDS)
 def test_jacobians(case, kind, transform):
@@ -425,6 +429,7 @@ def test_gradients_in_weights(case, kind, count):
             torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [3, MANY])
 @pytest.mark.parametrize("kind", KINDS)
 def test_forward_mode(case, kind, count):
@@ -469,6 +474,7 @@ def test_modes_without_gradients(case, kind):
         assert leaf.grad is not None and leaf.grad.abs().sum() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("kind", KINDS)
 def test_autocast(case, kind, dtype):

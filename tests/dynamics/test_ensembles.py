@@ -64,6 +64,7 @@ def test_rollouts_under_exchanged_weights(members, inputs):
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_losses_and_their_gradients_in_weights(members, inputs):
     made = members()
     state, action = inputs(made[0], BATCH)
@@ -87,6 +88,7 @@ def test_losses_and_their_gradients_in_weights(members, inputs):
         torch.testing.assert_close(found[tuple(name.split("."))], wanted, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_jacobians_of_a_bound_model(members, inputs):
     predictor = members("swimmer6")[0]
     state, action = inputs(predictor)
@@ -99,6 +101,7 @@ def test_jacobians_of_a_bound_model(members, inputs):
     torch.testing.assert_close(torch.autograd.functional.jacobian(step, action), reverse)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", ["native", "eager"])
 def test_specialised_members(members, inputs, executor):
     made = [specialize(member, executor=executor) for member in members()]

@@ -45,13 +45,14 @@ BOUNDS = {torch.float64: 1e-10, torch.float32: 1e-4}
 
 def cases() -> list:
     """Executor, system, model, batches, whether each sample has parameters of its own, and dtype."""
-    batches, found = [(), (1,), (5,)], []
+    batches, found, large = [(), (1,), (5,)], [], {"cheetah", "walker2d", "jaco", "crawler"}
     # State maths are the system's and networks the core's: every one of both, not every pair.
     pairs = [*itertools.product([*SYSTEMS, "joints", "crawler"], ["gn"]), *itertools.product(["swimmer6"], MODELS)]
     for each in dict.fromkeys(pairs):
-        for dtype in BOUNDS:
-            found += [(executor, *each, batches, False, dtype) for executor in ("eager", "native")]
-            found += [(executor, *each, [(5,), (2, 1)], True, dtype) for executor in ("eager", "native")]
+        marks = [pytest.mark.slow] if each[0] in large else []
+        for executor, dtype in itertools.product(("eager", "native"), BOUNDS):
+            found.append(pytest.param(executor, *each, batches, False, dtype, marks=marks))
+            found.append(pytest.param(executor, *each, [(5,), (2, 1)], True, dtype, marks=marks))
     # A gradient takes minutes to compile. Of recurrent cores see test_compiled.py, of several joints, contacts and
     # float32 test_pair_contacts.py.
     few = [("pendulum", "gn", [()], True, torch.float64), ("pendulum", "mlp", [(5,)], False, torch.float32)]

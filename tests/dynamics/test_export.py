@@ -123,6 +123,7 @@ def test_c_functions_are_the_native_executor_bit_for_bit(fit, make_model, random
     assert status == 0 and states[:, 1].isnan().any()
 
 
+@pytest.mark.slow
 @with_compiler
 def test_a_specialised_model_is_exported_as_it_is(scenes, make_model, tmp_path):
     scene = scenes["pendulum"]
@@ -144,6 +145,7 @@ def test_a_specialised_model_is_exported_as_it_is(scenes, make_model, tmp_path):
     assert (export_c(native, tmp_path / "again" / "step") / "step.cpp").read_text() == texts[1]
 
 
+@pytest.mark.slow
 def test_c_says_where_it_knows_no_state_maths(scenes, make_model, random_actions, tmp_path, monkeypatch):
     """A model whose maths for other states has no scalar form or too many registers."""
     scene = scenes["swimmer6"]

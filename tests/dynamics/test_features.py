@@ -72,6 +72,7 @@ def assert_predicts_alike(model: ForwardModel, scene, state, action) -> None:
         torch.testing.assert_close(predictor.step(state, action)[0], expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_feature_of_ones_own_is_seen_and_described(scenes, fit, random_states, random_actions, monkeypatch):
     scene = scenes["swimmer6"]
     state, action = random_states(scene, 5), random_actions(scene, 5)

@@ -247,6 +247,7 @@ def test_variants_bring_their_own_joints_and_laws(random_states, random_actions)
                 torch.testing.assert_close(here(given), expected(given), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_batches_of_any_shape_and_the_native_step(fit, random_states, random_actions):
     scene = zoo.load("servos")
     torch.manual_seed(0)

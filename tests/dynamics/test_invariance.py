@@ -135,6 +135,7 @@ def test_contacts_with_the_ground_do_not_show_the_yaw(make_model, random_states)
 TILTS = (0.0, 1e-300, 1e-30, 1e-9, 1e-7, 1e-5, 1e-3)  # from upside down, radians
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("executor", ["eager", "native"])
 def test_upside_down_all_is_finite(make_model, random_states, random_actions, executor, dtype):

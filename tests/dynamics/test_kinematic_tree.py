@@ -68,6 +68,7 @@ def angles_near(targets: torch.Tensor):
     return reward
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("core", ["gn", "recurrent"])
 def test_it_is_an_environment_and_is_planned_with(robot, core):
     tree, data = robot

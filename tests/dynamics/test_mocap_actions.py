@@ -149,6 +149,7 @@ def test_the_feature_is_the_welds_violation(led, data):
     torch.testing.assert_close(found[-1, -1, 3:6], (gap / 0.01).clamp(-1, 1))
 
 
+@pytest.mark.slow
 def test_predictions_in_cpp_are_torchs_and_poses_have_gradients(led, data, trained):
     native, eager = (specialize(trained.bind(led), executor=name) for name in ("native", "eager"))
     assert native.reason is None
@@ -169,6 +170,7 @@ def reward(state, action, next_state, task):
     return -(next_state[..., 4, :3] - next_state.new_tensor([0.45, 0.05, 0.62])).norm(dim=-1, keepdim=True)
 
 
+@pytest.mark.slow
 def test_environments_and_planners_take_poses(led, data, trained):
     env, true = ModelEnv(trained.bind(led), reward, seed=0), SceneEnv(led, reward, seed=0)
     assert env.action_spec.shape == true.action_spec.shape == (8,)

@@ -116,6 +116,7 @@ def test_the_number_of_threads_does_not_matter(quick, inputs, name, dtype):
         torch.set_num_threads(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("many", [False, True])
 def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, monkeypatch, many):
     """Also over several axes of a batch; gradients of actions and states come in parts, too."""
@@ -135,6 +136,7 @@ def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, monkey
     assert equal(found(), expected) and sum(parts) == 90 and len(parts) == -(-90 // (24 * torch.get_num_threads()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_long_rollouts_of_few_samples_are_made_in_parts_with_the_same_numbers(wide, inputs, monkeypatch, dtype):
     """States of single precision would be rounded between the parts, so these are made whole."""
@@ -149,6 +151,7 @@ def test_long_rollouts_of_few_samples_are_made_in_parts_with_the_same_numbers(wi
     assert parts == ([2, 2, 2, 1] if dtype == torch.float64 else [7])
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_long_call_between_its_parts(wide, inputs, monkeypatch, ctrl_c):
     predictor, parts = specialize(wide("swimmer6")), []
     state, actions = inputs(predictor, 24 * torch.get_num_threads() * 5)
@@ -161,6 +164,7 @@ def test_ctrl_c_ends_a_long_call_between_its_parts(wide, inputs, monkeypatch, ct
     assert len(parts) == 2
 
 
+@pytest.mark.slow
 def test_threads_may_change_between_a_prediction_and_its_gradient(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 50)
@@ -407,6 +411,7 @@ def test_gradients_are_asked_for_one_by_one(quick, inputs):
         assert not predictor.rollout(leaf.new_tensor(state.tolist()).requires_grad_(), actions)[0].requires_grad
 
 
+@pytest.mark.slow
 def test_inference_mode(quick, wide, inputs):
     state, actions = inputs(quick(), 3)
     with torch.inference_mode():
@@ -420,6 +425,7 @@ def test_inference_mode(quick, wide, inputs):
     assert equal(pull(predictor, state, actions), pull(quick(), state, actions))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["meta"])
 def test_another_default_device(quick, wide, inputs, device):
     state, actions = inputs(quick(), 3)
@@ -435,6 +441,7 @@ def test_another_default_device(quick, wide, inputs, device):
     assert equal(pull(predictor, state, actions), expected)
 
 
+@pytest.mark.slow
 def test_a_refresh_between_a_prediction_and_its_gradient(wide, inputs):
     bound = wide()
     predictor = specialize(bound)
@@ -447,6 +454,7 @@ def test_a_refresh_between_a_prediction_and_its_gradient(wide, inputs):
             after.sum().backward()
 
 
+@pytest.mark.slow
 def test_state_maths_are_traced_when_it_is_made(wide, inputs, monkeypatch):
     bound = wide()
     predictor, eager = (specialize(bound, executor=executor) for executor in ("native", "eager"))
@@ -540,6 +548,7 @@ def test_python_threads_step_at_once(quick, inputs, shared):
         assert all(pool.map(work, range(4)))
 
 
+@pytest.mark.slow
 def test_a_refresh_while_another_thread_steps(wide, inputs):
     bound = wide(latent=64)
     predictor = specialize(bound)
@@ -636,6 +645,7 @@ REASONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", REASONS)
 def test_features_of_ones_own(fit, inputs, kind):
     function, reason = REASONS[kind]
@@ -655,6 +665,7 @@ def test_features_of_ones_own(fit, inputs, kind):
     assert torch.equal(predictor.rollout(state, actions)[0], expected) and predictor.reason == given
 
 
+@pytest.mark.slow
 def test_state_maths_with_too_many_registers(wide, quick, inputs, monkeypatch):
     eager, registers = quick(executor="eager"), []
     state, actions = inputs(eager, 3)
@@ -691,6 +702,7 @@ def zoo_cases() -> list:
     return [pytest.param(name, marks=[] if name in few else pytest.mark.slow) for name in ZOO]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", zoo_cases())
 def test_every_scene_is_traced(make_model, moved, random_states, random_actions, name):
     scene = zoo.load(name)
@@ -726,6 +738,7 @@ def test_scenes_of_the_suite_are_traced(make_model, moved, random_states, random
     assert (found - expected).norm() <= 1e-10 * (expected - state).norm()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("large", "maths"), [(1, 1), (10**9, 2)])
 def test_large_scenes_are_traced_once_for_all_states(
     make_model, moved, random_states, random_actions, monkeypatch, large, maths

@@ -253,6 +253,7 @@ def test_an_interrupt_stops_the_compiler(fresh, hangs, ends):
     assert ends(hangs(KeyboardInterrupt)[1], 5)
 
 
+@pytest.mark.slow
 def test_a_compiler_ends_with_the_process_that_started_it(tmp_path, ends):
     place = tmp_path / "process"
     command = ["sh", "-c", f"sleep 100 & echo $! > '{place}'; wait"]  # as g++ does

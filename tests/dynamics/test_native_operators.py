@@ -172,6 +172,7 @@ def test_inputs_that_change_in_place_before_the_gradient(quick, inputs):
                     loss.backward()
 
 
+@pytest.mark.slow
 def test_a_gradient_outlives_its_predictor(wide, inputs):
     predictor = specialize(wide("pendulum"))
     state, actions = inputs(predictor, 3)
@@ -209,6 +210,7 @@ def compiled(function, backend: str = "aot_eager", **options):
     return torch.compile(function, fullgraph=True, backend=backend, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("many", [False, True])
 @pytest.mark.parametrize("of_weights", [False, True])
 def test_operators_pass_torchs_own_checks(quick, inputs, many, of_weights):
@@ -231,6 +233,7 @@ def test_operators_pass_torchs_own_checks(quick, inputs, many, of_weights):
     torch.library.opcheck(OPS.pack.default, (numbers, [3, 5, 2, 4], many))
 
 
+@pytest.mark.slow
 @compiles
 @pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
 def test_a_compiled_function_steps_and_differentiates(quick, inputs, backend):
@@ -268,6 +271,7 @@ def operators_of(function, *arguments) -> int:
     return sum("torchrl_gn" in str(node.target) for graph in graphs for node in graph.graph.nodes)
 
 
+@pytest.mark.slow
 @compiles
 def test_a_compiled_model_takes_new_weights(wide, inputs):
     bound = wide("pendulum")

@@ -67,6 +67,7 @@ def of_variants(scenes, fit, moved, random_actions):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
 @pytest.mark.parametrize("core", ["gn", "mlp"])
 def test_batches_and_threads(of_variants, core, dtype, bound):
@@ -89,6 +90,7 @@ def test_batches_and_threads(of_variants, core, dtype, bound):
         assert equal(pull(prepared, *variants.inputs), whole)
 
 
+@pytest.mark.slow
 def test_one_sample_and_parameters_without_batch(of_variants):
     variants = of_variants(count=4)
     whole = variants.pull()
@@ -122,6 +124,7 @@ def test_inputs_are_what_samples_have_of_their_own(of_variants):
     assert set(array.ravel()) == {*names, *anchors[0, 0][~usual].tolist()} and array[1, 2] in names
 
 
+@pytest.mark.slow
 def test_state_maths_are_traced_once_for_all_values(of_variants, monkeypatch):
     variants = of_variants(count=6)
     whole = variants.pull()
@@ -135,6 +138,7 @@ def test_state_maths_are_traced_once_for_all_values(of_variants, monkeypatch):
     same(one, [each[1:2] for each in whole])
 
 
+@pytest.mark.slow
 def test_samples_that_need_other_state_maths(of_variants):
     variants = of_variants(count=6)
     state, actions = variants.inputs
@@ -152,6 +156,7 @@ def test_samples_that_need_other_state_maths(of_variants):
     same([each[1::2] for each in found], mixed.pull(slice(1, None, 2)))
 
 
+@pytest.mark.slow
 def test_gradients_after_other_parameters(of_variants):
     variants = of_variants(count=4)
     halves = [slice(0, 2), slice(2, 4)]
@@ -165,6 +170,7 @@ def test_gradients_after_other_parameters(of_variants):
     assert leaf.grad is not None and torch.equal(leaf.grad, torch.cat([each[2] for each in expected]))
 
 
+@pytest.mark.slow
 def test_no_samples(of_variants):
     variants = of_variants(count=4)
     state, actions = variants.inputs
@@ -172,6 +178,7 @@ def test_no_samples(of_variants):
     assert variants.core
 
 
+@pytest.mark.slow
 def test_the_scenes_own_parameters(of_variants):
     variants = of_variants(count=4)
     state, actions = variants.inputs
@@ -185,6 +192,7 @@ def test_the_scenes_own_parameters(of_variants):
         predictor.step(state, actions[:, 0], variants.parameters)
 
 
+@pytest.mark.slow
 def test_parameters_that_change_in_place(of_variants):
     variants = of_variants(count=1)
     (state, actions), predictor = variants.inputs, variants.predictor
@@ -195,6 +203,7 @@ def test_parameters_that_change_in_place(of_variants):
     torch.testing.assert_close(predictor.rollout(state, actions, own)[0], expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_refresh_takes_new_weights(of_variants):
     variants = of_variants(count=4)
     before = variants.pull()
@@ -208,6 +217,7 @@ def test_a_refresh_takes_new_weights(of_variants):
     same(after, variants.pull(predictor=specialize(variants.bound)))
 
 
+@pytest.mark.slow
 def test_prepared_parameters_are_folded_once(of_variants, folds):
     variants = of_variants(count=4)
     state, actions = variants.inputs
@@ -220,6 +230,7 @@ def test_prepared_parameters_are_folded_once(of_variants, folds):
     assert not folds
 
 
+@pytest.mark.slow
 def test_samples_may_bring_some_parameters(of_variants):
     variants = of_variants(count=4)
     state, actions = variants.inputs
@@ -229,6 +240,7 @@ def test_samples_may_bring_some_parameters(of_variants):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_threads_with_parameters_of_their_own(of_variants):
     variants = of_variants(count=8)
     (state, actions), predictor = variants.inputs, variants.predictor
@@ -270,6 +282,7 @@ class LogOfAnchor(torch.nn.Module):
         return logs.expand(*inputs.canonical.state.shape[:-1], 1)
 
 
+@pytest.mark.slow
 def test_constants_may_be_read_by_any_operation(fit, scenes, random_states, random_actions):
     scene = scenes["swimmer6"]
     features = (BodyState(), Controls(), JointAxes(), LogOfAnchors())
@@ -287,6 +300,7 @@ def test_constants_may_be_read_by_any_operation(fit, scenes, random_states, rand
     assert "no scalar form" in varied.prepared(parameters).executor.reason
 
 
+@pytest.mark.slow
 def test_another_number_of_samples_is_refused(of_variants):
     variants = of_variants(count=4)
     state, actions = variants.inputs

@@ -69,6 +69,7 @@ def fitted(sampled):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second", "mean", "largest"),
     [
@@ -226,6 +227,7 @@ def test_a_model_comes_back_from_its_checkpoint(fitted, sampled, tmp_path):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_scenes_with_other_pairs_share_weights(fitted, random_states, random_actions):
     model = fitted()
     for scene in (two_bodies("box", "capsule"), load_scene("pendulum"), zoo.load("plane")):

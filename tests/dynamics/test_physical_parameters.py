@@ -58,6 +58,7 @@ def inputs(samples, bound, variants):
     return samples["state"][:, 0, 0], samples["action"][:, 0, 0], parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["plain", "folded", "specialised"])
 def test_every_sample_is_predicted_as_its_own_scene(variants, samples, model, way):
     bound = model.bind(variants[0], parameters_key="parameters", reference=way == "plain")
@@ -84,6 +85,7 @@ def test_every_sample_is_predicted_as_its_own_scene(variants, samples, model, wa
     assert torch.equal(written, ours)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("special", [False, True])
 @pytest.mark.parametrize("core", ["gn", "mlp"])
 def test_rollouts_of_variants(variants, samples, model, special, core):
@@ -101,6 +103,7 @@ def test_rollouts_of_variants(variants, samples, model, special, core):
         torch.testing.assert_close(states[index], expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_values_that_change_are_never_taken_for_the_same(variants, samples, model):
     bound = model.requires_grad_(False).bind(variants[0], parameters_key="parameters")
     quick = specialize(bound)
@@ -116,6 +119,7 @@ def test_values_that_change_are_never_taken_for_the_same(variants, samples, mode
     torch.testing.assert_close(quick.step(state, action)[0], bound.step(state, action)[0])  # back to the scene's own
 
 
+@pytest.mark.slow
 def test_a_model_of_one_scene_refuses_samples_of_another(variants, samples, model):
     bound = model.requires_grad_(False).bind(variants[0])
     state, action = samples["state"][0, :, 0], samples["action"][0, :, 0]
@@ -166,6 +170,7 @@ def test_bad_parameters_are_named(variants, samples, model):
         bound.step(state, action, parameters.exclude("mass").set("child_anchor", torch.zeros(3, 3, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [1, 3])
 def test_the_loss_reads_every_samples_values(variants, samples, model, window):
     bound = model.bind(variants[0], parameters_key="parameters")
@@ -185,6 +190,7 @@ def test_the_loss_reads_every_samples_values(variants, samples, model, window):
     torch.testing.assert_close(total, torch.stack(alone).mean())
 
 
+@pytest.mark.slow
 def test_a_model_env_of_variants(variants, samples, model):
     bound = model.requires_grad_(False).bind(variants[0], parameters_key="parameters")
     state, _, parameters = inputs(samples, bound, variants)
@@ -200,6 +206,7 @@ def test_a_model_env_of_variants(variants, samples, model):
     torch.testing.assert_close(executed["next", "state"], expected[:, 1:])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenParameterWarning")
 def test_an_inferred_graph_is_read_as_it_is_and_gets_gradients(variants, samples):
     torch.manual_seed(0)

@@ -87,6 +87,7 @@ def test_perfect_physics_are_corrected_by_exactly_nothing(tmp_path):
     assert float(loss(batch)["loss_forward_model"].detach()) < 1e-20
 
 
+@pytest.mark.slow
 def test_physics_of_an_arm_follow_mujoco_from_body_states():
     for name in ("cartpole", "swimmer3", "cheetah", "tumbler", "arm", "joints", "creature"):
         scene = zoo.load(name)
@@ -162,6 +163,7 @@ def test_robots_that_do_not_fit_the_mjcf_are_refused():
         MujocoPhysics(scene, scale={"weight": 2.0})
 
 
+@pytest.mark.slow
 def test_gradients_flow_through_mujoco():
     scene = zoo.load("cartpole")
     data = collect_trajectories(scene, 2, 2, 0)
@@ -202,6 +204,7 @@ def test_what_is_predicted_is_the_correction():
     torch.testing.assert_close(change[:, 1], expected[:, 1] + mean, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_parameters_of_physics_train_with_the_network_or_before():
     data = simulated(Pendulum(11.0))
     physics = Pendulum(trained=True)

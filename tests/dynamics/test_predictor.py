@@ -64,6 +64,7 @@ def test_planar_bodies_never_leave_their_plane(scenes, make_model, random_states
     assert (state[..., 4:6] == 0).all()  # turned about z only
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("network", [torch.float32, torch.float64])
 def test_the_next_state_has_the_states_dtype(scenes, make_model, random_states, random_actions, network, dtype):
@@ -179,6 +180,7 @@ def test_actions_beyond_the_limits_do_what_those_at_the_limits_do(scenes, make_m
         assert (found - expected).norm() < 1e-5 * expected.norm()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", ["eager", "native"])
 def test_actions_at_their_limits_have_gradients_whatever_their_rounding(
     make_model, random_states, random_actions, executor
@@ -215,6 +217,7 @@ def test_binds_on_the_meta_device(scenes, make_model):
         assert predictor.step(state, action)[0].shape == (3, 8, 13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strict", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_torch_export_takes_a_bound_model(scenes, make_model, random_states, random_actions, strict):
     predictor = make_model(scenes["swimmer6"]).bind(scenes["swimmer6"]).requires_grad_(False)

@@ -53,6 +53,7 @@ def test_true_changes_are_linked_already(make_model, name):
     torch.testing.assert_close(project(bound, state, delta), delta, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_pinned_bodies_stay_together(make_model, random_actions, name):
     scene = zoo.load(name)
@@ -161,6 +162,7 @@ def test_in_the_plane_both_ways_are_the_same(make_model, name):
     assert (ours - theirs).norm() < 1e-3 * raw.norm()
 
 
+@pytest.mark.slow
 def test_gradients_of_linking_by_joints(make_model):
     scene = load_scene("jaco")
     bound = make_model(scene).bind(scene)
@@ -245,6 +247,7 @@ def test_what_bodies_disagree_on_is_settled_by_least_squares(make_model):
         assert distance(project(bound, state, projected + 1e-6 * other)) > nearest * (1 - 1e-6)
 
 
+@pytest.mark.slow
 def test_what_damping_locks_stays_in_rollouts(make_model):
     """A base on locked slides and a wrist that is locked, under predictions of random weights."""
     text = """<mujoco><worldbody><body name="base"><joint type="slide" axis="1 0 0" damping="1e11"/>

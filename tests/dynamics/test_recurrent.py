@@ -99,6 +99,7 @@ def test_environments_and_rollouts_carry_the_hidden_state(bound, trajectories):
     assert entries["next", "hidden_state", "edges"].shape == (6, bound.scene.num_edges, 4)
 
 
+@pytest.mark.slow
 def test_errors_begin_behind_the_burn_in(bound, trajectories):
     table = evaluate_errors(bound, trajectories, horizons=(5,), burn_in=4, keep=6)
     hidden_state = bound.teacher_forced(trajectories["state"][:, :4], trajectories["action"][:, :4])[1]

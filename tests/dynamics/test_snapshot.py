@@ -114,6 +114,7 @@ def test_loaded_weights_are_predicted_with(made, inputs, assign):
 BITS = {torch.float64: 1e-6, torch.float32: 1e-5, torch.float16: 2e-2, torch.bfloat16: 0.1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_casts(made, inputs, kind):
     quick, bound = made(kind)
@@ -151,6 +152,7 @@ def test_a_cast_keeps_running_natively(made, inputs, monkeypatch):
     assert quick.program().core.weights.dtype == torch.float64
 
 
+@pytest.mark.slow
 def test_refresh_into_another_dtype(made, inputs):
     """A bound model in one dtype refreshes a specialised one of another."""
     quick, bound = made()
@@ -244,6 +246,7 @@ def test_a_bound_model_folds_once_a_rollout(made, inputs, folds):
     assert len(folds) == 3
 
 
+@pytest.mark.slow
 def test_inference_mode_leaves_nothing_behind(scenes, make_model, inputs):
     """Folded inside, differentiated outside; and values made inside are never taken for the same."""
     scene = scenes["swimmer6"]

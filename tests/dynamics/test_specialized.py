@@ -61,6 +61,7 @@ def both_kinds(moved, random_states, bound, count: int = 4) -> torch.Tensor:
     return torch.cat((moved(bound, count), random_states(bound.scene, count, seed=3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("activation", ["relu", "silu", "gelu", "tanh"])
 @pytest.mark.parametrize("name", ["swimmer3", "jaco"])
 def test_every_activation_is_predicted_as_by_the_reference(
@@ -101,6 +102,7 @@ def trees(draw) -> str:
     return f"<mujoco><worldbody>{bodies}</worldbody><actuator>{''.join(motors)}</actuator></mujoco>"
 
 
+@pytest.mark.slow
 @settings(
     max_examples=20,
     deadline=None,
@@ -182,6 +184,7 @@ def test_bfloat16_is_close_and_keeps_the_states_dtype(scenes, make_model, random
     assert "bfloat16" in str(quick)
 
 
+@pytest.mark.slow
 def test_it_stands_in_for_the_bound_model(scenes, make_model, random_states, random_actions):
     scene = scenes["swimmer6"]
     bound = make_model(scene).double().bind(scene)
@@ -197,12 +200,14 @@ def test_it_stands_in_for_the_bound_model(scenes, make_model, random_states, ran
     assert torch.equal(ModelEnv(quick).step(tensordict)["next", "state"], quick.step(state, actions[:, 0])[0])
 
 
+@pytest.mark.slow
 def test_a_loss_refuses_to_train_a_snapshot(scenes, make_model):
     scene = scenes["swimmer6"]
     with pytest.raises(TypeError, match="no gradient to the weights.*bound model"):
         ForwardModelLoss(specialize(make_model(scene).bind(scene)))
 
 
+@pytest.mark.slow
 def test_the_table_names_what_was_skipped(scenes, make_model):
     scene = scenes["swimmer6"]
     sizes = {"edge_hidden": (128, 128), "node_hidden": (128, 128), "global_hidden": (128, 128)}
@@ -223,6 +228,7 @@ def test_the_table_names_what_was_skipped(scenes, make_model):
     assert all(what in str(quick) for what in skipped)
 
 
+@pytest.mark.slow
 def test_no_second_warning(scenes, make_model):
     model = make_model(scenes["swimmer6"])
     other = load_scene("swimmer6", timestep=0.01)

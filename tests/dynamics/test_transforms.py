@@ -57,6 +57,7 @@ def close(found: Tensor, wanted: Tensor) -> None:
     torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6 * float(wanted.detach().abs().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transform", [jacfwd, jacrev])
 def test_jacobians(case, transform):
     rollout, states, actions = case
@@ -81,6 +82,7 @@ def test_samples_at_once(case):
     close(vmap(rollout)(states, actions), rollout(states, actions))
 
 
+@pytest.mark.slow
 def test_weights(case):
     rollout, states, actions = case
     weights = dict(rollout.named_parameters())

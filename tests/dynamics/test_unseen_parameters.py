@@ -41,6 +41,7 @@ def test_values_that_training_never_saw_are_named(scenes, make_model):
         model.bind(scenes["falling"])
 
 
+@pytest.mark.slow
 def test_variants_with_values_that_training_never_saw_are_named(scenes, make_model, fit):
     model = make_model(scenes["swimmer6"])
     bound, strict = (

@@ -250,6 +250,7 @@ def test_native_steps_are_those_of_torch(fit, kind, random_states):
     torch.testing.assert_close(predictor.step(state, action)[0], expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_native_steps_read_each_samples_own_points_and_surfaces(fit, random_states):
     given = scene(CUBE, WORLD)
     torch.manual_seed(0)

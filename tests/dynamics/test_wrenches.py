@@ -32,6 +32,7 @@ def test_they_are_the_forces_of_rotors_in_the_world(random_states, random_action
         np.testing.assert_allclose(np.concatenate((wrench[row, :3], torque)), data.qfrc_actuator, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_scenes_with_actuators_at_sites_have_them():
     for name, suits in (("quadrotor", True), ("machine", True), ("gripper", False), ("arm", False)):
         scene = zoo.load(name)

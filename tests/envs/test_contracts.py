@@ -185,6 +185,7 @@ def test_steps_are_those_by_hand_in_every_container(container, kind):
     check_steps(kind, data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SUITE)
 @pytest.mark.parametrize(
     "container", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CONTAINERS]
@@ -385,6 +386,7 @@ def test_frame_skips_are_refused_and_multi_actions_are_right(kind, inside):
     assert torch.equal(found, now["state"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SUITE)
 def test_frame_skips_of_the_suite_are_its_own(kind):
     env, plain = TransformedEnv(make(kind, 3), FrameSkipTransform(3), auto_unwrap=True), make(kind, 3)

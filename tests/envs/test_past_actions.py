@@ -77,6 +77,7 @@ def test_an_action_has_the_gradient_of_all_later_steps(model):
     assert change.item() == pytest.approx(gradient[:, 0].sum().item() * by, rel=1e-2, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("specialized", [False, True])
 def test_a_planner_hands_past_actions_on(model, specialized):
     network = specialize(model[0]) if specialized else model[0]

@@ -31,6 +31,7 @@ def own_env(monkeypatch):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("domain", "task", "timestep"),
     [
@@ -97,6 +98,7 @@ def test_without_steps_the_limit_is_the_suites():
     assert len(env.rollout(30)[0]) == 20
 
 
+@pytest.mark.slow
 def test_every_environment_starts_elsewhere_and_the_same_seed_alike():
     envs = [suite_env("swimmer", "swimmer3", num_envs=num, seed=seed) for num, seed in ((2, 1), (1, 1), (1, 2))]
     first, same, other = (env.reset()["observation"] for env in envs)
@@ -153,6 +155,7 @@ def test_actions_of_other_ranges_are_refused():
         observation_env(graph, "lqr", "lqr_2_1")
 
 
+@pytest.mark.slow
 def test_running_episodes_go_on_elsewhere_as_they_would_have():
     """Also over an end, after which the next start is drawn as it would have been."""
 

@@ -63,6 +63,7 @@ def is_picture(path) -> bool:
         return picture.format == "PNG" and np.asarray(picture).std() > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pendulum", "swimmer6"])
 def test_body_trajectory(scenes, tmp_path, name):
     truth = moving_states(scenes[name], 20)
@@ -97,6 +98,7 @@ def test_quaternions_are_shown_without_jumps():
     np.testing.assert_allclose(predicted, smooth)
 
 
+@pytest.mark.slow
 def test_training_curve_and_errors(tmp_path):
     curves = {"loss": ([1, 2, 3], [1.0, 0.1, math.nan]), "empty": ([], [])}
     assert is_picture(plot_training_curve(curves, tmp_path / "curve.png"))
@@ -113,6 +115,7 @@ def test_training_curve_and_errors(tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_rewards_of_episodes_that_ended_early(tmp_path):
     rewards = torch.rand(3, 50, generator=torch.Generator().manual_seed(0))
     rewards[1, 20:] = rewards[:, 40:] = torch.nan
@@ -170,6 +173,7 @@ def test_counts_on_logarithmic_axes_are_labelled_as_such(tmp_path, monkeypatch):
     assert len(powers.get_xticks(minor=True))
 
 
+@pytest.mark.slow
 def test_bars(tmp_path):
     bars = {"GN": {"a": (0.01, 0.001), "b": (math.inf, 0.0)}, "MLP": {"a": (0.5, 0.0)}}
     assert is_picture(plot_bars({"one step": bars, "100 steps": bars}, tmp_path / "bars.png"))

@@ -38,6 +38,7 @@ def sizes(swimmer, monkeypatch) -> list[int]:
     return asked
 
 
+@pytest.mark.slow
 def test_what_does_not_diverge_is_the_rollout(swimmer, simulated, sizes):
     state, actions = simulated["state"][:, 0], simulated["action"]
     expected = swimmer.rollout(state, actions)[0].detach()
@@ -50,6 +51,7 @@ def test_what_does_not_diverge_is_the_rollout(swimmer, simulated, sizes):
     torch.testing.assert_close(guarded_rollout(quick, state, actions).states, expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", BAD_ACTIONS)
 def test_what_diverges_keeps_its_last_good_state_and_costs_nothing_more(swimmer, simulated, sizes, bad):
     state, actions = simulated["state"][:, 0], simulated["action"].clone()
@@ -74,6 +76,7 @@ def test_nothing_is_predicted_once_all_have_diverged(swimmer, simulated, sizes):
     assert guarded.states.isfinite().all()
 
 
+@pytest.mark.slow
 def test_a_compiled_model_keeps_its_batch(swimmer, simulated, sizes, monkeypatch):
     # Every other batch size would be compiled anew.
     monkeypatch.setattr(type(swimmer), "fixed_batch", True)
@@ -88,6 +91,7 @@ def test_a_compiled_model_keeps_its_batch(swimmer, simulated, sizes, monkeypatch
     assert sizes == [(6, 20), (6, 20)]
 
 
+@pytest.mark.slow
 def test_the_range_is_that_of_the_training(swimmer, simulated):
     state, actions = simulated["state"][:, 0], simulated["action"]
     states = rollout(swimmer, state, actions).detach()
@@ -119,6 +123,7 @@ def test_before_training_only_finite_numbers_are_asked_for(swimmer, simulated):
     assert not guarded_rollout(fresh, state, actions).diverged.any()
 
 
+@pytest.mark.slow
 def test_rollouts_with_parameters_of_their_own(swimmer, simulated, sizes):
     state, actions = simulated["state"][:, 0].clone(), simulated["action"].clone()
     parameters = torch.stack([swimmer.parameters_of(swimmer.scene)] * 6)
@@ -170,6 +175,7 @@ def test_bad_options_are_named(swimmer, simulated, options):
         guarded_rollout(swimmer, simulated["state"][:, 0], simulated["action"], **options)
 
 
+@pytest.mark.slow
 def test_errors_count_what_diverged(swimmer, simulated):
     trajectories = simulated.clone()
     clean = evaluate_errors(swimmer, trajectories, horizons=(20, 60))

@@ -22,6 +22,8 @@ from .conftest import moving_states
 def silent(capfd):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        # Said of ffmpeg once jax was imported, by a test of the same process.
+        warnings.filterwarnings("ignore", r"os.fork\(\) was called", RuntimeWarning)
         yield
     captured = capfd.readouterr()
     assert captured.out == captured.err == ""
@@ -93,6 +95,7 @@ def test_short_steps_are_skipped_and_long_ones_kept(scenes, tmp_path, silent):
         assert video.n_frames == 11
 
 
+@pytest.mark.slow
 def test_mp4_has_every_frame(scenes, tmp_path, silent):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     truth = moving_states(scenes["swimmer6"], 10)

@@ -47,6 +47,7 @@ def test_a_point_inside_is_as_deep_as_the_nearest_face():
     torch.testing.assert_close(found.normal, expected)
 
 
+@pytest.mark.slow
 def test_its_gradient_is_that_of_finite_differences():
     start, direction, half = draw(20, half=[0.3, 0.5, 0.1])
     assert torch.autograd.gradcheck(

@@ -54,6 +54,7 @@ def test_normalised_samples_have_mean_zero_and_variance_one():
     torch.testing.assert_close(normalized.var(0, correction=0), torch.ones(4).double(), rtol=1e-13, atol=0)
 
 
+@pytest.mark.slow
 @maths
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=6), st.floats(-1e4, 1e4))
 def test_merged_shards_equal_the_whole(sizes, mean):

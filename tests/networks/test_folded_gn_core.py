@@ -80,6 +80,7 @@ def compare(core: GNCore, dynamic: Graph, static: Graph, predicted: Tensor, tole
         assert error <= tolerance * max(float(expected.norm()), 1e-2 * scale), (error, expected.norm())
 
 
+@pytest.mark.slow
 @maths
 @given(
     topology=topologies(),

@@ -41,6 +41,7 @@ def test_folding_keeps_outputs_and_gradients(random_graph, globals_):
         torch.testing.assert_close(got, expected)
 
 
+@pytest.mark.slow
 def test_it_learns_and_is_tied_to_its_scene(scenes, fit, random_states, random_actions):
     scene = scenes["pendulum"]
     torch.manual_seed(0)

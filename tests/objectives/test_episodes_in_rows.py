@@ -44,6 +44,7 @@ def pieces(rows: TensorDictBase) -> list[TensorDictBase]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"core": "recurrent", "hidden_state": [4, 4, 4]}])
 @pytest.mark.parametrize("forced", [1, 2])
 def test_the_loss_is_that_of_the_episodes(scenes, make_model, rows, options, forced):

@@ -156,6 +156,7 @@ def test_predictions_need_no_data():
     assert bool(state.isfinite().all())
 
 
+@pytest.mark.slow
 def test_noise_needs_a_scale(make_loss, windows):
     """Of a trained model the statistics are there; how large its states are the loss must be told."""
     trained = make_loss().model.model.state_dict()

@@ -71,6 +71,7 @@ def by_hand(loss: ForwardModelLoss, delta: Tensor, target: Tensor) -> dict[str, 
     return errors
 
 
+@pytest.mark.slow
 def test_a_fitted_loss_loads_into_a_fresh_one(make_loss, windows):
     loss, fresh = make_loss(noise=0.1), make_loss(fitted=False, noise=0.1)
     fresh.load_state_dict({name: value.clone() for name, value in loss.state_dict().items()})
@@ -160,6 +161,7 @@ def test_tiny_rotations_keep_their_digits_in_float32(make_loss, predict):
     assert abs(errors[torch.float32] / errors[torch.float64] - 1) < 1e-5
 
 
+@pytest.mark.slow
 def test_float64_states_give_a_float32_network_its_full_precision(make_loss, windows):
     batch = windows["swimmer6"].reshape(-1)
     exact = make_loss()
@@ -170,6 +172,7 @@ def test_float64_states_give_a_float32_network_its_full_precision(make_loss, win
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 def test_windows_feed_the_model_its_own_predictions(make_loss, windows, noise):
     generator = torch.Generator()
@@ -218,6 +221,7 @@ def test_gradients_flow_through_the_whole_window(make_loss, windows):
         torch.testing.assert_close((ahead - behind) / (2 * step), slope, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 2, 3])
 def test_truncated_gradients_are_those_of_pieces_of_the_window(make_loss, windows, steps):
     whole, truncated = make_loss(), make_loss(bptt_steps=steps)
@@ -283,6 +287,7 @@ def test_the_target_leads_from_the_noisy_input_to_the_clean_next_state(make_loss
     assert loss(batch)["loss_forward_model"] > 1e-4
 
 
+@pytest.mark.slow
 def test_noise_comes_from_the_generator_alone(make_loss, windows):
     batch = windows["swimmer6"].reshape(-1)
     values = []
@@ -354,6 +359,7 @@ def test_torchrl_contract(make_loss, windows):
     assert all(torch.equal(got, out[key]) for got, key in zip(tensors, loss.out_keys, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["observation", ("robot", "body")])
 def test_keys_can_be_set(make_loss, windows, key):
     loss = make_loss()
@@ -384,6 +390,7 @@ def test_batches_that_do_not_fit_are_named(make_loss, windows):
         make_loss(noise=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -415,6 +422,7 @@ def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
         assert table[error].total == pytest.approx(own[error].total, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_leaving_out_what_never_varies_changes_neither_loss_nor_gradient(make_loss, windows, monkeypatch):
     loss = make_loss()
     network, whole = loss.trained.core, type(loss.model).program

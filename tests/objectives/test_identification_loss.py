@@ -53,6 +53,7 @@ def test_it_is_the_forward_models_loss_with_the_inferred_graph(make_loss, trajec
     torch.testing.assert_close(loss(batch)["loss_forward_model"], torch.stack(alone).mean())
 
 
+@pytest.mark.slow
 def test_a_random_number_of_steps_is_identified_from_the_last_of_the_phase(make_loss, trajectories):
     loss = make_loss(context_length=6, shortest=4, num_queries=1, generator=torch.Generator().manual_seed(0))
     batch = trajectory_buffer(trajectories, batch_size=5, window=6, query_windows=(1, 1), seed=0).sample()

@@ -141,6 +141,7 @@ def test_what_diverges_ends_and_spoils_nothing(scenes, starts):
     assert any(bool((weight.grad != 0).any()) for weight in policy.network.parameters())
 
 
+@pytest.mark.slow
 def test_a_policy_learns_to_swing(model, scenes, starts):
     loss = make_loss(model, scenes["pendulum"], starts, steps=16)
     adam = torch.optim.Adam(loss.parameters(), lr=1e-2)

@@ -113,6 +113,7 @@ def trained(scene, **options):
     return bound
 
 
+@pytest.mark.slow
 def test_it_reaches_the_known_optimum_of_a_linear_quadratic_problem():
     env, start = point_env(20.0), at(1.0, -0.5)
     planner = GradientPlanner(env, HORIZON, warm_up=400, samples=4, seed=0)
@@ -127,6 +128,7 @@ def test_it_reaches_the_known_optimum_of_a_linear_quadratic_problem():
     torch.testing.assert_close(action.double(), optimum[:, 0], rtol=0.02, atol=0.02)
 
 
+@pytest.mark.slow
 def test_limits_bind():
     env, start = point_env(2.0), at(1.0)
     planner = GradientPlanner(env, HORIZON, warm_up=300, samples=4, seed=0)
@@ -164,6 +166,7 @@ def test_a_trained_kind_of_model_imagines_what_stepping_gives_and_differentiates
         assert gradient[index].item() == pytest.approx(difference, rel=1e-5, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_next_call_goes_on_from_the_last_plan():
     env, planner = point_env(20.0), GradientPlanner(point_env(20.0), HORIZON, 2, warm_up=200, samples=4, seed=0)
     executed = env.rollout(4, planner, tensordict=at(1.0), auto_reset=False)
@@ -196,6 +199,7 @@ def test_steps_shrink_where_they_gain_nothing_and_grow_where_they_do():
     assert thrown == pytest.approx(0.4) and at_rest < 0.4
 
 
+@pytest.mark.slow
 def test_rows_are_planned_on_their_own():
     env = point_env(20.0)
     optimum = GradientPlanner(env, HORIZON, warm_up=150, samples=1, candidates=1, seed=0)
@@ -380,6 +384,7 @@ def test_output_tensordict():
         planner(given, steps=3)
 
 
+@pytest.mark.slow
 def test_actions_cost_what_is_asked():
     """Without the reward's own cost: where actions are dear the best is to do nothing."""
     env = ModelEnv(point_env(2.0).world_model, lambda *step: quadratic(*step) + CONTROL_COST * step[1].square())

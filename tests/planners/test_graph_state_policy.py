@@ -125,6 +125,7 @@ def test_drives_other_scenes_with_the_same_weights(tmp_path) -> None:
     assert torch.equal(back.act(states_of(back.scene)), policy.act(states_of(back.scene)))
 
 
+@pytest.mark.slow
 def test_several_scenes_learn_at_once() -> None:
     policy, _ = make_policy("swimmer3", NEAR)
     gradients = []

@@ -136,6 +136,7 @@ def test_swings_the_pendulum_up():
     assert angle[-25:].max() < 0.1
 
 
+@pytest.mark.slow
 def test_rows_of_a_batch_are_planned_by_themselves():
     env = point_env(5.0)
     planner = point_planner(env)
@@ -231,6 +232,7 @@ def test_primer_and_collector():
     assert known[-12:] == ([False] + [True] * 4) * 2 + [False, True]
 
 
+@pytest.mark.slow
 def test_without_a_primer_the_plan_goes_on():
     env = point_env(5.0)
     planner = point_planner(env, 1, warm_up=5)
@@ -250,6 +252,7 @@ def test_works_without_gradients(mode):
     assert not wanted["plan", "actions"].requires_grad
 
 
+@pytest.mark.slow
 def test_task_may_be_a_tensordict():
     def reward(state, action, next_state, task):
         return quadratic(state, action, next_state, task["target"])
@@ -350,6 +353,7 @@ def test_where_every_step_is_too_long_shorter_ones_are_tried():
     assert solver.improve(start, 3).cost < start.cost - 0.1
 
 
+@pytest.mark.slow
 def test_copies_and_pickles_plan_alike():
     env = point_env(5.0)
     planner = point_planner(env, num_threads=1)

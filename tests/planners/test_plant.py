@@ -84,6 +84,7 @@ def test_states_without_joint_coordinates_change_in_all_channels(make_model):
     assert np.isfinite(local.dynamics).all() and np.abs(local.dynamics).max() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "task"), [("pendulum", "balance"), ("cheetah", "forward")])
 def test_more_iterations_find_better_plans(name, task):
     scene = load_scene(name)

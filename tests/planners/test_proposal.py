@@ -89,6 +89,7 @@ def test_ilqg_starts_from_it_on_the_true_physics():
         assert torch.allclose(later.plan(rest).float(), expected) == better
 
 
+@pytest.mark.slow
 def test_a_learned_policy_proposes_through_learned_models_without_exploring():
     scene = load_scene("cartpole")
     seen = collect_trajectories(scene, 4, 10, seed=0)

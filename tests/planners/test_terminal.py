@@ -72,6 +72,7 @@ def planned(name: str, terminal=None, start=None) -> torch.Tensor:
     return planner(start)["action"].double()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gn", "ilqg", "cem", "mppi"])
 @pytest.mark.parametrize("discount", [1.0, 0.9])
 def test_a_short_horizon_and_the_true_value_act_as_the_long_horizon(name, discount):
@@ -85,6 +86,7 @@ def test_a_short_horizon_and_the_true_value_act_as_the_long_horizon(name, discou
     assert ((short_sighted - optimum).abs() > 2 * noise + 0.1 * optimum.abs()).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gn", "ilqg", "cem", "mppi"])
 def test_a_value_of_nothing_changes_no_bit(name):
     assert torch.equal(planned(name, nothing), planned(name))
@@ -185,6 +187,7 @@ def posing():
     return env, start.set("task", reward.task_of(start["state"], targets))
 
 
+@pytest.mark.slow
 def test_a_terminal_reward_is_that_of_staying_at_the_target_s_distance(posing):
     env, start = posing
     actions = 0.1 * torch.ones(3, 4, 9)
@@ -201,6 +204,7 @@ def test_a_terminal_reward_is_that_of_staying_at_the_target_s_distance(posing):
     torch.testing.assert_close(totals.double(), found.sum(1).double() - 30 * staying[0], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_planners_read_the_target_of_a_terminal_reward(posing):
     """Each row's own: iLQG's costs are the returns that the model imagines for it."""
     env, start = posing

@@ -126,6 +126,7 @@ def test_casts_leave_statistics_alone(observation_graphs, make_observation_model
         torch.testing.assert_close(predicted.double() - observation, expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("core", ["gn", "mlp"])
 def test_it_learns_a_linear_system(core):
     """Two masses on springs, the second pushed: errors of one step, against predicting the mean change."""

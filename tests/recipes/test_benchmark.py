@@ -24,6 +24,7 @@ def model(tmp_path) -> str:
     return f"checkpoints=[{tmp_path / 'model.safetensors'}]"
 
 
+@pytest.mark.slow
 def test_every_method_on_every_number_of_threads(call, load, model, tmp_path, monkeypatch):
     recipe, seen = load("benchmark"), []
     inner = recipe.predict
@@ -56,6 +57,7 @@ def test_every_method_on_every_number_of_threads(call, load, model, tmp_path, mo
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", ["2", "[2]"])
 def test_names_of_one_number_of_threads_do_not_have_it(call, model, tmp_path, threads):
     options = (*SHORT, model, f"threads={threads}", "batches=[2]", f"run_dir={tmp_path / 'run'}")
@@ -81,6 +83,7 @@ def test_refused_before_work_begins(call, tmp_path, option, said):
     assert code == 1 and said in errors and not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_every_number_of_threads_has_its_own_front(tmp_path, capsys):
     def method(name, error, *seconds):
         return Method(name, name, lambda *_: torch.empty(0), error, {(n + 1, 1): s for n, s in enumerate(seconds)})

@@ -22,6 +22,7 @@ def test_systems_are_observed_from_one_start_with_and_without_control(system, co
     assert (speed < 1e-6) == (system == "swimmer3")
 
 
+@pytest.mark.slow
 def test_another_systems_estimate_predicts_worse(compose):
     scene, cfg = load_scene("pendulum"), compose("inference_model", "test.systems=8", "test.steps=[1]")
     model, systems = load_pretrained("identified_pendulum").trained, identification.TestSystems(cfg, scene)

@@ -25,6 +25,7 @@ def tracker(tmp_path) -> Tracker:
     return Tracker("none", tmp_path / "log", name="run", config=CONFIG)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_saved_and_goes_on(make_learner, tracker, tmp_path):
     path, trainer = tmp_path / "c.safetensors", make_learner(frames=100)
     evaluate = trainer.evaluate

@@ -64,6 +64,7 @@ def test_variants_start_alike_whoever_plans(tmp_path, call):
     assert code == 1 and "random.safetensors began in other states" in errors and "Traceback" not in errors
 
 
+@pytest.mark.slow
 def test_counts_the_starts_that_reach_a_goal_and_hold_it(tmp_path, call):
     options = ("system=pendulum", "planner=random", "episodes=4", "steps=30", "video=false", f"run_dir={tmp_path}")
     code, output, errors = call(*options, recipe="mpc")
@@ -81,6 +82,7 @@ def test_counts_the_starts_that_reach_a_goal_and_hold_it(tmp_path, call):
     assert metrics["random/steps_to_goal"] == 1 + max(first)
 
 
+@pytest.mark.slow
 def test_targets_that_are_poses(tmp_path, call):
     options = ("system=jaco", "planner=nothing", "episodes=2", "video=false", f"run_dir={tmp_path}")
     for steps in (1, 2):  # the second goes on from what the first saved
@@ -118,6 +120,7 @@ def test_an_episode_ends_where_its_simulation_becomes_unstable(tmp_path, call, m
     assert set(threads) == {1} and len(threads) == 8
 
 
+@pytest.mark.slow
 def test_a_system_that_explodes_is_not_identified(tmp_path, call, monkeypatch):
     rollout = Simulator.rollout
 
@@ -179,6 +182,7 @@ def test_bad_options_are_named(tmp_path, call):
         assert code == 1 and message in errors and "Traceback" not in errors, errors
 
 
+@pytest.mark.slow
 def test_planners_that_go_on_draw_what_they_would_have_drawn(tmp_path, call):
     options = ("system=pendulum", "planner=[gn,cem]", "horizon=2", "episodes=2", "video=false")
     options += ("gn.candidates=2", "gn.samples=2", "gn.warm_up=1", "gn.iterations=1")

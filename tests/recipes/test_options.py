@@ -99,6 +99,7 @@ def test_options_of_every_recipe_pass_as_they_are_and_null_where_the_comments_sa
         check_options(compose(recipe, "log=robot.csv", "lag=auto", "filter=auto"), RECIPES / f"{recipe}.py")
 
 
+@pytest.mark.slow
 def test_mistyped_options_suggest_the_nearest():
     def hints(*words):
         return unknown_options(words, RECIPES / "forward_model.py")

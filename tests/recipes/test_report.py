@@ -93,6 +93,7 @@ def test_a_cell_may_compare_two_runs(report, finished):
     assert shown(cell | {"times": 4}, report / "data") == "1.00"
 
 
+@pytest.mark.slow
 def test_committed_pages_are_those_of_their_data():
     pages = make_pages(REPORT / "data")
     assert pages == {file.name: file.read_text() for file in REPORT.glob("*.md")}
@@ -112,6 +113,7 @@ def test_readmes_table_quotes_runs(report, finished):
         fill_readme("# Some\n\n## Results\n\nNone.\n", report / "data")
 
 
+@pytest.mark.slow
 def test_committed_figures_are_those_of_their_data():
     assert stale_figures(read_figures(REPORT / "data"), REPORT.parent / "images" / "results") == []
 
@@ -287,6 +289,7 @@ def test_figures_are_stale_without_being_drawn_again(report, monkeypatch, option
     assert stale_figures(read_figures(report / "data"), images) == ["errors.png"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("columns", [1, 3])
 def test_names_of_places_do_not_overlap(columns):
     """Seven rounds of a run, a few per cent of the panel apart, in panels beside each other."""

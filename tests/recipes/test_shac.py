@@ -24,6 +24,7 @@ FORWARD = ("system=pendulum", "data.train=4", "data.validation=2", "data.test=2"
 SMALL += ("model={hidden:8,latent:8}", "evaluate.episodes=2", "evaluate.steps=20")
 
 
+@pytest.mark.slow
 def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     for folder, rounds in ((whole, 3), (resumed, 1), (resumed, 3)):
@@ -88,6 +89,7 @@ def test_a_forged_state_to_resume_from_is_refused_by_name(tmp_path, call, recipe
     assert code == 1 and f"CheckpointError: Checkpoint {tmp_path / file} cannot resume this training: " in errors
 
 
+@pytest.mark.slow
 def test_one_judged_episode_has_no_spread(tmp_path, call):
     code, _, errors = call(*SMALL, "rounds=1", "evaluate.episodes=1", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0 and "warning" not in errors.lower(), errors
@@ -137,6 +139,7 @@ def test_one_graph_policy_learns_on_several_systems(tmp_path, call):
     assert code == 0, errors
 
 
+@pytest.mark.slow
 def test_a_round_that_was_cut_short_is_done_again(tmp_path, call):
     call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
     before = json.loads((tmp_path / "metrics.json").read_text())
@@ -146,6 +149,7 @@ def test_a_round_that_was_cut_short_is_done_again(tmp_path, call):
     assert json.loads((tmp_path / "metrics.json").read_text())["reward"] == before["reward"]
 
 
+@pytest.mark.slow
 def test_what_is_derived_of_the_last_round_is_made_again(tmp_path, call):
     """As a run that was killed right after the last round's numbers needs."""
     call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
@@ -173,6 +177,7 @@ def test_what_is_derived_of_the_last_round_is_made_again(tmp_path, call):
     assert [name for name, content in contents().items() if content != whole[name]] == []
 
 
+@pytest.mark.slow
 def test_refuses_other_options_and_targets(tmp_path, call):
     call(*SMALL, "rounds=1", f"run_dir={tmp_path}", recipe="shac")
     code, _, errors = call(*SMALL, "updates=4", f"run_dir={tmp_path}", recipe="shac")
@@ -205,6 +210,7 @@ def test_checks_options_before_data_are_collected(option, tmp_path, call):
     assert code == 1 and option.partition("=")[0] in errors and not (tmp_path / "x/rounds").exists()
 
 
+@pytest.mark.slow
 def test_a_round_whose_episodes_all_became_unstable_does_not_end_the_run(tmp_path, call):
     code, _, errors = call(*SMALL, "rounds=1", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0, errors

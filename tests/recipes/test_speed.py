@@ -82,6 +82,7 @@ def test_others_are_timed_in_turn_and_compared(capsys, monkeypatch):
     assert "step, batch 1/jraph/bound" not in metrics and "8.0" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("activation", ["relu", "silu", "gelu", "tanh"])
 def test_jraph_network_is_ours(activation):
     pytest.importorskip("jraph")
@@ -106,6 +107,7 @@ def test_jraph_network_is_ours(activation):
         torch.testing.assert_close(torch.from_numpy(np.array(found)).view_as(wanted), wanted, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_samples_with_parameters_of_their_own(load, compose):
     recipe = load("benchmark_speed")
     batches = ["batches=[1,3]", "rollout_batches=[2]", "step_gradient_batches=[]", "gradient_batches=[1]"]

@@ -41,6 +41,7 @@ def test_an_episode_that_became_unstable_ends_before(tmp_path):
         transitions(tmp_path / "x.safetensors")
 
 
+@pytest.mark.slow
 def test_planners_see_further_with_what_was_learned(played, tmp_path, call):
     run = tmp_path / "value"
     for _ in range(2):  # the second repeats it
@@ -69,6 +70,7 @@ def test_planners_see_further_with_what_was_learned(played, tmp_path, call):
     torch.testing.assert_close(alone["action"], chosen["action"])
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_refused(played, tmp_path, call):
     code, _, errors = call("episodes=[]", recipe="value")
     assert code == 1 and "Name episodes of recipes/mpc.py" in errors
@@ -96,6 +98,7 @@ def test_what_does_not_fit_is_refused(played, tmp_path, call):
     assert code == 1 and "is of scene 'pendulum', not 'cartpole'" in errors
 
 
+@pytest.mark.slow
 def test_rounds_plan_with_the_value_of_all_episodes_before(tmp_path, load, compose):
     options = ("system=pendulum", "value=true", "discount=0.9", "planner=ilqr", "valuing=['fit.steps=5']")
     learned, executed, valued = load("plan_and_learn").make_runs(

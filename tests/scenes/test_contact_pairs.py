@@ -25,6 +25,7 @@ def names(scene) -> set[str]:
     return {" - ".join(scene.node_names[node] for node in nodes) for nodes in scene.contact_pairs.nodes}
 
 
+@pytest.mark.slow
 def test_a_finger_meets_box_and_table():
     scene = zoo.load("pusher")
     assert names(scene) == {"world - mount", "world - link", "world - box", "mount - box", "link - box"}
@@ -106,6 +107,7 @@ def test_height_fields_are_named():
     )
 
 
+@pytest.mark.slow
 def test_the_most_frequent_pairs_are_kept():
     balls = "".join(f'<body pos="0 0 {i}"><freejoint/><geom size="0.1"/></body>' for i in range(9))
     scene = load_scene(f"<mujoco><worldbody>{balls}</worldbody></mujoco>")
@@ -119,6 +121,7 @@ def test_the_paper_s_systems():
     assert names(load_scene("cheetah")) == {"torso - bfoot", "torso - bshin", "bthigh - bfoot", "torso - ffoot"}
 
 
+@pytest.mark.slow
 def test_print_does_not_look_for_the_pairs_of_a_large_scene():
     balls = "".join(
         f'<body pos="{x} 0 1"><freejoint/><geom size="0.05"/></body>' for x in range(33)

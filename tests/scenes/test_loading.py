@@ -263,6 +263,7 @@ def test_few_solver_iterations_that_rest_on_warm_starts_give_the_same_motion_wit
     assert np.median(errors[scene]) < 1e-12 < 1e-2 < np.median(errors[cold])
 
 
+@pytest.mark.slow
 def test_printed_summary():
     text = str(load_scene("jaco"))
     for part in ("Scene jaco: 10 nodes, 18 edges, 9 actions", "100 ms = 50 x 2 ms", "no axis", "b_base"):

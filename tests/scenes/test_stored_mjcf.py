@@ -14,6 +14,7 @@ def model(inside: str, before: str = "") -> str:
     return f"<mujoco>{before}<worldbody>{inside}{BALL}</worldbody></mujoco>"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -52,6 +53,7 @@ def test_copies_and_comments_that_only_mujoco_reads_come_back():
     assert scene_from_description(scene.description()).fingerprint() == scene.fingerprint()
 
 
+@pytest.mark.slow
 def test_files_are_unpacked_as_they_were_and_no_further_than_their_size():
     files = {"a": b"text", "b": bytes(range(256)) * 99, "c": b""}
     assert unpacked(packed(files)) == files

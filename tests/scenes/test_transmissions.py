@@ -287,6 +287,7 @@ def test_suite_domains_with_tendons_load(domain, controls):
     require_bounds(scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("domain", "count"), [("quadruped", 12), ("dog", 38)])
 def test_suite_domains_with_activations_load(domain, count):
     scene = load_scene(model_file(f"suite/{domain}.xml"))

@@ -183,6 +183,7 @@ def test_heading_of_small_models(case):
     assert (None if yaw_frame is None else yaw_frame.exact) is exact
 
 
+@pytest.mark.slow
 def test_heading_of_the_systems():
     for name in SYSTEMS:
         yaw_frame = load_scene(name).yaw_frame

@@ -37,6 +37,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
+@pytest.mark.slow
 def test_the_loss_falls_and_predictions_improve(train, scene):
     test = gn.collect_trajectories(scene, 5, 20, seed=1)
     model, history = train(steps=1)
@@ -48,6 +49,7 @@ def test_the_loss_falls_and_predictions_improve(train, scene):
         assert after[name].total < 0.5 * before[name].total
 
 
+@pytest.mark.slow
 def test_a_seed_decides_batches_and_noise(train, make_model, scene):
     trained = []
     for seed, others in ((0, 0), (0, 1), (1, 0)):
@@ -125,6 +127,7 @@ def test_a_specialised_predictor_is_refused(train):
     assert same(weights(model), before)
 
 
+@pytest.mark.slow
 def test_steps_and_minutes_end_it(train, monkeypatch):
     _, history = train(steps=7)
     assert history.steps == list(range(1, 8))
@@ -145,6 +148,7 @@ def test_steps_and_minutes_end_it(train, monkeypatch):
     assert budgets == [{"steps": None, "minutes": 1.0}]
 
 
+@pytest.mark.slow
 def test_validation_keeps_the_best_weights(train, trajectories, monkeypatch):
     seen, errors = [], iter([5.0, 3.0, 1.0, float("nan"), *[2.0] * 16])
 
@@ -161,6 +165,7 @@ def test_validation_keeps_the_best_weights(train, trajectories, monkeypatch):
     assert "best validation error 1.00e+00" in str(history)
 
 
+@pytest.mark.slow
 def test_validation_errors_are_those_of_the_model(train, scene):
     validation = gn.collect_trajectories(scene, 3, 20, seed=2)
     model, history = train(steps=20, validation=validation)
@@ -186,6 +191,7 @@ def test_the_history_has_a_hundred_points_of_mean_losses(train, monkeypatch):
     assert history.validations == [] and str(History()) == "no step"
 
 
+@pytest.mark.slow
 def test_a_second_fit_goes_on_with_the_same_normalisers(train, scene):
     model, first = train(steps=100)
     statistics, trained = normalizers(model), weights(model)

@@ -63,6 +63,7 @@ def learned(scene):
     return value, fit_value(value, play(), iterations=20, steps=100, seed=0)
 
 
+@pytest.mark.slow
 def test_it_recovers_the_value_of_a_linear_system(learned):
     """Beyond the episodes' time limits, after which a fifth of the value is still to come."""
     value, history = learned
@@ -124,6 +125,7 @@ def test_gradient_and_hessian_are_those_of_finite_differences(learned):
     value.float()
 
 
+@pytest.mark.slow
 def test_the_policy_acts_as_in_the_episodes(scene):
     torch.manual_seed(0)
     policy = StatePolicy(scene, hidden=(64, 64))

@@ -90,6 +90,7 @@ def updated(shapes: list, dtype: torch.dtype, steps: int = 3, *, transposed: boo
 NATIVE_SHAPES = [*SHAPES, (5, 1), (1, 1), (33, 17), (17, 33), (128, 128), (300, 70), (600, 530)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_cpp_updates_as_torch_operations_do(monkeypatch, dtype):
     compiled = updated(NATIVE_SHAPES, dtype)

@@ -49,6 +49,7 @@ def test_svg_learns_to_hold_a_point(make_learner):
     assert progress[-1].evaluation == last and progress[-1].losses["loss_model"] < 0.05
 
 
+@pytest.mark.slow
 def test_updates_come_at_the_stated_ratio_and_evaluations_where_they_are_due(make_learner):
     trainer = make_learner(frames=200, random_frames=60, updates_per_frame=1 / 32, evaluate_frames=50)
     progress = spend(trainer)
@@ -121,6 +122,7 @@ def test_every_transition_is_remembered_and_counted_once(make_learner):
     torch.testing.assert_close(kept[:, 3], -kept[:, 2].square())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("capacity", [1000, 90])
 def test_a_stopped_run_goes_on_where_it_was(make_learner, tmp_path, capacity):
     trainer = make_learner(frames=300, capacity=capacity)
@@ -144,6 +146,7 @@ def test_a_stopped_run_goes_on_where_it_was(make_learner, tmp_path, capacity):
     assert again.curve.frames == [0, 100, 200, 300] and rest[-1].updates == again.updates
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_begins_other_episodes(make_learner):
     trainer = make_learner(frames=100)
     spend(trainer)
@@ -157,6 +160,7 @@ def test_a_run_that_goes_on_begins_other_episodes(make_learner):
     assert not (starts[0] == starts[1]).any() and torch.equal(starts[1], starts[2])
 
 
+@pytest.mark.slow
 def test_the_last_updates_have_no_other_threads_than_the_first(make_learner, point_env, monkeypatch):
     """Closing TorchRL's SerialEnv, which its collector does with the last batch, would give torch all it began with."""
     monkeypatch.setattr(torchrl, "_THREAD_POOL_INIT", 4)
@@ -172,6 +176,7 @@ def test_the_last_updates_have_no_other_threads_than_the_first(make_learner, poi
         torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leave", ["break", "raise"])
 def test_a_run_that_is_left_leaves_the_environment_open(make_learner, monkeypatch, leave):
     trainer = make_learner(frames=100)
@@ -189,6 +194,7 @@ def test_a_run_that_is_left_leaves_the_environment_open(make_learner, monkeypatc
     assert spend(trainer)[-1].frames == 100
 
 
+@pytest.mark.slow
 def test_the_next_update_after_a_stop_is_the_one_that_would_have_been(make_learner):
     trainer = make_learner(frames=200)
     spend(trainer)
@@ -202,6 +208,7 @@ def test_the_next_update_after_a_stop_is_the_one_that_would_have_been(make_learn
     assert same(trainer.agent.state_dict(), again.agent.state_dict())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("capacity", [1000, 90])
 def test_a_finished_run_goes_on_with_more_frames(make_learner, capacity):
     """The buffer of a finished run is full: what is learned now comes behind, or replaces the oldest."""
@@ -217,6 +224,7 @@ def test_a_finished_run_goes_on_with_more_frames(make_learner, capacity):
     assert again.curve.frames[: len(trainer.curve.frames)] == trainer.curve.frames
 
 
+@pytest.mark.slow
 def test_a_run_asked_for_fewer_frames_than_it_has_is_refused_and_forgets_nothing(make_learner):
     trainer = make_learner(frames=200)
     spend(trainer)
@@ -230,6 +238,7 @@ def test_a_run_asked_for_fewer_frames_than_it_has_is_refused_and_forgets_nothing
     assert spend(again) == [] and torch.equal(contents(again), contents(trainer))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "at", ["first evaluation", "first batch", "update", "evaluation", "last update", "last evaluation"]
 )
@@ -264,6 +273,7 @@ def test_an_interrupt_costs_no_update_and_no_point_of_the_curve(make_learner, at
     assert again.curve.updates == whole.curve.updates
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("owner", "name"), [(torch.optim.Adam, "step"), (TensorDictReplayBuffer, "extend")])
 def test_an_interrupt_comes_between_changes(make_learner, ctrl_c, monkeypatch, owner, name):
     whole, trainer = (make_learner(frames=100, random_frames=20) for _ in range(2))
@@ -310,6 +320,7 @@ def test_weights_on_a_gpu_learn_from_experience_elsewhere(make_learner, point_en
     assert all(math.isfinite(value) for value in trainer.update().values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broken", ["loss", "gradient"])
 def test_what_is_not_finite_stops_before_any_weight_is_touched(make_learner, broken):
     trainer = make_learner()

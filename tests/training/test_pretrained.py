@@ -15,6 +15,7 @@ from torchrl_gn.training.checkpoint import WEIGHTS
 QUICK = {"pendulum", "cartpole", "acrobot"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in pretrained_names()]
 )

@@ -151,6 +151,7 @@ def test_patience_stops_after_validations_without_a_new_best(make_trainer):
     assert list(trainer.run()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("owner", "name"), [(ReplayBuffer, "sample"), (torch.optim.Adam, "step"), (Errors, "__call__")]
 )
@@ -169,6 +170,7 @@ def test_an_interrupt_waits_until_the_step_is_whole(make_trainer, ctrl_c, monkey
     assert_same(weights(interrupted), weights(whole))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [1, 4, 7])
 @pytest.mark.parametrize("preset", ["muon", "paper"])
 def test_resumed_training_is_the_uninterrupted_one(make_trainer, scene, tmp_path, stop, preset):
@@ -232,6 +234,7 @@ def test_minutes_cap_a_budget_of_steps(make_trainer):
     assert len(list(done.run())) == 3 and not done.cut_short
 
 
+@pytest.mark.slow
 def test_an_optimiser_of_torch_trains(make_trainer):
     trainer = make_trainer(Budget(steps=60), noise=0.0)
     trainer = Trainer(
@@ -307,6 +310,7 @@ def test_callers_see_their_own_precision_between_steps(make_trainer):
         assert torch.backends.mkldnn.matmul.fp32_precision == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
 def test_cpp_has_all_threads_of_a_step_and_torch_one(make_trainer):
     threads, seen, trained = torch.get_num_threads(), [], []

@@ -125,6 +125,7 @@ def test_smoothing_keeps_parabolas_and_quiets_noise(uneven):
     assert np.array_equal(smoothed(at[:2], noise[:2], 5)[0], noise[:2])
 
 
+@pytest.mark.slow
 def test_the_width_follows_the_noise():
     widths = [inspect_log(swinging_log(noise)).half_widths["angle"] for noise in (0.0, 1e-5, 1e-3)]
     assert widths[0] < widths[1] < widths[2]

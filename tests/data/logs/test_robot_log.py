@@ -327,6 +327,7 @@ def test_a_simulated_robot_has_the_faults_of_a_real_one():
         simulate_log(load_scene("cartpole"), 1, 10, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists(PAM), reason="the robot's logs are not here")
 def test_a_real_log_is_cut_where_its_description_says():
     log = load_robot_log(PAM, timestep=0.01047, names=NAMES)
