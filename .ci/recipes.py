@@ -37,6 +37,8 @@ def quoted(options: str) -> str:
 MODELS = f"""
 evaluate checkpoint=runs/forward_model sequences=10 run_dir=runs/evaluate
 
+evaluate checkpoint=acrobot suite_task=acrobot/swingup sequences=5 run_dir=runs/evaluate_suite
+
 publish checkpoint=runs/forward_model file=runs/published.safetensors sequences=5
 
 benchmark_scaling system=pendulum batches=[20] steps=2 warm_up=1 repeats=1 trajectories=5 run_dir=runs/scaling

@@ -2,9 +2,11 @@
 
     python recipes/evaluate.py checkpoint=runs/forward_model/<time> [system=swimmer8] [key=value ...]
     python recipes/evaluate.py checkpoint=swimmerN system=swimmer12
+    python recipes/evaluate.py checkpoint=cheetah suite_task=cheetah/run
 
-Collects fresh test trajectories and prints the error table (docs/evaluation.md defines the errors). Takes seconds. All
-options: recipes/config/evaluate.yaml.
+Collects fresh test trajectories, or pieces of a suite task's episodes under uniformly random actions. Prints the error
+table (docs/evaluation.md defines the errors), and the joints' errors in metres and radians. Takes seconds. All options:
+recipes/config/evaluate.yaml.
 
 Writes config.yaml, metrics.json, a figure and a video to its run folder.
 """
@@ -12,15 +14,47 @@ Writes config.yaml, metrics.json, a figure and a video to its run folder.
 from __future__ import annotations
 
 import hydra
+import numpy as np
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDict
 
 from _common import clean_exit, finish_run, open_run, with_help
 from _common.progress import HORIZON, collecting
-from torchrl_gn.data import collect_trajectories
-from torchrl_gn.evaluation import report
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.data import Simulator, collect_trajectories
+from torchrl_gn.envs import load_suite_task
+from torchrl_gn.evaluation import joint_errors, report
+from torchrl_gn.scenes import Scene, UnsupportedSceneError, load_scene
 from torchrl_gn.training import load_pretrained
+
+EPISODE, PIECES = 1000, 5  # control steps of an episode, and pieces that it gives
+
+
+def pieces_of_episodes(scene: Scene, name: str, count: int, length: int, seed: int) -> TensorDict:
+    """``count`` pieces of ``length`` steps at random places of a task's episodes, each action drawn anew, uniformly."""
+    domain, separator, task = name.partition("/")
+    if not separator:
+        raise ValueError(f"suite_task={name} must be a domain and a task, as in cheetah/run.")
+    env = load_suite_task(domain, task, seed)
+    joints = tuple(env.physics.model.id2name(joint, "joint") for joint in range(env.physics.model.njnt))
+    if joints != scene.joint_names or not np.isclose(env.control_timestep(), scene.timestep):
+        raise ValueError(
+            f"suite_task={name} has joints {joints} and control steps of {env.control_timestep():g} s;"
+            f" {scene.name!r} has {scene.joint_names} and {scene.timestep:g} s."
+        )
+    rng, episodes = np.random.default_rng(seed), -(-count // PIECES)
+    starts = np.zeros((episodes, scene.physics_size))
+    for start in starts:
+        env.reset()
+        start[1:] = env.physics.get_state()
+    size = (episodes, EPISODE, scene.num_actions)
+    actions = rng.uniform(scene.action_low, scene.action_high, size)
+    played = Simulator(scene).rollout(starts, actions)
+    begin = rng.integers(EPISODE - length + 1, size=count)
+    which = torch.from_numpy(np.arange(count) // PIECES)[:, None]
+    steps = torch.from_numpy(begin[:, None] + np.arange(length + 1))
+    pieces = {"state": played["state"][which, steps], "action": torch.from_numpy(actions)[which, steps[:, :-1]]}
+    return TensorDict(pieces, [count])[played["stable"][which[:, 0]]]
 
 
 @with_help
@@ -36,11 +70,22 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(f"length={cfg.length} is too short: errors are measured over {HORIZON} steps.")
     torch.set_num_threads(cfg.threads)
     run, tracker = open_run(cfg, "evaluate")
-    with collecting("test data") as show:
-        test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, split=3, progress=show)
+    if cfg.suite_task:
+        test = pieces_of_episodes(scene, cfg.suite_task, cfg.sequences, cfg.length, cfg.seed)
+    else:
+        with collecting("test data") as show:
+            test = collect_trajectories(scene, cfg.sequences, cfg.length, cfg.seed, split=3, progress=show)
     table, files = report(model, test, run.path)
     print(table)
-    finish_run(cfg, run, tracker, table.to_metrics(), files=files)
+    metrics = table.to_metrics()
+    try:
+        joints = joint_errors(model, test)
+    except UnsupportedSceneError as error:
+        print(error)
+    else:
+        print(f"\nJoints, over {cfg.length} steps:\n{joints}")
+        metrics |= joints.to_metrics()
+    finish_run(cfg, run, tracker, metrics, files=files)
 
 
 if __name__ == "__main__":

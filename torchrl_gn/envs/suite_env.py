@@ -53,7 +53,7 @@ def suite_env(
         raise ValueError(f"num_envs={num_envs} and steps={steps} must be at least 1.")
     seeds = np.random.SeedSequence(seed).generate_state(num_envs).tolist()
     make = partial(_make, domain, task, timestep, steps)
-    order = tuple(_load(domain, task, 0).observation_spec()) if keys is None else tuple(keys)
+    order = tuple(load_suite_task(domain, task, 0).observation_spec()) if keys is None else tuple(keys)
     env = TransformedEnv(SerialEnv(num_envs, [partial(make, seed=each) for each in seeds]), DoubleToFloat())
     for key in order:
         axes = env.observation_spec[key].ndim - 1  # without the batch of environments
@@ -68,7 +68,7 @@ def observation_env(graph: ObservationGraph, domain: str, task: str, **options) 
 
     Raises ValueError if its observation or actions differ from the graph's, or actions are not within -1 and 1.
     """
-    loaded = _load(domain, task, 0)
+    loaded = load_suite_task(domain, task, 0)
     low, high = loaded.action_spec().minimum, loaded.action_spec().maximum
     if (low != -1).any() or (high != 1).any():
         raise ValueError(f"Task {domain} {task} has actions of {low.min():g} to {high.max():g}; policies give -1 to 1.")
@@ -96,7 +96,11 @@ def _suite() -> tuple[Any, Any, Any]:
     return suite, swimmer, control
 
 
-def _load(domain: str, task: str, seed: int) -> Any:
+def load_suite_task(domain: str, task: str, seed: int) -> Any:
+    """dm_control's environment of a task of the suite, loaded without a display; swimmers have any number of links.
+
+    Raises ValueError for an unknown task, ImportError without dm_control.
+    """
     suite, swimmer, _ = _suite()
     links = task.removeprefix("swimmer")
     if domain == "swimmer" and links.isdigit() and (domain, task) not in suite.ALL_TASKS:
@@ -161,7 +165,7 @@ def _is_random(numbers: Any, drawn: Any) -> bool:
 
 
 def _make(domain: str, task: str, timestep: float | None, steps: int | None, *, seed: int) -> _SuiteEnv:
-    loaded = _load(domain, task, seed)
+    loaded = load_suite_task(domain, task, seed)
     step = loaded.control_timestep() if timestep is None else timestep
     physics_step = loaded.physics.timestep()
     if not 0 < step < np.inf or abs(step / physics_step - round(step / physics_step)) > 1e-6:

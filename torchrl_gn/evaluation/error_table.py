@@ -62,7 +62,7 @@ class ErrorTable:
 
     def to_table(self) -> str:
         """Errors relative to the persistence baseline as lines of text, one column per error."""
-        return "\n".join([*_aligned(self.rows()), *self._divergences()])
+        return "\n".join([*aligned(self.rows()), *self._divergences()])
 
     __str__ = to_table
 
@@ -78,14 +78,15 @@ def summary(tables: Mapping[str, ErrorTable]) -> str:
     rows += [(label, *(_number(table[name].total) for name in first.errors)) for label, table in tables.items()]
     rows.append(("persistence baseline", *(_number(1.0) for _ in first.errors)))
     notes = [f"{label}, {line}" for label, table in tables.items() for line in table._divergences()]
-    return "\n".join([*_aligned(rows), *notes])
+    return "\n".join([*aligned(rows), *notes])
 
 
 def _titles(table: ErrorTable) -> tuple[str, ...]:
     return "relative squared error", *(name.replace("_error", "").replace("_", " ") for name in table.errors)
 
 
-def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
+def aligned(rows: list[tuple[str, ...]]) -> list[str]:
+    """Lines of a table, its title row underlined, with numbers to the right."""
     first, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join((row[0].ljust(first), *map(str.rjust, row[1:], widths))) for row in rows]
     return [lines[0], "-" * len(lines[0]), *lines[1:]]

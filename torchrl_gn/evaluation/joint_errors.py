@@ -1,0 +1,100 @@
+"""Errors of predicted joint coordinates and rates, in metres and radians."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.evaluation.error_table import aligned
+from torchrl_gn.maths import quaternion
+from torchrl_gn.scenes import Scene
+
+_SLIDE, _BALL, _FREE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("SLIDE", "BALL", "FREE"))
+
+
+class JointErrors(NamedTuple):
+    """Mean squared errors of each degree of freedom over all steps and rollouts; infinite where one diverged."""
+
+    names: tuple[str, ...]  # [nv], of its joint, ``root[2]`` where that has several
+    units: tuple[str, ...]  # [nv], "m" or "rad"
+    coordinate: Tensor  # [nv], m² or rad²
+    rate: Tensor  # [nv], (m/s)² or (rad/s)²
+
+    @property
+    def mean_square(self) -> float:
+        """Mean over all coordinates and rates, whatever their units, as MoSim reports it."""
+        return torch.cat((self.coordinate, self.rate)).mean().item()
+
+    def to_metrics(self) -> dict[str, float]:
+        """``joint_mean_square``, and the root mean squares of each degree of freedom by name."""
+        found = {"joint_mean_square": self.mean_square}
+        for name, coordinate, rate in zip(self.names, self.coordinate.sqrt(), self.rate.sqrt(), strict=True):
+            found |= {f"joint_error/{name}": coordinate.item(), f"joint_rate_error/{name}": rate.item()}
+        return found
+
+    def __str__(self) -> str:
+        rows = [("root mean square error", "coordinate", "rate")]
+        for name, unit, coordinate, rate in zip(
+            self.names, self.units, self.coordinate.sqrt(), self.rate.sqrt(), strict=True
+        ):
+            rows.append((name, f"{coordinate.item():.3g} {unit}", f"{rate.item():.3g} {unit}/s"))
+        return "\n".join([*aligned(rows), f"mean square of all: {self.mean_square:.3g}"])
+
+
+@torch.no_grad()
+def joint_errors(model: Predictor, trajectories: TensorDictBase) -> JointErrors:
+    """Errors of MuJoCo's coordinates and velocities over all steps of rollouts from state 0.
+
+    Angles differ by at most half a turn. The coordinates of a ball, and the last three of a free joint, are those of
+    the rotation vector from the true to the predicted orientation.
+
+    Args:
+        model: a bound or specialised model.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]`` and ``action`` ``[M, T, A]``.
+
+    Raises:
+        UnsupportedSceneError: names joints whose coordinates do not follow from body states.
+    """
+    scene, coordinates = model.scene, JointCoordinates(model.scene)
+    state, action = trajectories.get("state"), trajectories.get("action")
+    predicted = model.rollout(state[:, 0], action)[0][:, 1:].cpu()
+    finite = predicted.isfinite().all()
+    (position, velocity), (place, rate) = coordinates(predicted), coordinates(state[:, 1:].cpu())
+    names, units, parts = _degrees_of_freedom(scene)
+    away = _difference(scene, parts, position, place)
+    errors = [each.square().flatten(0, -2).mean(0) for each in (away, velocity - rate)]
+    return JointErrors(names, units, *(torch.where(finite & each.isfinite(), each, torch.inf) for each in errors))
+
+
+def _degrees_of_freedom(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...], list[tuple[int, int]]]:
+    """Names ``[nv]`` and units ``[nv]`` of degrees of freedom, and each joint's address in ``qpos`` and type."""
+    model, names, units, parts = scene.model, [], [], []
+    for joint, (kind, address) in enumerate(zip(model.jnt_type.tolist(), model.jnt_qposadr.tolist(), strict=True)):
+        count, name = {_BALL: 3, _FREE: 6}.get(kind, 1), scene.joint_names[joint]
+        names += [name] if count == 1 else [f"{name}[{index}]" for index in range(count)]
+        units += ["m", "m", "m", "rad", "rad", "rad"] if kind == _FREE else count * ["m" if kind == _SLIDE else "rad"]
+        parts.append((address, kind))
+    return tuple(names), tuple(units), parts
+
+
+def _difference(scene: Scene, parts: list[tuple[int, int]], position: Tensor, truth: Tensor) -> Tensor:
+    """``[*B, nv]`` from coordinates ``truth`` ``[*B, nq]`` to ``position``."""
+    found = []
+    for address, kind in parts:
+        turned = address + 3 * (kind == _FREE)
+        if kind == _FREE:
+            found.append(position[..., address:turned] - truth[..., address:turned])
+        if kind in (_FREE, _BALL):
+            to, start = (each[..., turned : turned + 4] for each in (position, truth))
+            found.append(quaternion.log(quaternion.product(quaternion.conjugate(start), to)))
+            continue
+        away = position[..., address : address + 1] - truth[..., address : address + 1]
+        found.append(away if kind == _SLIDE else torch.remainder(away + math.pi, 2 * math.pi) - math.pi)
+    return torch.cat(found, dim=-1)
