@@ -35,7 +35,7 @@ from torchrl_gn.scenes.scene import Scene
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.model import ForwardModel
     from torchrl_gn.maths.state_layout import StateLayout
-    from torchrl_gn.scenes import ParameterNames
+    from torchrl_gn.scenes import KinematicTree, ParameterNames
 
 # Standard deviations below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 DYNAMIC_FLOOR = 1e-9
@@ -175,7 +175,7 @@ class BoundPredictor(Predictor):
             parameters: physical parameters of each sample; default: the scene's.
             reference: whether not to fold the core; default: as bound.
             reduced: leave out features that never vary, and take scales into the network's layers.
-            rows: components of the change to predict, the others keep their mean; default: all, so that a loss of
+            rows: components of the output to predict, the others keep their mean; default: all, so that a loss of
                 weights that are not finite is not finite.
             core: another core with the same weights.
             dtype: of the network; default: that of the core.
@@ -186,7 +186,7 @@ class BoundPredictor(Predictor):
         unfolded = self.reference if reference is None else reference
         folded = UnfoldedCore(core, static) if unfolded else core.fold(self.incidence, static)
         if reduced and rows is None:
-            rows = torch.arange(model.residual_normalizer.size, device=self.movable.device)
+            rows = torch.arange(sum(each.size for each in model.output_normalizers), device=self.movable.device)
         folded, nodes, edges, output = _scaled(self, folded, rows if reduced else None)
         return StepProgram(
             layout=self.layout,
@@ -209,6 +209,7 @@ class BoundPredictor(Predictor):
             static=static if self.recurrent else None,
             core=folded,
             output=output,
+            parents=moving_parents(self.scene) if model.parent_relative else None,
             position_weight=None if self.projection is None else position_weight(model.delta_normalizer.std),
             dtype=dtype or dtype_of(core),
             physics=model.physics,
@@ -307,6 +308,21 @@ def residual(program: StepProgram, state: Tensor, action: Tensor, next_state: Te
     return change if canonical.change is None else hardshrink(change - canonical.change, DYNAMIC_FLOOR)
 
 
+def relative_to_parents(program: StepProgram, residual: Tensor) -> Tensor:
+    """Residual changes ``[*B, N, 12]`` less those of the parents; of roots as they are."""
+    assert program.parents is not None
+    rows = list(residual.unbind(-2))
+    for node, parent in program.parents:
+        rows[node] = residual[..., node, :] - residual[..., parent, :]
+    return torch.stack(rows, dim=-2)
+
+
+def moving_parents(scene: Scene | KinematicTree) -> tuple[tuple[int, int], ...]:
+    """Nodes that hinges or balls connect to a parent that moves, with these, roots first."""
+    parent = scene.joint_anchors.parent.tolist()
+    return tuple((node, above) for node, above in enumerate(parent) if node != above and scene.predicted[above])
+
+
 def update_parameter_normalizers(predictor: BoundPredictor, parameters: TensorDictBase | None = None) -> None:
     """Take physical parameters, by default the scene's, into the model's statistics: once, before training.
 
@@ -347,7 +363,10 @@ def update_dynamic_normalizers(
     model.node_normalizer.update(nodes)
     model.edge_normalizer.update(edges)
     model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)
-    model.residual_normalizer.update(residual(program, state, action, next_state), movable)
+    change = residual(program, state, action, next_state)
+    model.residual_normalizer.update(change, movable)
+    if model.relative_normalizer is not None:
+        model.relative_normalizer.update(relative_to_parents(program, change), movable)
 
 
 def _scaled(
@@ -359,19 +378,19 @@ def _scaled(
     it can.
     """
     model = predictor.model
-    node, edge, residual = model.node_normalizer, model.edge_normalizer, model.residual_normalizer
+    node, edge, output = model.node_normalizer, model.edge_normalizer, OutputScaling.of(model.output_normalizers)
     # A hidden state is updated from all features.
     if rows is None or predictor.recurrent or not isinstance(core, ReducibleCore):
-        return core, InputScaling.of(node), InputScaling.of(edge), OutputScaling.of(residual)
+        return core, InputScaling.of(node), InputScaling.of(edge), output
     nodes, edges = InputScaling.folded(node), InputScaling.folded(edge)
-    assert nodes.columns is not None and edges.columns is not None
+    assert nodes.columns is not None and edges.columns is not None and output.std is not None
     core = core.reduced(
         (nodes.columns, node.inverse_std[nodes.columns]),
         (edges.columns, edge.inverse_std[edges.columns]),
-        (rows, residual.std[rows]),
-        residual.mean[rows],
+        (rows, output.std[rows]),
+        output.mean[rows],
     )
-    return core, nodes, edges, OutputScaling.folded(residual, rows)
+    return core, nodes, edges, output.folded(rows)
 
 
 def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:

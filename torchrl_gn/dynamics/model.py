@@ -11,7 +11,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_gn.dynamics.bound import DYNAMIC_FLOOR, BoundPredictor
+from torchrl_gn.dynamics.bound import DYNAMIC_FLOOR, BoundPredictor, moving_parents
 from torchrl_gn.dynamics.features import (
     FEATURES,
     Activations,
@@ -62,6 +62,9 @@ class ForwardModel(nn.Module):
         integrate: predict of position and orientation only what their rates do not explain (trapezoidal rule); the
             paper predicts the whole change. Physics take its place.
         project: project predictions onto the joint constraints. Paper: bodies drift apart.
+        parent_relative: predict each body's change twice, in the frame of all and relative to its parent's. The second
+            adds up along the tree, the sum of both counts. What a joint does is seen at the joint alone, not in the sum
+            of all joints before it. Paper: the first.
         physics: known physics of one robot, which the network corrects, see
             :class:`~torchrl_gn.dynamics.physics.Physics`; a function or module of state and action.
         core: name of the network, one of :data:`~torchrl_gn.networks.CORES`.
@@ -83,6 +86,7 @@ class ForwardModel(nn.Module):
         canonicalizer: Canonicalizer | None = None,
         integrate: bool = True,
         project: bool = True,
+        parent_relative: bool = True,
         physics: Callable[[Tensor, Tensor], Tensor] | None = None,
         core: str = "gn",
         counts: Sequence[int] | None = None,
@@ -97,7 +101,7 @@ class ForwardModel(nn.Module):
             self.features += (PhysicsChange(),)
         self.parameter_names = parameter_names if parameters == "scene" else ParameterNames()
         self.canonicalizer = Canonicalizer() if canonicalizer is None else canonicalizer
-        self.integrate, self.project = integrate, project
+        self.integrate, self.project, self.parent_relative = integrate, project, parent_relative
         self.core_name, self.core_options = core, core_options
 
         def count(part: str) -> int:
@@ -126,10 +130,12 @@ class ForwardModel(nn.Module):
         self.parameter_global_normalizer = Normalizer(static.globals_, limit=_PARAMETER_LIMIT)
         # The network's output has the residual's scale; errors are weighted by the whole change's.
         self.residual_normalizer = Normalizer(layout.delta_size, floor=DYNAMIC_FLOOR)
+        self.relative_normalizer = Normalizer(layout.delta_size, floor=DYNAMIC_FLOOR) if self.parent_relative else None
         self.delta_normalizer = Normalizer(layout.delta_size, floor=DYNAMIC_FLOOR)
         kind = cast(Any, core_class(core))
         fixed = {"counts": counts} if kind.fixed_size else {}
-        self.core: Core = kind(self.dynamic_size, static, layout.delta_size, **fixed, **core_options)
+        outputs = sum(normalizer.size for normalizer in self.output_normalizers)
+        self.core: Core = kind(self.dynamic_size, static, outputs, **fixed, **core_options)
         if not hasattr(self.core, "hidden_size"):
             raise TypeError(f"{kind.__name__}.__init__ must call super().__init__(dynamic), as a Core does.")
 
@@ -144,7 +150,8 @@ class ForwardModel(nn.Module):
         """A model with fresh weights for a scene, its name or path, or for several scenes that share it.
 
         Layout, controls at each joint, names of the physical parameters and the graph's size are read from the scene;
-        ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core.
+        ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core;
+        ``parent_relative`` is left out where no body has a parent that moves.
         """
         given = as_scene(scene)
         scenes = [given] if isinstance(given, (Scene, KinematicTree)) else list(given)
@@ -157,6 +164,7 @@ class ForwardModel(nn.Module):
             features += tuple(kind() for kind in optional if any(map(kind.suits, scenes)))
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
+        options["parent_relative"] = options.get("parent_relative", True) and any(map(moving_parents, scenes))
         return cls(ParameterNames.of(first), layout=layout, features=chosen, counts=counts, **options)
 
     @property
@@ -169,9 +177,15 @@ class ForwardModel(nn.Module):
         }
 
     @property
+    def output_normalizers(self) -> list[Normalizer]:
+        """Normalisers of the network's output: of residual changes, and of those relative to the parent's."""
+        relative = self.relative_normalizer
+        return [self.residual_normalizer] if relative is None else [self.residual_normalizer, relative]
+
+    @property
     def fitted(self) -> bool:
         """Whether all normalisers that the model reads have seen data. Waits for the device."""
-        read = [self.node_normalizer, self.edge_normalizer, self.residual_normalizer, self.delta_normalizer]
+        read = [self.node_normalizer, self.edge_normalizer, *self.output_normalizers, self.delta_normalizer]
         if self.parameter_source == "scene":  # an inferred graph is read as it is
             read += self.parameter_normalizers.values()
         return all(normalizer.fitted for normalizer in read)
@@ -237,6 +251,7 @@ class ForwardModel(nn.Module):
             "canonicalizer": asdict(self.canonicalizer),
             "integrate": self.integrate,
             "project": self.project,
+            "parent_relative": self.parent_relative,
             "physics": None if self.physics is None else self.physics.description(),
             "core": self.core_name,
             "counts": None if self.core.counts is None else list(self.core.counts),
@@ -253,7 +268,7 @@ class ForwardModel(nn.Module):
 
         ValueError if it has unknown names, or needs physics that are not given: those of MJCF rebuild themselves.
         """
-        rest = dict(description)
+        rest = {"parent_relative": False, **description}  # models of before 28 November 2026 say nothing of it
         known = physics_from_description(rest.pop("physics", None), physics)
         features = []
         for each in rest.pop("features"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -49,26 +49,26 @@ class InputScaling(NamedTuple):
 
 
 class OutputScaling(NamedTuple):
-    """How the network's output becomes a residual change in SI units."""
+    """How the network's output becomes residual changes in SI units, 12 of each body and 12 relative to its parent."""
 
-    # Columns of the change, in order: slices of the output, or of the mean for components that never varied; None:
+    # Columns of the changes, in order: slices of the output, or of the mean for components that never varied; None:
     # the output has all components, to be scaled.
     runs: tuple[tuple[bool, slice], ...] | None
-    mean: Tensor  # [12] float64
-    std: Tensor | None  # [12] float64; None: folded into the core
+    mean: Tensor  # [12] float64; [24] with relative changes
+    std: Tensor | None  # the same; None: folded into the core
 
     @classmethod
-    def of(cls, normalizer: Normalizer) -> OutputScaling:
-        """All components, scaled back as a normaliser scales them."""
-        return cls(None, normalizer.mean, normalizer.std)
+    def of(cls, normalizers: Sequence[Normalizer]) -> OutputScaling:
+        """All components, scaled back as the normalisers scale them; of those behind the first by their std alone."""
+        means = [normalizers[0].mean, *(torch.zeros_like(each.mean) for each in normalizers[1:])]
+        return cls(None, torch.cat(means), torch.cat([each.std for each in normalizers]))
 
-    @classmethod
-    def folded(cls, normalizer: Normalizer, rows: Tensor) -> OutputScaling:
+    def folded(self, rows: Tensor) -> OutputScaling:
         """Components ``rows`` from the output, in SI units; the others keep their mean."""
-        return cls(_runs(rows.tolist(), normalizer.size), normalizer.mean, None)
+        return OutputScaling(_runs(rows.tolist(), len(self.mean)), self.mean, None)
 
     def __call__(self, predicted: Tensor, dtype: torch.dtype) -> Tensor:
-        """Residual ``[*B, N, 12]`` in ``dtype``."""
+        """Residuals ``[*B, N, 12]``, or ``[*B, N, 24]`` with relative ones behind, in ``dtype``."""
         if self.runs is None:
             assert self.std is not None
             if predicted.shape[-1] != len(self.std):
@@ -105,6 +105,8 @@ class StepProgram:
     static: Graph | None  # normalised static graph, which the hidden state reads
     core: FoldedCore  # the folded network
     output: OutputScaling  # scaling of its output
+    # Nodes with their parents, roots first, along which relative changes add up; None: the output has none.
+    parents: tuple[tuple[int, int], ...] | None
     projection: MaximalProjection | None  # onto the joint constraints; None without
     position_weight: Tensor | None  # [] float64, of the projection: a squared metre against a squared radian
     dtype: torch.dtype  # of the network

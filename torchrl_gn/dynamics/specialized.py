@@ -277,7 +277,8 @@ def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype:
     """Snapshot of the step in a dtype, without features and components that never vary."""
     # In float64, so that folding loses nothing.
     core = copy_of(predictor.model.core).double().requires_grad_(False)
-    rows = (predictor.movable.any(0) & ~predictor.model.residual_normalizer.constant).nonzero().flatten()
+    moves = predictor.movable.any(0)
+    rows = torch.cat([moves & ~each.constant for each in predictor.model.output_normalizers]).nonzero().flatten()
     program = predictor.program(parameters, reference=False, reduced=True, rows=rows, core=core)
     changed = {name: in_dtype(getattr(program, name), dtype) for name in ("core", "recurrent", "static")}
     return replace(program, dtype=dtype, **changed)
@@ -338,7 +339,7 @@ def _skipped(predictor: BoundPredictor, program: StepProgram) -> dict[str, tuple
     }
     if program.output.runs is not None:
         moved = sum(where.stop - where.start for varies, where in program.output.runs if varies)
-        rows["components predicted"] = (predictor.layout.delta_size, moved)
+        rows["components predicted"] = (len(program.output.mean), moved)
     if isinstance(program.core, FoldedGNCore):
         rows["edges of the second block"] = (edges, program.core.gather.shape[0])
     return {**rows, "kFLOP": (plain.get_total_flops() / 1e3, quick.get_total_flops() / 1e3)}

@@ -99,9 +99,20 @@ def delta(
     return change(program, state, canonical, program.core.predict(graph)), hidden
 
 
+def summed(program: StepProgram, residual: Tensor) -> Tensor:
+    """Residuals ``[*B, N, 12]``, to which relative ones behind them are added along the tree."""
+    if program.parents is None:
+        return residual
+    residual, relative = residual.chunk(2, dim=-1)
+    rows = list(relative.unbind(-2))
+    for node, parent in program.parents:
+        rows[node] = rows[node] + rows[parent]
+    return residual + torch.stack(rows, dim=-2)
+
+
 def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predicted: Tensor) -> Tensor:
     """Change ``[*B, N, 12 + K]`` of a state from the network's output ``[*B, N, F_out]``."""
-    residual = program.output(predicted, state.dtype)
+    residual = summed(program, program.output(predicted, state.dtype))
     if canonical.change is not None:
         residual = canonical.change + residual
     if canonical.rotation is not None:
