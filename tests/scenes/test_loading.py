@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.data.start_states import sample_start_states
 from torchrl_gn.scenes import (
     SYSTEMS,
     Scene,
@@ -234,6 +236,25 @@ def test_sensors_are_left_out_and_decide_nothing():
         mujoco.mj_step(model, data, nstep=20)
         ends.append(np.concatenate((data.qpos, data.qvel, data.sensordata)))
     np.testing.assert_array_equal(*ends)
+
+
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_history"), reason="needs MuJoCo 3.5")
+def test_controls_kept_without_delay_and_late_sensors_are_no_state():
+    kept = MOTOR.replace("/>", ' nsample="4" interp="linear"/>')
+    sensor = '<sensor><jointpos joint="a" delay=".01" nsample="6"/></sensor></mujoco>'
+    given = GOOD.replace(MOTOR, kept).replace("</mujoco>", sensor)
+    by_class = GOOD.replace("<worldbody>", '<default><motor nsample="3"/></default><worldbody>')
+    assert all(mujoco.MjModel.from_xml_string(text).nhistory for text in (given, by_class))
+    plain = load_scene(GOOD)
+    for scene in map(load_scene, (given, by_class)):
+        assert scene.model.nhistory == 0 and scene.physics_size == plain.physics_size
+        assert scene.fingerprint() == plain.fingerprint()
+        again = scene_from_description(scene.description())
+        assert again.model.nhistory == 0 and again.fingerprint() == plain.fingerprint()
+        start = sample_start_states(plain, 2, 0)
+        actions = np.random.default_rng(0).uniform(-1, 1, (2, 5, plain.num_actions))
+        ends = [Simulator(each, 1).rollout(start, actions)["physics"] for each in (plain, scene)]
+        assert ends[0].equal(ends[1]) and not ends[0][:, 0].equal(ends[0][:, 5])
 
 
 WARM_STARTED = """<mujoco><option timestep="0.004" iterations="1" ls_iterations="5" tolerance="1e-4"/><worldbody>

@@ -121,6 +121,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
         graph = topology(spec.compile())
         for sensor in list(spec.sensors):  # rays and contact forces can take longer than all else of a step
             spec.delete(sensor)
+        _forget_unread_controls(spec)
         for body in spec.bodies:
             if body.id in graph.body:
                 body.name = body.name or f"body{body.id}"
@@ -132,6 +133,13 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     if model.njnt == 0:
         raise SceneError(f"Scene {name!r} has no joint, so nothing can move. Add one.")
     return model, graph
+
+
+def _forget_unread_controls(spec: mujoco.MjSpec) -> None:
+    """Drop buffers of past controls of actuators without delay: no force follows from them, so they are no state."""
+    for actuator in spec.actuators:
+        if getattr(actuator, "nsample", 0) and actuator.delay == 0:  # MuJoCo before 3.5 has none
+            actuator.nsample = 0
 
 
 def shrink_textures(spec: mujoco.MjSpec, pixels: int) -> None:

@@ -72,7 +72,7 @@ def _refuse_hidden_states(model: mujoco.MjModel, actuator: int) -> None:
     if controls is not None and controls[actuator] != 1:
         raise UnsupportedSceneError(f"{label} has {controls[actuator]} controls; a slot of an edge takes one.")
     if history is not None and history[actuator, 0] > 0:
-        raise UnsupportedSceneError(f"{label} has a delay, whose past controls states do not show. Use none.")
+        raise UnsupportedSceneError(f'{label} has a delay, whose past controls states do not show. Use delay="0".')
 
 
 def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[tuple[_Place, np.ndarray, int]]:
