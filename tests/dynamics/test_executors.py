@@ -39,6 +39,7 @@ MODELS = {
     "mlp": {"core": "mlp", "hidden": (16, 12)},
     "recurrent": {"core": "recurrent", "hidden_state": (3, 4, 5), **SIZES},
     "unfolded": {"core": "unfolded"},
+    "absolute": {"parent_relative": False, **SIZES},
 }
 BOUNDS = {torch.float64: 1e-10, torch.float32: 1e-4}
 
