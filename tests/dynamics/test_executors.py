@@ -118,4 +118,4 @@ def test_every_executor_is_the_reference(
             assert (got - wanted).norm() <= BOUNDS[dtype] * wanted.norm()
         if executor == "native":
             running = predictor.prepared(parameters).executor
-            assert isinstance(running, NativeExecutor) and (running.reason is None) == (kind in ("gn", "mlp"))
+            assert isinstance(running, NativeExecutor) and (running.reason is None) == (kind in ("gn", "mlp", "absolute"))

@@ -151,7 +151,7 @@ class ForwardModel(nn.Module):
 
         Layout, controls at each joint, names of the physical parameters and the graph's size are read from the scene;
         ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core;
-        ``parent_relative`` is left out where no body has a parent that moves.
+        ``parent_relative`` is left out where no body has a parent that moves, and of robots with a free joint.
         """
         given = as_scene(scene)
         scenes = [given] if isinstance(given, (Scene, KinematicTree)) else list(given)
