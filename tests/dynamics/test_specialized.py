@@ -214,7 +214,7 @@ def test_the_table_names_what_was_skipped(scenes, make_model):
     quick = specialize(make_model(scene, latent=64, **sizes).bind(scene))
     skipped = quick.skipped()
     assert skipped["nodes predicted"] == (7, 6)
-    assert skipped["components predicted"] == (12, 6)
+    assert skipped["components predicted"] == (24, 12)
     assert skipped["edges of the second block"] == (16, 13)  # three lead to the world
     plain, here = skipped["kFLOP"]
     # By hand: layers of h by their inputs, the last one of 6, and products with incidence matrices.
