@@ -118,4 +118,6 @@ def test_every_executor_is_the_reference(
             assert (got - wanted).norm() <= BOUNDS[dtype] * wanted.norm()
         if executor == "native":
             running = predictor.prepared(parameters).executor
-            assert isinstance(running, NativeExecutor) and (running.reason is None) == (kind in ("gn", "mlp", "absolute"))
+            assert isinstance(running, NativeExecutor) and (running.reason is None) == (
+                kind in ("gn", "mlp", "absolute")
+            )

@@ -59,7 +59,6 @@ def test_relative_outputs_have_the_scale_of_relative_changes(scenes, make_model)
     pushed = torch.linspace(-1, 1, 50, dtype=torch.float64).view(-1, 1, 1)
     after[..., 7:8] += pushed * moves  # one velocity for all links
     after[..., 6:7, 7:8] += 0.01 * pushed  # but for the last one's, which is a little faster
-
     update_dynamic_normalizers(
         model.bind(scene), reference, torch.zeros(50, scene.num_actions, dtype=torch.float64), after
     )

@@ -217,11 +217,11 @@ def test_the_table_names_what_was_skipped(scenes, make_model):
     assert skipped["components predicted"] == (24, 12)
     assert skipped["edges of the second block"] == (16, 13)  # three lead to the world
     plain, here = skipped["kFLOP"]
-    # By hand: layers of h by their inputs, the last one of 6, and products with incidence matrices.
+    # By hand: layers of h by their inputs, the last one of 12 (6 relative), and products with incidence matrices.
     nodes, edges, kept, moving, h = 7, 16, 13, 6, 128
     n, e = skipped["node features"][1], skipped["edge features"][1]
     layers = edges * (2 * n + e + h) + nodes * (h + n + h) + 3 * h + (2 * nodes + 2) * h
-    layers += kept * (h + 2 * n + e + h) + moving * (h + n + h + h + 6)
+    layers += kept * (h + 2 * n + e + h) + moving * (h + n + h + h + 12)
     incidence = edges * 2 * nodes * n
     incidence += h * ((nodes + 1) * edges + kept * (2 * nodes + 1) + moving * kept + moving)
     assert here == pytest.approx(2e-3 * (layers * h + incidence))
