@@ -14,15 +14,15 @@ from .cases import CASES
 from .damage import DAMAGES
 from .server import serving
 
+KINDS = ("strike", "full", "damage")
+
 
 def parse(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=list(CASES), choices=list(CASES), metavar="RECIPE")
-    parser.add_argument(
-        "--kinds", nargs="*", default=["strike", "full", "damage"], choices=["strike", "full", "damage"]
-    )
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=KINDS)
     parser.add_argument("--folder", type=Path, default=None, help="where what failed stays")
     return parser.parse_args(words)
 

@@ -88,6 +88,8 @@ class BoundPredictor(Predictor):
         self.register_buffer("movable", torch.as_tensor(_learned(scene)), persistent=False)
         self.register_buffer("reference_state", reference_state(scene, model.layout), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
+        # Found once: every prediction reads them.
+        self.parents = moving_parents(scene) if model.parent_relative else None
         self.incidence = Incidence(graph_edges(scene, model.features), scene.num_nodes, predicted)
         self.canonicalizer = model.canonicalizer.bind(scene, model.layout)
         self.controls = ControlInputs(scene)
@@ -210,7 +212,7 @@ class BoundPredictor(Predictor):
             static=static if self.recurrent else None,
             core=folded,
             output=output,
-            parents=moving_parents(self.scene) if model.parent_relative else None,
+            parents=self.parents,
             position_weight=None if self.projection is None else position_weight(model.delta_normalizer.std),
             dtype=dtype or dtype_of(core),
             physics=model.physics,

@@ -68,7 +68,7 @@ def joint_errors(model: Predictor, trajectories: TensorDictBase) -> JointErrors:
     finite = predicted.isfinite().all()
     (position, velocity), (place, rate) = coordinates(predicted), coordinates(state[:, 1:].cpu())
     names, units, parts = _degrees_of_freedom(scene)
-    away = _difference(scene, parts, position, place)
+    away = _difference(parts, position, place)
     errors = [each.square().flatten(0, -2).mean(0) for each in (away, velocity - rate)]
     return JointErrors(names, units, *(torch.where(finite & each.isfinite(), each, torch.inf) for each in errors))
 
@@ -84,7 +84,7 @@ def _degrees_of_freedom(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...],
     return tuple(names), tuple(units), parts
 
 
-def _difference(scene: Scene, parts: list[tuple[int, int]], position: Tensor, truth: Tensor) -> Tensor:
+def _difference(parts: list[tuple[int, int]], position: Tensor, truth: Tensor) -> Tensor:
     """``[*B, nv]`` from coordinates ``truth`` ``[*B, nq]`` to ``position``."""
     found = []
     for address, kind in parts:
