@@ -298,6 +298,23 @@ RETIRED = {
 }
 
 
+def test_what_tests_import_late_exists():
+    """A name that a function of a test imports is looked up only when the test runs, which may be a slow one."""
+    files = [*Path(__file__).parent.rglob("*.py")]
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text()))]
+    named = {
+        (node.module or "", alias.name) for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    ours = {(module, name) for module, name in named if module.split(".")[0] == "torchrl_gn"}
+    assert len(ours) > 100
+    missing = [
+        f"{module}.{name}"
+        for module, name in sorted(ours)
+        if f"{module}.{name}" not in MODULES and not hasattr(importlib.import_module(module), name)
+    ]
+    assert not missing
+
+
 @pytest.mark.slow
 def test_retired_words_come_back_nowhere():
     root = PACKAGE.parent

@@ -213,10 +213,10 @@ def begins_like(kind: str, row: TensorDictBase, seed: int) -> bool:
 
 
 def check_against_dm_control(kind: str, row: TensorDictBase, seed: int) -> None:
-    from torchrl_gn.envs.suite_env import _load, _suite
+    from torchrl_gn.envs.suite_env import _suite, load_suite_task
 
     names = ("cartpole", "swingup") if kind == "suite" else ("swimmer", "swimmer3")
-    loaded = _load(*names, seed)
+    loaded = load_suite_task(*names, seed)
     limit = (LIMIT - 0.5) * loaded.control_timestep()
     own = _suite()[2].Environment(
         loaded.physics, loaded.task, time_limit=limit, control_timestep=loaded.control_timestep()
