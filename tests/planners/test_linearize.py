@@ -52,7 +52,7 @@ def test_equals_mujocos_chained_transitions(central):
 def fourth_order(simulator: Simulator, physics: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same derivatives, of one step, by differences of the fourth order with a large step."""
     scene = simulator.scene
-    tangent, num, h = Tangent(scene.model), scene.num_actions, 1e-3
+    tangent, num, h = Tangent(scene), scene.num_actions, 1e-3
     steps, bodies = [], []
     for column in range(tangent.size + num):
         change = np.zeros(tangent.size + num)
@@ -111,7 +111,7 @@ def test_fixed_controls_change_nothing(central):
 
 def test_tangent_is_its_own_inverse():
     scene = zoo.load("tumbler")
-    tangent = Tangent(scene.model)
+    tangent = Tangent(scene)
     start = sample_start_states(scene, 4, 0)
     change = 0.3 * np.random.default_rng(0).standard_normal((5, 4, tangent.size))
     np.testing.assert_allclose(tangent.subtract(tangent.add(start, change), start), change, atol=1e-12)

@@ -39,7 +39,7 @@ def test_the_jacobians_are_those_of_the_model(scenes, make_model, name):
     predictor = specialize(make_model(scene).double().requires_grad_(False).bind(scene))
     physics, actions, simulator = path_of(scene, 3)
     states = simulator.observe(physics)
-    plant, tangent, epsilon = LearnedPlant(predictor), Tangent(scene.model), 1e-6
+    plant, tangent, epsilon = LearnedPlant(predictor), Tangent(scene), 1e-6
     local = plant.linearize(states.flatten(1).numpy(), actions)
     size = 2 * scene.model.nv
     assert local.dynamics.shape == (3, size, size + scene.num_actions)

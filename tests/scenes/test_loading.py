@@ -50,7 +50,7 @@ def test_loading_leaves_a_spec_as_it_was():
     ("actuators", "rest", "named"),
     [
         pytest.param(
-            '<motor name="late" joint="a" ctrlrange="-1 1" delay=".01" nsample="9"/>',
+            '<motor name="late" joint="a" ctrlrange="-1 1" delay=".01" nsample="9" interp="cubic"/>',
             "",
             ["'late'", "delay"],
             marks=pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_history"), reason="needs MuJoCo 3.5"),

@@ -60,6 +60,7 @@ class Simulator:
         self.memory = min(2**23 * num_threads, 2**28) if memory is None else memory
         self._pool = Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.scene.model) for _ in range(num_threads)]
+        self._times = self.scene.delays.times(self.scene.model)
         self.start_poses: dict[int, Any] = {}  # of each variant from MJCF, once states of it were drawn
         self.control_limits: dict[float, Any] = {}  # of a scene from MJCF by knot interval, once controls were drawn
 
@@ -164,6 +165,7 @@ class Simulator:
             controls = np.tile(self.scene.rest_action, (len(start[rows]), steps + 1, 1))
             after, _, stable[rows] = self._advance(start[rows], controls, which[rows])
             settled[rows] = after[:, -2]
+        settled[:, self._times] -= settled[:, :1] - start[:, :1]
         settled[:, 0] = start[:, 0]
         return settled, stable
 
@@ -172,10 +174,10 @@ class Simulator:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Physics ``[n, t, S]`` after and sensors ``[n, t, nsensordata]`` before each step, and stability ``[n]``."""
         # Instability shows in the time, which MuJoCo's reset sets to 0: start above 0.
-        zero = start[:, 0] == 0
+        zero, given = start[:, 0] == 0, start
         if zero.any():
             start = start.copy()
-            start[zero, 0] = 1.0
+            start[np.ix_(zero, self._times)] += 1.0
         with quiet_mujoco():
             after, sensors = self._pool.rollout(
                 [self.scenes[i].model for i in which] if len(self.scenes) > 1 else self.scene.model,
@@ -191,7 +193,13 @@ class Simulator:
         # Comparisons with NaN are false.
         stable &= (np.abs(start) <= _HUGE).all(axis=1) & (np.abs(after) <= _HUGE).all(axis=(1, 2))
         # Summed in MuJoCo's order.
-        after[zero, :, 0] = np.cumsum(np.full(after.shape[1], timestep))
+        sums = np.cumsum(np.full(after.shape[1], timestep))
+        after[zero, :, 0] = sums
+        if len(self._times) > 1:
+            past = after[zero][..., self._times[1:]] - 1.0
+            when = np.concatenate([np.zeros(1), sums])[np.rint(past / timestep).astype(int).clip(0, len(sums))]
+            before = given[zero][:, None, self._times[1:]]
+            after[np.ix_(zero, np.arange(len(sums)), self._times[1:])] = np.where(past < -timestep / 2, before, when)
         return after, sensors, stable
 
     def _chunks(self, count: int, steps: int) -> Iterator[slice]:

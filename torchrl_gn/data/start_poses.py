@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.data.clearance import clearance, find_bases
-from torchrl_gn.scenes.actuator_kinds import activated_servos, holding_controls
+from torchrl_gn.scenes.actuator_kinds import activated_servos, actuator_kind, holding_controls
 from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.force_elements import winding_joints
 from torchrl_gn.scenes.keyframes import reference_keyframe
@@ -63,6 +63,8 @@ class StartPoses:
             self._avoid(depths)
         self._integrates = self.model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
         self._servos = activated_servos(self.model)
+        late = np.flatnonzero(scene.delays.lag).tolist()
+        self._late = [actuator for actuator in late if actuator_kind(self.model, actuator) == "position"]
         self._rest = np.empty(scene.physics_size)
         mujoco.mj_getState(self.model, self._data, self._rest, _PHYSICS)
 
@@ -88,13 +90,17 @@ class StartPoses:
         return states  # what still collides stays in the reference pose
 
     def _hold(self, state: np.ndarray) -> None:
-        """Give filtered and integrating position servos the activations at which they hold the pose."""
-        model, data = self.model, self._data
+        """Give position servos the activations, or past controls, at which they hold the pose."""
+        model, data, scene = self.model, self._data, self.scene
         servos = self._servos
-        if not len(servos):
+        if not len(servos) + len(self._late):
             return
         for stage in ("kinematics", "comPos", "tendon", "transmission"):
             getattr(mujoco, f"mj_{stage}")(model, data)
+        for actuator in self._late:
+            target = holding_controls(model, actuator, data.actuator_length[actuator])
+            inside = np.clip(target, scene.action_low[actuator], scene.action_high[actuator])
+            scene.delays.hold(model, state, actuator, float(inside))
         held = holding_controls(model, servos, data.actuator_length[servos])
         for limited, bounds in (
             (model.actuator_actlimited[servos], model.actuator_actrange[servos]),

@@ -85,9 +85,7 @@ def _overlaps(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray) -> 
 
 
 def _draw(scene: Scene, n: int, rng: np.random.Generator) -> np.ndarray:
-    model, rest = scene.model, np.empty(scene.physics_size)
-    mujoco.mj_getState(model, mujoco.MjData(model), rest, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    states = np.tile(rest, (n, 1))
+    model, states = scene.model, np.tile(scene.rest_physics, (n, 1))
     qpos = states[:, 1 : 1 + model.nq]  # after the time; both are views
     qvel = states[:, 1 + model.nq : 1 + model.nq + model.nv]
     if scene.origin.get("system") == "cartpole":

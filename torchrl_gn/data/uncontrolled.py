@@ -58,7 +58,7 @@ def _actions_matter(simulator: Simulator) -> bool:
         return True
     variant = np.zeros(_STARTS, dtype=np.int64)
     start, _ = draw_start_states(simulator, variant, rng)
-    size = (_STARTS, _STEPS, scene.num_actions)
+    size = (_STARTS, _STEPS + int(scene.delays.age.max(initial=0)), scene.num_actions)
     first, second = (
         simulator.rollout(start, rng.uniform(scene.action_low, scene.action_high, size), variant) for _ in range(2)
     )

@@ -27,7 +27,7 @@ class ActivationStep(NamedTuple):
 
 
 class ActivationLaws(Float64Buffers):
-    """Activations of a scene, ``na`` of them, over a control step with its controls held.
+    """Activations of a scene, ``na`` of them, over a control step with its controls held, or delayed ones changed once.
 
     Those without a law of MuJoCo's (of plugins, or of users' callbacks) stay: the network predicts their change.
     """
@@ -36,6 +36,7 @@ class ActivationLaws(Float64Buffers):
     channel: Tensor
     place: Tensor
     control: Tensor
+    switch: Tensor
     keeps: Tensor
     slope: Tensor
     low: Tensor
@@ -44,7 +45,8 @@ class ActivationLaws(Float64Buffers):
     muscle: Tensor
     early: Tensor
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, switch: np.ndarray | None = None) -> None:
+        """``switch`` ``[A]``: physics steps of a control step after which another control acts; default: none."""
         super().__init__()
         model, found = scene.model, scene.activations
         actuator = found.actuator
@@ -60,12 +62,14 @@ class ActivationLaws(Float64Buffers):
         place[found.node, found.slot] = np.arange(len(actuator))
         is_muscle, early = kind == int(_DYN.mjDYN_MUSCLE), model.actuator_actearly[actuator].astype(bool)
         self.any_muscle, self.any_early = bool(is_muscle.any()), bool(early.any())
+        self.switches = switch is not None and bool((switch[actuator] < self.steps).any())
         self.constants(
             {
                 "node": found.node,
                 "channel": BODY_STATE.size + found.slot,
                 "place": place,
                 "control": actuator,
+                "switch": np.full(len(actuator), self.steps) if switch is None else switch[actuator],
                 "keeps": self._keeps(kind, np.maximum(model.actuator_dynprm[actuator, 0], _TINY)),
                 "slope": np.where(kind == int(_DYN.mjDYN_INTEGRATOR), self.timestep, 0.0),
                 "low": np.where(limited, ranges[:, 0], -np.inf),
@@ -88,17 +92,27 @@ class ActivationLaws(Float64Buffers):
         """Activations ``[*B, na]`` in states ``[*B, N, C]``."""
         return state[..., self.node, self.channel]
 
-    def after(self, activation: Tensor, control: Tensor, steps: int) -> Tensor:
+    def after(self, activation: Tensor, first: Tensor, later: Tensor, steps: int) -> Tensor:
         """Activations ``[*B, na]`` some physics steps later, under controls ``[*B, A]`` within their limits."""
-        dtype, control = activation.dtype, control[..., self.control]
+        first, later = first[..., self.control], later[..., self.control]
+        if self.switches:
+            before = self.switch.clamp(max=steps)
+            found = self._follow(self._follow(activation, first, before), later, steps - before)
+        else:
+            found = self._follow(activation, first, steps)
+        if not self.any_muscle:
+            return found
+        contracted = activation
+        for step in range(steps):
+            control = torch.where(step < self.switch, first, later) if self.switches else first
+            contracted = self._contract(contracted, control)
+        return torch.where(self.is_muscle, self._limited(contracted), found)
+
+    def _follow(self, activation: Tensor, control: Tensor, steps: Tensor | int) -> Tensor:
+        """Filters and integrators some physics steps later."""
+        dtype = activation.dtype
         away = (activation - control) * (self.keeps**steps - 1).to(dtype)
-        found = activation + away + control * (steps * self.slope).to(dtype)
-        if self.any_muscle:
-            contracted = activation
-            for _ in range(steps):
-                contracted = self._contract(contracted, control)
-            found = torch.where(self.is_muscle, contracted, found)
-        return self._limited(found)
+        return self._limited(activation + away + control * (steps * self.slope).to(dtype))
 
     def _contract(self, activation: Tensor, control: Tensor) -> Tensor:
         """Muscles after a physics step."""
@@ -125,11 +139,15 @@ class ActivationLaws(Float64Buffers):
         up = torch.where(is_smooth, smooth, torch.where(away > 0, 1.0, 0.0).to(x.dtype))
         return away / (falls + (rises - falls) * up).clamp(min=_TINY)
 
-    def forward(self, state: Tensor, control: Tensor) -> ActivationStep:
-        """What a control step makes of states ``[*B, N, C]`` under controls ``[*B, A]`` within their limits."""
+    def forward(self, state: Tensor, first: Tensor, later: Tensor) -> ActivationStep:
+        """What a control step makes of states ``[*B, N, C]`` under controls ``[*B, A]`` within their limits.
+
+        ``first`` act at its start and ``later`` at its end: the same without delays.
+        """
         now = self.read(state)
-        later = self.after(now, control, self.steps)
-        change = pad(later - now, (0, 1))[..., self.place]
+        end = self.after(now, first, later, self.steps)
+        change = pad(end - now, (0, 1))[..., self.place]
         if self.any_early:  # forces are those of the next physics step's activation
-            now, later = (torch.where(self.early, self.after(each, control, 1), each) for each in (now, later))
-        return ActivationStep(now, later, change)
+            now = torch.where(self.early, self.after(now, first, first, 1), now)
+            end = torch.where(self.early, self.after(end, later, later, 1), end)
+        return ActivationStep(now, end, change)

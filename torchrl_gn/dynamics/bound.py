@@ -16,6 +16,7 @@ from torch.nn.functional import hardshrink, pad
 
 from torchrl_gn.dynamics.activation_laws import ActivationLaws
 from torchrl_gn.dynamics.constraints import make_projection, position_weight
+from torchrl_gn.dynamics.delayed_controls import DelayedControls
 from torchrl_gn.dynamics.executors import CudaExecutor, EagerExecutor, NativeExecutor, eager, native_executor
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.features.feature import graph_edges
@@ -83,8 +84,10 @@ class BoundPredictor(Predictor):
         self.model, self.strict, self.reference = model, strict, reference
         self._executors: dict[tuple, NativeExecutor | CudaExecutor] = {}  # by the structures they run
 
-        has_activations = isinstance(scene, Scene) and scene.activations.size > 0
-        self.activations = ActivationLaws(scene) if has_activations else None
+        of_bodies = isinstance(scene, Scene)
+        self.delays = delays = DelayedControls(scene) if of_bodies and scene.delays.size else None
+        switch = None if delays is None else delays.switch
+        self.activations = ActivationLaws(scene, switch) if of_bodies and scene.activations.size else None
         self.register_buffer("movable", torch.as_tensor(_learned(scene)), persistent=False)
         self.register_buffer("reference_state", reference_state(scene, model.layout), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
@@ -203,6 +206,7 @@ class BoundPredictor(Predictor):
             canonicalizer=self.canonicalizer,
             controls=self.controls,
             activations=self.activations,
+            delays=self.delays,
             node_features=cast(nn.ModuleList, self.features["nodes"]),
             edge_features=cast(nn.ModuleList, self.features["edges"]),
             projection=self.projection,
@@ -253,10 +257,13 @@ class BoundPredictor(Predictor):
 
 
 def _learned(scene: Scene) -> np.ndarray:
-    """``[N, 12 + K]`` bool, components that the network predicts: all that move, but activations with known laws."""
+    """``[N, 12 + K]`` bool, components that the network predicts: those that move and do not follow from known laws."""
     learned = scene.movable.copy()
-    if isinstance(scene, Scene) and scene.activations.size:
-        learned[:, BODY_STATE.delta_size :] &= ~scene.activations.mask(len(learned), scene.activations.known)
+    if isinstance(scene, Scene):
+        first = BODY_STATE.delta_size
+        known = scene.activations.mask(len(learned), scene.activations.known)
+        learned[:, first : first + known.shape[1]] &= ~known
+        learned[:, first + known.shape[1] :] = False  # past controls
     return learned
 
 
@@ -420,7 +427,8 @@ def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
     if isinstance(scene, Scene) and "position" in model.layout.names and model.layout != scene.layout:
         raise ValueError(
             f"The model's states have {model.layout.size} numbers a node, those of scene {scene.name!r} with its"
-            f" actuators' activations {scene.layout.size}: build the model with ForwardModel.for_scene."
+            f" actuators' activations and past controls {scene.layout.size}: build the model with"
+            " ForwardModel.for_scene."
         )
     if varies and model.marks_edges:
         raise ValueError(

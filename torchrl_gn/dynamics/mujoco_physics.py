@@ -69,7 +69,8 @@ class MujocoPhysics(Physics):
         self._pool: Rollout | None = None
         self._data: list[mujoco.MjData] = []
         model = scene.model
-        if scene.physics_size != 1 + model.nq + model.nv + model.na or (model.na and tree is not None):
+        shown = 1 + model.nq + model.nv + model.na + (model.nhistory if scene.delays.size else 0)
+        if scene.physics_size != shown or (scene.state_size > BODY_STATE.size and tree is not None):
             raise UnsupportedSceneError(f"Scene {scene.name!r} has a state that the states given do not show.")
         if tree is None:
             self.joints, self.coordinates = None, JointCoordinates(scene)
@@ -107,30 +108,38 @@ class MujocoPhysics(Physics):
         given = state.double()
         if self.tree is None:
             position, velocity = self.coordinates(given)
-            held = self.scene.activations
-            activation = given[..., held.node, BODY_STATE.size + held.slot]
-            after = _Advance.apply(self, position, velocity, activation, action.double())
+            act, late = self.scene.activations, self.scene.delays
+            held = given[..., act.node, BODY_STATE.size + act.slot]
+            past = given[..., late.node, BODY_STATE.size + act.size + late.slot]
+            after = _Advance.apply(self, position, velocity, held, past, action.double())
             return cast(Tensor, after).unflatten(-1, (-1, self.scene.state_size)).to(state.dtype)
         joints = given[..., 1:, :]
         position = torch.atan2(joints[..., 1], joints[..., 0])[..., self.back]
         velocity = joints[..., 2][..., self.back]
         none = position[..., :0]
-        after = cast(Tensor, _Advance.apply(self, position, velocity, none, action.double()[..., self.command]))
+        after = cast(Tensor, _Advance.apply(self, position, velocity, none, none, action.double()[..., self.command]))
         angle, rate = (each[..., self.order] for each in after.chunk(2, dim=-1))
         moved = torch.stack((angle.cos(), angle.sin(), rate), dim=-1)
         moved = torch.cat((moved, joints[..., 3:]), dim=-1)  # of further channels it knows nothing
         return torch.cat((given[..., :1, :], moved), dim=-2).to(state.dtype)
 
     def advance(
-        self, position: np.ndarray, velocity: np.ndarray, activation: np.ndarray, action: np.ndarray
+        self, position: np.ndarray, velocity: np.ndarray, activation: np.ndarray, past: np.ndarray, action: np.ndarray
     ) -> np.ndarray:
-        """Coordinates and rates ``[n, nq + nv]``, or body states ``[n, N * C]``, a control step later."""
+        """Coordinates and rates ``[n, nq + nv]``, or body states ``[n, N * C]``, a control step later.
+
+        ``activation`` ``[n, na]``; ``past`` ``[n, K]``: controls of earlier steps that are still to act.
+        """
         model, timestep = self.simulated.model, self.simulated.model.opt.timestep
         # Sensors show the state before a physics step: one more step shows the last.
         steps = self.scene.substeps + (self.tree is None)
-        start = np.concatenate((np.ones((len(position), 1)), position, velocity, activation), axis=1)
+        rest = self.scene.rest_physics
+        rest[self.scene.delays.times(model)] += 1.0  # MuJoCo's reset, which tells instability, is to 0
+        start = np.tile(rest, (len(position), 1))
+        given = np.concatenate((position, velocity, activation), axis=1)
+        start[:, 1 : 1 + given.shape[1]] = given
+        self.scene.delays.add(model, self.scene.substeps, start, past)
         finite = np.all(np.isfinite(np.concatenate((start, action), axis=1)), axis=1)
-        rest = np.concatenate((np.ones(1), model.qpos0, np.zeros(model.nv + model.na)))
         start, action = np.where(finite[:, None], start, rest), np.where(finite[:, None], action, 0.0)
         rows, parts = max(1, _MEMORY // (steps * (model.nsensordata + start.shape[1] + model.nu))), []
         for first in range(0, len(start), rows):

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchrl_gn.dynamics.activation_laws import ActivationLaws
 from torchrl_gn.dynamics.constraints import MaximalProjection
+from torchrl_gn.dynamics.delayed_controls import DelayedControls
 from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.physics import Physics
@@ -97,6 +98,7 @@ class StepProgram:
     canonicalizer: BoundCanonicalizer  # to the canonical state and back
     controls: ControlInputs  # actions to edges
     activations: ActivationLaws | None  # of actuators that have some; None without
+    delays: DelayedControls | None  # of actuators that act late; None without
     node_features: nn.ModuleList  # modules from StepInputs to node features
     edge_features: nn.ModuleList  # modules to edge features
     nodes: InputScaling  # scaling of the node features

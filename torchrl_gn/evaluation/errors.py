@@ -112,11 +112,12 @@ def evaluate_errors(
 
 
 def fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
-    """Components of a scene's states that errors leave out: those that cannot move, and activations with laws."""
+    """Components of a scene's states that errors leave out: those that cannot move, and those with known laws."""
     movable = scene.movable[scene.predicted]
     fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
-    lawful = isinstance(scene, Scene) and scene.activations.known.all()
-    return fixed | {"activation"} if lawful else fixed
+    if not isinstance(scene, Scene):
+        return fixed
+    return fixed | {"past_control"} | ({"activation"} if scene.activations.known.all() else set())
 
 
 class ErrorSums:

@@ -35,6 +35,8 @@ def half_step_errors(
     """
     model = copy.copy(scene.model)
     model.opt.timestep /= 2
+    if scene.delays.size:
+        model.actuator_delay[:] = np.maximum(2 * scene.delays.lag - 0.5, 0) * model.opt.timestep
     simulator = Simulator(replace(scene, model=model, substeps=2 * scene.substeps), num_threads)
     state, physics, action = (cast(Tensor, trajectories[key]) for key in ("state", "physics", "action"))
     horizons, (count, steps) = sorted(horizons), action.shape[:2]

@@ -241,11 +241,11 @@ BODY_STATE = StateLayout(
 """State of a rigid body in the world frame: metres, unit quaternion, m/s, rad/s (13 channels)."""
 
 
-def body_layout(activations: int = 0) -> StateLayout:
-    """State of a rigid body and the activations of the actuators that it carries, behind :data:`BODY_STATE`."""
-    if not activations:
-        return BODY_STATE
-    return StateLayout((*BODY_STATE.components, Component("activation", activations, "scalar")))
+def body_layout(activations: int = 0, past_controls: int = 0) -> StateLayout:
+    """State of a rigid body, and behind :data:`BODY_STATE` what it carries of actuators."""
+    carried = (("activation", activations), ("past_control", past_controls))
+    further = [Component(name, count, "scalar") for name, count in carried if count]
+    return StateLayout((*BODY_STATE.components, *further)) if further else BODY_STATE
 
 
 def joint_layout(extras: Sequence[str] = ()) -> StateLayout:

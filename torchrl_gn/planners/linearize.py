@@ -13,23 +13,27 @@ from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.specs import require_shape
+from torchrl_gn.scenes import Scene
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]  # state [*B, N, 13], action [*B, A], next state [*B, N, 13]
 
 
 class Tangent:
-    """Tangent space of MuJoCo states, ``X = 2 nv + na``; quaternions change by rotation vectors."""
+    """Tangent space of physics states: of ``2 nv + na`` and past controls; quaternions change by rotation vectors."""
 
-    def __init__(self, model: mujoco.MjModel):
-        self.model = model
-        self.size = 2 * model.nv + model.na
+    def __init__(self, scene: Scene):
+        self.scene, self.model = scene, scene.model
+        model = self.model
+        self.size = 2 * model.nv + model.na + len(scene.delays.actuator)
         self._flat = model.nq == model.nv
         self._end = 1 + model.nq + model.nv + model.na  # after the time
 
     def add(self, physics: np.ndarray, change: np.ndarray) -> np.ndarray:
         """States ``[*B, S]`` plus changes ``[*B, X]``."""
-        nq, nv = self.model.nq, self.model.nv
+        nq, nv, na = self.model.nq, self.model.nv, self.model.na
         changed = np.array(np.broadcast_to(physics, (*change.shape[:-1], physics.shape[-1])), order="C")
+        self.scene.delays.add(self.model, self.scene.substeps, changed, change[..., 2 * nv + na :])
+        change = change[..., : 2 * nv + na]
         if self._flat:
             changed[..., 1 : self._end] += change
             return changed
@@ -41,12 +45,17 @@ class Tangent:
 
     def subtract(self, physics: np.ndarray, base: np.ndarray) -> np.ndarray:
         """Changes ``[*B, X]`` from states ``base`` to states ``physics``, which broadcast."""
-        nq, nv = self.model.nq, self.model.nv
+        nq, nv, late = self.model.nq, self.model.nv, self.scene.delays
+        past = [late.read(self.model, self.scene.substeps, each) for each in (physics, base)]
         if self._flat:
-            return physics[..., 1 : self._end] - base[..., 1 : self._end]
+            change = physics[..., 1 : self._end] - base[..., 1 : self._end]
+            return np.concatenate((change, past[0] - past[1]), axis=-1) if late.size else change
         physics, base = np.broadcast_arrays(physics, base)
         change = np.empty((*physics.shape[:-1], self.size))
-        change[..., nv:] = physics[..., 1 + nq : self._end] - base[..., 1 + nq : self._end]
+        change[..., nv : self.size - len(late.actuator)] = (
+            physics[..., 1 + nq : self._end] - base[..., 1 + nq : self._end]
+        )
+        change[..., self.size - len(late.actuator) :] = past[0] - past[1]
         to, start = (np.ascontiguousarray(s[..., 1 : 1 + nq]).reshape(-1, nq) for s in (physics, base))
         step = np.empty((len(to), nv))
         for row in range(len(to)):
@@ -72,7 +81,7 @@ def linearize(
     ``epsilon`` perturbs in SI units, and controls in halves of their range. ``central`` differences have an error
     ``O(epsilon ** 2)``, at twice the cost of forward ones, ``O(epsilon)``.
     """
-    scene, tangent = simulator.scene, Tangent(simulator.scene.model)
+    scene, tangent = simulator.scene, Tangent(simulator.scene)
     times, num = len(physics), tangent.size + scene.num_actions
     # The last state has no action: its row only observes the bodies.
     controls = np.concatenate([actions, actions[-1:]])

@@ -77,8 +77,8 @@ class SimulatedPlant:
 class LearnedPlant:
     """A learned model; states are its flattened body states.
 
-    Changes are those of MuJoCo's positions, velocities and activations where joint coordinates follow from body states,
-    which takes ``2 nv + na`` gradients of the model a step; else of all ``N C`` channels. ``device`` is the model's.
+    Changes are those of :class:`~torchrl_gn.planners.linearize.Tangent` where joint coordinates follow from body
+    states, which takes a gradient of the model each a step; else of all ``N C`` channels. ``device`` is the model's.
     """
 
     def __init__(self, predictor: Predictor, device: torch.device | str | None = "cpu") -> None:
@@ -137,7 +137,7 @@ class LearnedPlant:
         if self._coordinates is None:
             return np.broadcast_to(np.eye(channels), (count, channels, channels))
         model, epsilon = self.scene.model, 1e-6
-        nv, tangent = model.nv, Tangent(model)
+        nv, tangent = model.nv, Tangent(self.scene)
         position, velocity = (each.numpy() for each in self._coordinates(torch.from_numpy(states)))
         physics = np.zeros((count, self.scene.physics_size))
         physics[:, 1 : 1 + model.nq] = position
@@ -151,14 +151,16 @@ class LearnedPlant:
         by_velocity[..., linear] = by_position[..., place]
         rate = quaternion.product(by_position[..., turn], quaternion.conjugate(here[..., turn]))
         by_velocity[..., angular] = 2 * rate[..., 1:]
-        held = self.scene.activations
-        by_activation = by_position.new_zeros(count, model.na, *self._shape)
-        by_activation[:, range(model.na), held.node, BODY_STATE.size + held.slot] = 1.0
-        basis = torch.cat((by_position, by_velocity, by_activation), dim=1).numpy()
+        held, late = self.scene.activations, self.scene.delays
+        node = np.concatenate((held.node, late.node))
+        channel = BODY_STATE.size + np.concatenate((held.slot, held.size + late.slot))
+        of_actuators = by_position.new_zeros(count, len(node), *self._shape)
+        of_actuators[:, range(len(node)), node, channel] = 1.0
+        basis = torch.cat((by_position, by_velocity, of_actuators), dim=1).numpy()
         # The model's quaternions may have the other sign.
         flips = np.sign((here.numpy()[:, 0, :, turn] * states[..., turn]).sum(-1, keepdims=True))
         basis[..., turn] *= flips[:, None]
-        return basis.reshape(count, 2 * nv + model.na, channels).swapaxes(1, 2)
+        return basis.reshape(count, tangent.size, channels).swapaxes(1, 2)
 
 
 def _stable_steps(paths: np.ndarray) -> np.ndarray:

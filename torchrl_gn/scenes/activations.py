@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.actuator_channels import ActuatorChannels, holding_nodes
 from torchrl_gn.scenes.topology import EdgePair
 
 _DYN = mujoco.mjtDyn
@@ -15,43 +16,17 @@ _KNOWN = (_DYN.mjDYN_INTEGRATOR, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT, _DYN
 
 
 @dataclass(frozen=True, eq=False)
-class Activations:
-    """Where body states hold the ``na`` activations of a model (``mjData.act``), in its order."""
+class Activations(ActuatorChannels):
+    """The ``na`` activations of a model (``mjData.act``), in its order."""
 
-    actuator: np.ndarray  # [na] actuator of each
-    node: np.ndarray  # [na] node that holds it: the first one that the actuator moves
-    slot: np.ndarray  # [na] which of the node's activations it is
     known: np.ndarray  # [na] bool, whether it changes by one of MuJoCo's laws, see ActivationLaws
-
-    @property
-    def size(self) -> int:
-        """Most activations that one node holds."""
-        return int(self.slot.max(initial=-1)) + 1
-
-    def mask(self, nodes: int, which: np.ndarray | None = None) -> np.ndarray:
-        """``[nodes, size]`` bool, where activations are, or those ``which`` ``[na]`` says."""
-        found = np.zeros((nodes, self.size), dtype=bool)
-        found[self.node, self.slot] = True if which is None else which
-        return found
-
-    def at_nodes(self, act: np.ndarray, nodes: int) -> np.ndarray:
-        """Activations ``[*B, na]`` as channels ``[*B, nodes, size]`` of their nodes, 0 elsewhere."""
-        found = np.zeros((*act.shape[:-1], nodes, self.size))
-        found[..., self.node, self.slot] = act
-        return found
 
 
 def find_activations(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: np.ndarray) -> Activations:
     """Activations of a model whose actuators act at edge ``pairs`` in the slots ``action`` ``[P, C]``."""
     order = np.argsort(model.actuator_actadr)
     actuators = np.repeat(order, np.maximum(model.actuator_actnum[order], 0))
-    nodes = []
-    for actuator in actuators.tolist():
-        acting = np.flatnonzero((action == actuator).any(1))
-        pair = pairs[acting[0]] if len(acting) else None
-        nodes.append(1 if pair is None else pair.second or pair.first)
-    node = np.array(nodes, dtype=np.int64)
-    slot = np.array([nodes[:index].count(each) for index, each in enumerate(nodes)], dtype=np.int64)
+    node, slot = holding_nodes(actuators.tolist(), pairs, action)
     return Activations(actuators, node, slot, _known(model, actuators))
 
 

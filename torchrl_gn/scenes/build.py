@@ -11,6 +11,7 @@ from torchrl_gn.scenes.activations import find_activations
 from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.contact_points import find_contact_points
 from torchrl_gn.scenes.control_bounds import ActionBounds, set_control_bounds
+from torchrl_gn.scenes.delays import find_delays, round_delays
 from torchrl_gn.scenes.invariance import movable_components, translation_invariant
 from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.mocap import NO_MOCAP_ACTIONS, MocapActions, find_mocap_actions
@@ -72,6 +73,7 @@ def build_scene(
     ends = np.array([(pair.first, pair.second) for pair in pairs])
     data = mujoco.MjData(model)
     activations = find_activations(model, pairs, transmissions.action)
+    delays = find_delays(model, pairs, transmissions.action, substeps)
     bodies_move = movable_components(model, data, graph.body)
     mujoco.mj_resetData(model, data)
     mujoco.mj_kinematics(model, data)
@@ -91,12 +93,13 @@ def build_scene(
         receivers=ends[:, ::-1].flatten(),
         edge_action=np.repeat(transmissions.action, 2, axis=0),
         static=static,
-        movable=np.concatenate((bodies_move, activations.mask(len(node_names))), axis=1),
+        movable=np.concatenate((bodies_move, *(each.mask(len(node_names)) for each in (activations, delays))), axis=1),
         translation_invariant=invariant,
         joint_anchors=find_joint_anchors(model, data, graph),
         yaw_frame=yaw_frame,
         contact_points=find_contact_points(model, data, graph),
         activations=activations,
+        delays=delays,
         mocaps=mocaps,
         action_low=np.concatenate((low, mocaps.low)),
         action_high=np.concatenate((high, mocaps.high)),
@@ -121,7 +124,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
         graph = topology(spec.compile())
         for sensor in list(spec.sensors):  # rays and contact forces can take longer than all else of a step
             spec.delete(sensor)
-        _forget_unread_controls(spec)
+        round_delays(spec)
         for body in spec.bodies:
             if body.id in graph.body:
                 body.name = body.name or f"body{body.id}"
@@ -133,13 +136,6 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     if model.njnt == 0:
         raise SceneError(f"Scene {name!r} has no joint, so nothing can move. Add one.")
     return model, graph
-
-
-def _forget_unread_controls(spec: mujoco.MjSpec) -> None:
-    """Drop buffers of past controls of actuators without delay: no force follows from them, so they are no state."""
-    for actuator in spec.actuators:
-        if getattr(actuator, "nsample", 0) and actuator.delay == 0:  # MuJoCo before 3.5 has none
-            actuator.nsample = 0
 
 
 def shrink_textures(spec: mujoco.MjSpec, pixels: int) -> None:

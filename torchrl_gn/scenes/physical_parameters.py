@@ -101,6 +101,7 @@ def topology(scene: Scene) -> dict[str, object]:
         "tendons, slider-cranks or sites": tendon_numbers(scene),
         "equality constraints": constraint_numbers(scene),
         "activations": activation_numbers(scene.model),
+        "delays": scene.delays.lag.tolist(),
         "mocap poses": np.round(scene.mocap_poses, 9).tolist(),
         "contacts with the world": (contacts.node.tolist(), contacts.touches.tolist(), contacts.kinds),
     }

@@ -14,6 +14,7 @@ from torchrl_gn.maths.state_layout import StateLayout, body_layout
 from torchrl_gn.scenes.activations import Activations
 from torchrl_gn.scenes.contact_pairs import ContactPairs, find_contact_pairs
 from torchrl_gn.scenes.contact_points import ContactPoints
+from torchrl_gn.scenes.delays import Delays
 from torchrl_gn.scenes.fingerprint import physics
 from torchrl_gn.scenes.mocap import NEAR_TURN, NO_MOCAP_ACTIONS, MocapActions
 from torchrl_gn.scenes.scene_text import scene_text
@@ -76,13 +77,15 @@ class Scene:
     receivers: np.ndarray  # [E]
     edge_action: np.ndarray  # [E, C] actions at each edge, -1 where fewer than C, the most (or 1)
     static: StaticGraph
-    # [N, 12 + K] bool: position 3, rotation 3, linear velocity 3, angular velocity 3, in the world frame; activations
+    # [N, 12 + K] bool: position 3, rotation 3, linear velocity 3, angular velocity 3, in the world frame; activations,
+    # past controls
     movable: np.ndarray
     translation_invariant: np.ndarray  # [3] bool, world axes along which the dynamics do not depend on position
     yaw_frame: YawFrame | None  # if the dynamics do not depend on the yaw
     joint_anchors: JointAnchors
     contact_points: ContactPoints | None
     activations: Activations  # where states hold those of actuators
+    delays: Delays  # of actuators, and where states hold their past controls
     mocaps: MocapActions  # poses that are actions, behind the actuators' controls
     action_low: np.ndarray  # [A] -inf where unbounded
     action_high: np.ndarray  # [A]
@@ -170,22 +173,26 @@ class Scene:
 
     @cached_property
     def layout(self) -> StateLayout:
-        """Channels of a node's state: those of a body, and ``K`` activations of actuators that have some."""
-        return body_layout(self.activations.size)
+        """Channels of a node's state: those of a body, and ``K`` activations and past controls of actuators."""
+        return body_layout(self.activations.size, self.delays.size)
 
     @property
     def state_size(self) -> int:
-        """Numbers ``C`` in a node's state: position 3, quaternion 4, velocities 6, ``K`` activations."""
+        """Numbers ``C`` in a node's state: position 3, quaternion 4, velocities 6, ``K`` more of actuators."""
         return self.layout.size
 
     def states(self, sensors: np.ndarray, physics: np.ndarray) -> np.ndarray:
         """States ``[*B, N, C]`` of ``mjData.sensordata`` ``[*B, S]`` and physics ``[*B, S']`` of the same time."""
         bodies = sensors.reshape(*sensors.shape[:-1], self.num_nodes, 13)
-        if not self.model.na:
-            return bodies
-        first = 1 + self.model.nq + self.model.nv
-        act = physics[..., first : first + self.model.na]
-        return np.concatenate((bodies, self.activations.at_nodes(act, self.num_nodes)), axis=-1)
+        parts = [bodies]
+        if self.model.na:
+            first = 1 + self.model.nq + self.model.nv
+            act = physics[..., first : first + self.model.na]
+            parts.append(self.activations.at_nodes(act, self.num_nodes))
+        if self.delays.size:
+            past = self.delays.read(self.model, self.substeps, physics)
+            parts.append(self.delays.at_nodes(past, self.num_nodes))
+        return np.concatenate(parts, axis=-1) if parts[1:] else bodies
 
     @property
     def reference_state(self) -> np.ndarray:
@@ -193,8 +200,14 @@ class Scene:
         data = mujoco.MjData(self.model)
         for stage in ("kinematics", "comPos", "comVel", "sensorPos", "sensorVel"):
             getattr(mujoco, f"mj_{stage}")(self.model, data)
-        rest = np.concatenate((np.zeros(1), self.model.qpos0, np.zeros(self.model.nv + self.model.na)))
-        return self.states(data.sensordata, rest).copy()
+        return self.states(data.sensordata, self.rest_physics).copy()
+
+    @property
+    def rest_physics(self) -> np.ndarray:
+        """``[S]`` physics of the model's reference pose, at rest, at time 0."""
+        rest = np.empty(self.physics_size)
+        mujoco.mj_getState(self.model, mujoco.MjData(self.model), rest, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        return rest
 
     @property
     def predicted(self) -> np.ndarray:

@@ -87,6 +87,10 @@ def _notes(scene: Scene) -> list[str]:
         "activations without a law, which are learned": [
             scene.actuator_names[each] for each in np.unique(scene.activations.actuator[~scene.activations.known])
         ],
+        "delayed actuators, with their delays": [
+            f"{scene.actuator_names[each]} ({1e3 * scene.delays.lag[each] * model.opt.timestep:g} ms)"
+            for each in np.flatnonzero(scene.delays.lag)
+        ],
         "joints without features, as their bodies do not show them": hidden,
         "limits without features, as bodies do not show whole turns": [
             scene.joint_names[each] for each in turning if limited[each]

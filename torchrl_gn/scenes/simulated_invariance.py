@@ -100,6 +100,8 @@ def _precise(model: mujoco.MjModel, graph: Topology, contacts: bool) -> mujoco.M
     """A copy that is solved to the last digits; without contacts, or with the world's from some distance on."""
     model = copy.copy(model)
     model.opt.iterations, model.opt.tolerance = 200, 0.0
+    if getattr(model, "nhistory", 0):
+        model.actuator_history[:, 0] = 0  # controls act at once
     if contacts:
         fixed = graph.node_of_body[model.geom_bodyid] == 0
         model.geom_margin[fixed] += _REACH * model.stat.extent

@@ -69,10 +69,13 @@ def _refuse_hidden_states(model: mujoco.MjModel, actuator: int) -> None:
     label = f"Actuator {named(model, _OBJECT.mjOBJ_ACTUATOR, actuator)!r}"
     # MuJoCo before 3.11 has one control an actuator, and before 3.5 no delays.
     controls, history = getattr(model, "actuator_ctrlnum", None), getattr(model, "actuator_history", None)
+    rk4 = model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
     if controls is not None and controls[actuator] != 1:
         raise UnsupportedSceneError(f"{label} has {controls[actuator]} controls; a slot of an edge takes one.")
-    if history is not None and history[actuator, 0] > 0:
-        raise UnsupportedSceneError(f'{label} has a delay, whose past controls states do not show. Use delay="0".')
+    if history is not None and history[actuator, 0] > 0 and (history[actuator, 1] or rk4):
+        what = "with RK4" if rk4 else "of controls that are interpolated"
+        other = "another integrator" if rk4 else 'interp="zoh"'
+        raise UnsupportedSceneError(f"{label} has a delay {what}, which depends on the absolute time. Use {other}.")
 
 
 def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[tuple[_Place, np.ndarray, int]]:

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data.logs.pose_log import PoseLog
+from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes import Scene
 
 
@@ -41,11 +42,11 @@ def pose_trajectories(
         raise ValueError(f"steps={steps} and stride={stride} must be at least 1.")
     scene.require_timestep(log.timestep, "The log")
     nodes, counts = np.flatnonzero(scene.predicted), (log.state.shape[1], log.action.shape[1])
-    if scene.model.na or counts != (len(nodes), scene.num_actions):
+    if scene.state_size > BODY_STATE.size or counts != (len(nodes), scene.num_actions):
         names = [scene.node_names[node] for node in nodes]
         raise ValueError(
             f"The log has {counts[0]} bodies and {counts[1]} actions; scene {scene.name!r} moves {names} by"
-            f" {scene.num_actions} actions, and must have no activations."
+            f" {scene.num_actions} actions, and must have no activations and no delays."
         )
     begins = np.r_[0, np.cumsum(log.length)]
     chosen = range(len(log.length)) if episodes is None else [int(episode) for episode in episodes]

@@ -46,9 +46,8 @@ class EagerExecutor:
 def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> CanonicalState:
     """Canonical state of ``[*B, N, 13]``, with the change that the program's physics predict in its frame."""
     canonical = program.canonicalizer(state, program.parameters)
-    if program.activations is not None:
-        present = action[..., : program.controls.present]
-        canonical = canonical._replace(activations=program.activations(state, program.controls.clipped(present)))
+    if program.activations is not None or program.delays is not None:
+        canonical = _with_actuators(program, canonical, state, action[..., : program.controls.present])
     if program.physics is None:
         return canonical
     after = program.physics(state, action[..., : program.controls.present])
@@ -61,10 +60,29 @@ def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> Cano
     return canonical._replace(change=change)
 
 
+def _with_actuators(program: StepProgram, canonical: CanonicalState, state: Tensor, action: Tensor) -> CanonicalState:
+    """Add what states hold of actuators, in the step."""
+    clipped = program.controls.clipped
+    if program.delays is None:
+        first = later = clipped(action)
+    else:
+        step = program.delays(state, action)
+        first, later = clipped(step.first), clipped(step.later)
+        canonical = canonical._replace(delays=step._replace(first=first, later=later))
+    if program.activations is None:
+        return canonical
+    return canonical._replace(activations=program.activations(state, first, later))
+
+
 def features(program: StepProgram, canonical: CanonicalState, action: Tensor) -> tuple[Tensor, Tensor]:
     """Dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised."""
     controls, action = program.controls, program.controls.clipped(action)
-    inputs = StepInputs(canonical, controls.at_edges(action), program.parameters, action[..., : controls.present])
+    acting, ends = action, None
+    if program.delays is not None and canonical.delays is not None:
+        first, later, _ = canonical.delays
+        acting, ends = program.delays.mean(first, later), (controls.at_edges(first), controls.at_edges(later))
+    present = action[..., : controls.present]
+    inputs = StepInputs(canonical, controls.at_edges(acting), program.parameters, present, ends)
     nodes = [feature(inputs) for feature in program.node_features]
     edges = [_of_all_edges(feature(inputs), program.edge_index.shape[1]) for feature in program.edge_features]
     nodes, edges = (torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0] for parts in (nodes, edges))
@@ -126,10 +144,11 @@ def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predi
         assert matrices is not None
         assert program.position_weight is not None
         change = program.projection(state, matrices, change, program.position_weight, program.parameters)
-    if canonical.activations is None:
+    known = [step.change for step in (canonical.activations, canonical.delays) if step is not None]
+    if not known:
         return change
-    activations = predicted[..., BODY_STATE.delta_size :] + canonical.activations.change
-    return torch.cat((change[..., : BODY_STATE.delta_size], activations), dim=-1)
+    of_actuators = predicted[..., BODY_STATE.delta_size :] + torch.cat(known, dim=-1)
+    return torch.cat((change[..., : BODY_STATE.delta_size], of_actuators), dim=-1)
 
 
 def step(

@@ -48,6 +48,8 @@ class Actuators(Feature):
         """Whether a scene has actuators whose force at their edges is not proportional to the control."""
         if not isinstance(scene, Scene):
             return False
+        if scene.delays.size:
+            return True
         laws = actuator_laws(scene)
         limits = np.abs(laws[..., 6:8])
         pulling = set(line_actuators(scene)) - set(site_actuators(scene.model))  # their arms vary
@@ -136,14 +138,16 @@ class _Bound(Float64Buffers):
 
     def _drives(self, inputs: StepInputs) -> tuple[Tensor, Tensor]:
         """What drives each actuator ``[*B, P, C]``, its control or activation: now, and a step on."""
-        control, step = inputs.controls[..., ::2, :], inputs.canonical.activations
+        ends = (inputs.controls, inputs.controls) if inputs.ends is None else inputs.ends
+        first, later = (each[..., ::2, :] for each in ends)
+        step = inputs.canonical.activations
         if step is None or not self.any_driven:
-            return control, control
-        now, later = (
+            return first, later
+        first, later = (
             torch.where(self.activated, pad(each, (0, 1))[..., self.activation], control)
-            for each in (step.now, step.later)
+            for each, control in ((step.now, first), (step.later, later))
         )
-        return now, later
+        return first, later
 
     def forward(self, inputs: StepInputs) -> Tensor:
         """Features ``[*B, E, 4 C]``; 0 of an actuator whose force does not follow from body states.

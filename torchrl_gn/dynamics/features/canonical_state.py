@@ -16,6 +16,7 @@ from torchrl_gn.maths.state_layout import StateLayout
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.activation_laws import ActivationStep
+    from torchrl_gn.dynamics.delayed_controls import DelayStep
     from torchrl_gn.scenes import Scene
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
@@ -39,6 +40,7 @@ class CanonicalState(NamedTuple):
     rotation: FrameRotation | None  # from the yaw frame to the world; None without a yaw frame
     change: Tensor | None = None  # [*B, N, 12] in this frame, as known physics predict it; None without physics
     activations: ActivationStep | None = None  # of actuators that have some; None without
+    delays: DelayStep | None = None  # of controls, clipped; None without
 
 
 @dataclass(frozen=True)

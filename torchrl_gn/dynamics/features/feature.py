@@ -22,9 +22,10 @@ class StepInputs(NamedTuple):
     """What features are computed from."""
 
     canonical: CanonicalState  # the canonical state
-    controls: Tensor  # [*B, E, C] controls at each edge's joint, clipped to the actuators' limits
+    controls: Tensor  # [*B, E, C] controls at each edge's joint, clipped to the actuators' limits, means of the step
     parameters: PhysicalParameters  # physical parameters of the scene, or of each sample
     action: Tensor | None = None  # [*B, A] of the present step, within its bounds
+    ends: tuple[Tensor, Tensor] | None = None  # controls at the step's start and end, as delays have them; None: equal
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,98 @@
+"""Delays of actuators: by how much each control acts late, and where body states hold those of past control steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.actuator_channels import ActuatorChannels, holding_nodes
+from torchrl_gn.scenes.topology import EdgePair
+
+_ROUNDING = 1e-6  # of a physics step
+
+
+@dataclass(frozen=True, eq=False)
+class Delays(ActuatorChannels):
+    """Controls of past steps that are still to act, as given, not yet clipped; age by age for each late actuator."""
+
+    age: np.ndarray  # [K] how many control steps ago each was given, from 1
+    lag: np.ndarray  # [A] physics steps by which each actuator's control acts late; 0 without delay
+
+    def read(self, model: mujoco.MjModel, substeps: int, physics: np.ndarray) -> np.ndarray:
+        """Past controls ``[*B, K]`` in MuJoCo's buffers, at ends of control steps of ``substeps`` physics steps."""
+        found = np.empty((*physics.shape[:-1], len(self.actuator)))
+        for index, (actuator, age) in enumerate(self._held()):
+            times, values = (physics[..., where] for where in _buffer(model, actuator))
+            before = times < _end(model, substeps, physics, age)
+            at = np.where(before, times, -np.inf).argmax(-1)[..., None]  # the last control of its step
+            found[..., index] = np.take_along_axis(values, at, -1)[..., 0]
+        return found
+
+    def add(self, model: mujoco.MjModel, substeps: int, physics: np.ndarray, change: np.ndarray) -> None:
+        """Change the past controls in physics ``[*B, S]`` by ``[*B, K]``, in place."""
+        for index, (actuator, age) in enumerate(self._held()):
+            times, values = (physics[..., where] for where in _buffer(model, actuator))
+            begin, end = (_end(model, substeps, physics, each) for each in (age + 1, age))
+            values += np.where((begin <= times) & (times < end), change[..., index, None], 0.0)
+
+    def _held(self) -> list[tuple[int, int]]:
+        return list(zip(self.actuator.tolist(), self.age.tolist(), strict=True))
+
+    def hold(self, model: mujoco.MjModel, physics: np.ndarray, actuator: int, control: float) -> None:
+        """Let physics ``[S]`` have had one control for long, in place."""
+        physics[_buffer(model, actuator)[1]] = control
+
+    def times(self, model: mujoco.MjModel) -> np.ndarray:
+        """Where physics hold times, the present first."""
+        late = np.flatnonzero(self.lag).tolist()
+        buffers = [np.arange(times.start, times.stop) for times, _ in (_buffer(model, each) for each in late)]
+        return np.concatenate([np.zeros(1, dtype=np.int64), *buffers])
+
+
+def _buffer(model: mujoco.MjModel, actuator: int) -> tuple[slice, slice]:
+    """Where physics ``[S]`` hold the times and the values of an actuator's past controls."""
+    # A buffer begins with two numbers of its own.
+    first = 1 + model.nq + model.nv + model.na + int(model.actuator_historyadr[actuator]) + 2
+    count = int(model.actuator_history[actuator, 0])
+    return slice(first, first + count), slice(first + count, first + 2 * count)
+
+
+def _end(model: mujoco.MjModel, substeps: int, physics: np.ndarray, age: int) -> np.ndarray:
+    """When the control step ``age`` steps ago ended, ``[*B, 1]``, less what rounding may do."""
+    return physics[..., :1] - ((age - 1) * substeps + 0.25) * model.opt.timestep
+
+
+def find_delays(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: np.ndarray, substeps: int) -> Delays:
+    """Delays of a model whose actuators act at edge ``pairs`` in the slots ``action`` ``[P, C]``."""
+    lag = np.zeros(model.nu, dtype=np.int64)
+    if (history := getattr(model, "actuator_history", None)) is not None:  # MuJoCo before 3.5 has none
+        late = history[:, 0] > 0
+        lag[late] = np.ceil(model.actuator_delay[late] / model.opt.timestep)
+    held = [(actuator, age) for actuator in range(model.nu) for age in range(1, -(-lag[actuator] // substeps) + 1)]
+    actuator, age = (np.array([each[part] for each in held], dtype=np.int64) for part in (0, 1))
+    node, slot = holding_nodes(actuator.tolist(), pairs, action)
+    return Delays(actuator, node, slot, age, lag)
+
+
+def round_delays(spec: mujoco.MjSpec) -> None:
+    """Let delays be of whole physics steps, as MuJoCo rounds them, whatever the time, and drop buffers without delay.
+
+    At multiples of the physics step MuJoCo's own lag hangs on how the time is rounded; half a step below, it does not.
+    """
+    for actuator, lag in _lags(spec):
+        if lag:
+            actuator.delay = (lag - 0.5) * spec.option.timestep
+            actuator.nsample = 2 * lag + 1  # enough at half the physics step, too
+        else:
+            actuator.nsample = 0  # no force follows from it
+
+
+def _lags(spec: mujoco.MjSpec) -> Iterator[tuple[mujoco.MjsActuator, int]]:
+    """Actuators that keep past controls, and by how many physics steps each acts late."""
+    for actuator in spec.actuators:
+        if kept := getattr(actuator, "nsample", 0):  # MuJoCo before 3.5 has none
+            late = int(np.ceil(actuator.delay / spec.option.timestep - _ROUNDING))
+            yield actuator, min(late, kept)
