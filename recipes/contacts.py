@@ -71,11 +71,14 @@ def make_data(cfg: DictConfig, scene: Scene) -> dict[str, TensorDict]:
 
 
 def throws(cfg: DictConfig, scene: Scene, split: int, count: int) -> TensorDict:
-    """Simulated throws, without control: free bodies lifted, turned any way, with random velocities."""
+    """Simulated throws, without control: free bodies lifted, turned any way, and joints, with random velocities."""
     model, rng = scene.model, np.random.default_rng([cfg.data_seed, split])
     physics = sample_start_states(scene, count, rng)
+    rates = 1 + model.nq + np.arange(model.nv)  # behind the time
+    free = model.jnt_type[model.dof_jntid] == mujoco.mjtJoint.mjJNT_FREE
+    physics[:, rates[~free]] = cfg.throw.joints * rng.normal(size=(count, int((~free).sum())))
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-        pose, rate = 1 + model.jnt_qposadr[joint], 1 + model.nq + model.jnt_dofadr[joint]  # behind the time
+        pose, rate = 1 + model.jnt_qposadr[joint], rates[model.jnt_dofadr[joint]]
         turn = rng.normal(size=(count, 4))
         physics[:, pose + 2] += rng.uniform(*cfg.throw.lift, size=count)
         physics[:, pose + 3 : pose + 7] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
