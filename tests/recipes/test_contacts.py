@@ -13,6 +13,8 @@ from tensordict import TensorDict
 
 from torchrl_gn.maths import quaternion
 
+from .. import zoo
+
 SMALL = ("steps=3", "length=10", "window=4", "unroll_steps=2", "batch_size=8", "unroll_batch_size=4", "model.hidden=8")
 EPISODES = "episodes={train: 3, validation: 2, test: 2}"
 
@@ -26,7 +28,7 @@ def recipe(load):
 def log(recipe, tmp_path_factory):
     """Seven throws of the recipe's cube."""
     options = {"system": None, "timestep": 0.00675676, "length": 14, "data_seed": 0}
-    cfg = OmegaConf.create(options | {"throw": {"lift": [0.1, 0.2], "speed": 1.0, "spin": 5.0}})
+    cfg = OmegaConf.create(options | {"throw": {"lift": [0.1, 0.2], "speed": 1.0, "spin": 5.0, "joints": 0.0}})
     state = recipe.throws(cfg, recipe.make_scene(cfg), 0, 7)["state"]
     path = tmp_path_factory.mktemp("log") / "falls.npz"
     np.savez(path, state=np.asarray(state)[:, :, 1], length=np.full(7, 15))
@@ -45,6 +47,16 @@ def test_splits_share_no_episode(recipe, log):
     cfg.episodes.train = 4
     with pytest.raises(ValueError, match="more than the log's 7"):
         recipe.make_data(cfg, recipe.make_scene(cfg))
+
+
+def test_robots_are_thrown_with_moving_joints(recipe):
+    scene = zoo.load("tumbler")
+    cfg = OmegaConf.create({"length": 3, "data_seed": 0})
+    for joints in (0.0, 2.0):
+        cfg.throw = {"lift": [0.1, 0.2], "speed": 1.0, "spin": 5.0, "joints": joints}
+        state = recipe.throws(cfg, scene, 0, 40)["state"][:, 0]
+        moved = (state[:, 2:, 10:13] - state[:, 1:2, 10:13]).norm(dim=-1)  # relative to the base, rad/s
+        assert moved.max() < 1e-9 if joints == 0 else 0.5 < moved.square().mean().sqrt() < 5
 
 
 def test_copies_are_cubes_on_other_faces(recipe, log):
