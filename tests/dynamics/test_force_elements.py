@@ -30,6 +30,7 @@ def poses(scene: Scene, count: int, *, beyond: float = 0.0, speed: float = 1.0):
     """MuJoCo's data and body states ``[N, 13]`` at random coordinates, ``beyond`` the limits by this share of them."""
     model, rng = scene.model, np.random.default_rng(0)
     data = mujoco.MjData(model)
+    winding = scene.unwrapped.joint
     for _ in range(count):
         mujoco.mj_resetData(model, data)
         data.qvel[:] = speed * rng.normal(size=model.nv)
@@ -41,6 +42,9 @@ def poses(scene: Scene, count: int, *, beyond: float = 0.0, speed: float = 1.0):
                 data.qpos[at : at + 7] = *rng.normal(size=3), *turn
             elif kind == _KINDS.mjJNT_BALL:
                 data.qpos[at : at + 4] = turn
+            elif joint in winding:
+                middle, half = (low + high) / 2, (1 + beyond) * (high - low) / 2
+                data.qpos[at] = rng.uniform(middle - half, middle + half) if high > low else rng.uniform(-9, 9)
             elif model.jnt_limited[joint]:
                 middle, half = (low + high) / 2, (1 + beyond) * min((high - low) / 2, 1.4)
                 data.qpos[at] = rng.uniform(middle - half, middle + half)
@@ -57,7 +61,8 @@ def inputs_of(scene: Scene, state, control) -> StepInputs:
     parameters = PhysicalParameters.of(scene)
     canonical = Canonicalizer(recenter=False, yaw=False).bind(scene, scene.layout)(state, parameters)
     if scene.model.na:
-        canonical = canonical._replace(activations=ActivationLaws(scene)(state, torch.as_tensor(control)))
+        held = torch.as_tensor(control)
+        canonical = canonical._replace(activations=ActivationLaws(scene)(state, held, held))
     return StepInputs(canonical, ControlInputs(scene)(torch.as_tensor(control)), parameters)
 
 
@@ -70,14 +75,14 @@ def check_gradients(scene, kinds, action, weights, *, count: int, tolerance: flo
 
     data = mujoco.MjData(scene.model)
     mujoco.mj_forward(scene.model, data)
-    rest = torch.from_numpy(data.sensordata.reshape(scene.num_nodes, 13).copy()).requires_grad_()
+    rest = torch.from_numpy(scene.reference_state).requires_grad_()
     assert torch.autograd.grad(total(rest), rest)[0].isfinite().all()
     for _, state in poses(scene, count):
         change = torch.randn(scene.num_nodes, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
 
         def step(size, state=state, change=change):
-            return total(BODY_STATE.apply(state, size * change))
+            return total(torch.cat((BODY_STATE.apply(state[:, :13], size * change), state[:, 13:]), dim=-1))
 
         assert torch.autograd.gradcheck(step, zero, atol=tolerance, rtol=tolerance)
 
@@ -122,18 +127,16 @@ def test_joints_that_do_not_follow_from_their_body_have_no_features():
 def test_limits_set_in_where_mujocos_do(name):
     scene = zoo.load(name)
     feature, model, found = bind(Joints(), scene), scene.model, 0
-    inert = torch.from_numpy(model.jnt_limited.astype(bool)) & ~torch.as_tensor(feature.limited).bool()
     for data, state in poses(scene, 20, beyond=0.3):
         features = feature(inputs_of(scene, state, data.ctrl)).unflatten(0, (-1, 2))
         torch.testing.assert_close(features[:, 0], features[:, 1])
-        within = (features[:, 0, 4:6] >= 0).all(-1) | inert
+        within = (features[:, 0, 4:6] >= 0).all(-1)
         active = data.efc_id[data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)]
         expected = torch.ones(model.njnt, dtype=torch.bool)
         expected[active.astype(int)] = False
-        assert torch.equal(within, expected | inert)
+        assert torch.equal(within, expected)
         found += len(active)
     assert found or not model.jnt_limited.any()
-    assert int(inert.sum()) == (1 if name == "servos" else 0)  # more than a turn, which its body does not show
 
 
 def test_the_step_on_and_the_friction():
@@ -159,9 +162,6 @@ def test_forces_are_mujocos(name):
     feature = bind(Actuators(), scene)
     slots = scene.edge_action.shape[1]
     for data, state in poses(scene, 20):
-        if name == "servos":  # whose joint's whole turns do not show: its target must be near
-            data.ctrl[0] = data.qpos[0] + np.clip(data.ctrl[0], -0.1, 0.1)
-            mujoco.mj_forward(scene.model, data)
         features = feature(inputs_of(scene, state, data.ctrl)).unflatten(-1, (slots, 4))
         force = features[: 2 * scene.model.njnt : 2, :, 0].sum(-1).numpy()
         np.testing.assert_allclose(force, data.qfrc_actuator[scene.model.jnt_dofadr], atol=1e-8)
@@ -181,19 +181,6 @@ def test_a_servos_error_and_its_force_a_step_on():
         expected = [400 * error, 400 * (error - scene.timestep * rate)]
         expected += [np.clip(error / near, -1, 1) for near in (0.05, 0.005)]
         np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def test_a_servo_whose_joint_winds_is_near_its_target():
-    scene = zoo.load("servos")
-    feature, model = bind(Actuators(), scene), scene.model
-    data = mujoco.MjData(model)
-    data.qpos[:] = model.qpos0
-    data.qpos[0], data.ctrl[0] = 7.0, 7.02
-    mujoco.mj_forward(model, data)
-    state = torch.from_numpy(data.sensordata.reshape(scene.num_nodes, 13).copy())
-    found = feature(inputs_of(scene, state, data.ctrl))[0, :4]
-    np.testing.assert_allclose(found, [1.0, 1.0, 0.4, 1.0], atol=1e-9)
-    assert data.qfrc_actuator[0] == pytest.approx(1.0)
 
 
 def test_scenes_that_actuators_suit():
@@ -217,7 +204,7 @@ def test_gradients_are_finite_at_rest_and_right_elsewhere(name):
 
     data = mujoco.MjData(scene.model)
     mujoco.mj_forward(scene.model, data)
-    rest = torch.from_numpy(data.sensordata.reshape(scene.num_nodes, 13).copy()).requires_grad_()
+    rest = torch.from_numpy(scene.reference_state).requires_grad_()
     control = torch.zeros(scene.num_actions, dtype=torch.float64, requires_grad=True)
     for gradient in torch.autograd.grad(total(rest, control), (rest, control), allow_unused=True):
         assert gradient is None or gradient.isfinite().all()
@@ -225,7 +212,8 @@ def test_gradients_are_finite_at_rest_and_right_elsewhere(name):
         change = torch.randn(scene.num_nodes, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
         def along(step, state=state, change=change):
-            return total(BODY_STATE.apply(state, step * change), control.detach())
+            moved = torch.cat((BODY_STATE.apply(state[:, :13], step * change), state[:, 13:]), dim=-1)
+            return total(moved, control.detach())
 
         zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
         assert torch.autograd.gradcheck(along, zero, atol=1e-4, rtol=1e-4)

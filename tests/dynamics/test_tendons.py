@@ -150,8 +150,6 @@ def test_tendons_whose_length_does_not_follow_are_printed():
     assert "actuators without features of their forces: pull" in str(scene)
     assert "tendons that pull at joints: round (rail, swing, tilt, spin, wrist), over" in str(scene)
     assert not bind(Tendons(), scene)(inputs_of(scene, next(poses(scene, 1))[1], np.zeros(6))).isnan().any()
-    winds = zoo.load("gripper", ('<fixed name="roll">', '<fixed name="roll" stiffness="1">'))
-    assert "tendons without features of their own: roll" in str(winds) and not Tendons.suits(winds)
 
 
 def test_scenes_that_tendons_suit():

@@ -295,7 +295,7 @@ def test_printed_summary():
     assert "1 action\n" in str(load_scene("pendulum"))
 
 
-def test_whole_turns_that_bodies_do_not_show_are_printed():
+def test_joints_whose_whole_turns_matter_are_printed():
     text = str(
         load_scene("""<mujoco><worldbody>
         <body><joint name="far" axis="0 0 1" range="-360 360"/><geom size=".1"/></body>
@@ -305,9 +305,8 @@ def test_whole_turns_that_bodies_do_not_show_are_printed():
         <actuator><position joint="far" ctrlrange="-6 6"/><position joint="endless" ctrlrange="-3 3"/>
         <position joint="near" ctrlrange="-2 2"/><motor joint="pushed" ctrlrange="-1 1"/></actuator></mujoco>""")
     )
-    assert "  limits without features, as bodies do not show whole turns: far\n" in text
-    assert "  servos that are taken to be within half a turn of their targets: far, endless" in text
-    assert "half a turn" not in str(load_scene("swimmer6"))
+    assert "  joints whose whole turns are state: far, endless" in text
+    assert "whole turns" not in str(load_scene("swimmer6"))
 
 
 BODY = '<body name="p" pos="0 0 1"><joint name="j"/><geom size=".1"/></body>'

@@ -15,7 +15,6 @@ from torchrl_gn.data.servo_targets import position_targets
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints
-from torchrl_gn.scenes.force_elements import winding_joints
 from torchrl_gn.scenes.scene import Scene
 
 _SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # slow ones, rad/s or m/s
@@ -44,19 +43,6 @@ def slow_targets(model: mujoco.MjModel) -> np.ndarray:
         if speed := _SPEEDS.get(int(model.jnt_type[joint])):
             fastest[actuator] = min(fastest[actuator], speed * a_unit)
     return fastest
-
-
-def quarter_turns(scene: Scene) -> np.ndarray:
-    """How far ``[A]`` position targets may be from where they hold the first pose, in the controls' units.
-
-    A quarter turn of joints that may make whole turns: bodies do not show these, so that what a servo does would not
-    follow from a state in which it were more than half a turn from its target. Infinite of others.
-    """
-    winds, room = winding_joints(scene), np.full(scene.model.nu, math.inf)
-    for actuator, joint, a_unit in _servos_at_joints(scene.model):
-        if winds[joint]:
-            room[actuator] = math.pi / 2 * a_unit
-    return room
 
 
 def _servos_at_joints(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:

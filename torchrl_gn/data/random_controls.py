@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from torchrl_gn.data.control_limits import ControlLimits, find_control_limits, quarter_turns, slow_targets
+from torchrl_gn.data.control_limits import ControlLimits, find_control_limits, slow_targets
 from torchrl_gn.data.controls import check_knot_interval, spline_controls
 from torchrl_gn.data.holding import pose_holding_controls
 from torchrl_gn.data.mocap_paths import mocap_paths
@@ -57,8 +57,6 @@ def random_controls(
       are as fast ones.
     - ``"mixed"``: three tenths of the sequences are fast, of motors a third of these full; the others are calm.
 
-    Position targets of joints that may make whole turns, which bodies do not show, stay within a quarter turn of where
-    they hold the given state, but for full ones: a servo more than half a turn from its target cannot be predicted.
     Poses of mocap bodies follow smooth paths from that of the model, slow ones in calm sequences.
 
     Args:
@@ -114,13 +112,10 @@ def random_controls(
         speed = (np.where(fast[:, None], np.fmax(limits.target_speed, slow), slow) * scene.timestep)[:, servos]
         width = _LEAST_WIDTH ** rng.uniform(0.0, 1.0, speed.shape)
         width[held] = _HELD_WIDTH * rng.uniform(0.0, 1.0, (int(held.sum()), width.shape[1]))
-        here, room = holding[:, servos], quarter_turns(scene)[servos]
-        near = np.maximum(low[servos], here - room), np.minimum(high[servos], here + room)
-        targets = position_targets(here, *near, width, speed, steps, knot_interval, rng)
+        bounds = low[servos], high[servos]
+        targets = position_targets(holding[:, servos], *bounds, width, speed, steps, knot_interval, rng)
         free = (fast[:, None] & np.isinf(limits.target_speed[servos]))[:, None]
-        narrow = np.minimum(1.0, room / (high - low)[servos])
-        drawn = here[:, None] + narrow * (controls[..., servos] - here[:, None])
-        controls[..., servos] = np.where(free, drawn, targets)
+        controls[..., servos] = np.where(free, controls[..., servos], targets)
     return controls
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from torchrl_gn.data.clearance import clearance, find_bases
 from torchrl_gn.scenes.actuator_kinds import activated_servos, actuator_kind, holding_controls
 from torchrl_gn.scenes.collisions import colliding_geoms
-from torchrl_gn.scenes.force_elements import winding_joints
 from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import named, weld_roots
@@ -35,8 +34,8 @@ class StartPoses:
 
     The reference pose is the keyframe ``home``, else ``stand``, else the first, else ``qpos0``; a joint beyond its
     limits moves to the nearest, or to their middle if it is far beyond. Half of the draws (``Scene.wide_starts``)
-    perturb it widely: joints uniform within their limits, unlimited hinges and balls in every direction, hinges of more
-    than a turn within half a turn, as bodies do not show more. The others stay within 30 % of that.
+    perturb it widely: joints uniform within their limits, unlimited hinges and balls in every direction. The others
+    stay within 30 % of that.
 
     - Free bodies turn about the vertical and shift by up to their size; bases of robots tilt by up to 0.5 rad. Without
       gravity, or where they can touch nothing fixed, they stay in place in any orientation.
@@ -146,14 +145,12 @@ class StartPoses:
     def _perturbations(self, spread: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Changes of the reference pose ``[n, nv]``, as of ``mj_integratePos`` over one second."""
         model, kind, n = self.model, mujoco.mjtJoint, len(spread)
-        changes, winds = np.zeros((n, model.nv)), winding_joints(self.scene)
+        changes = np.zeros((n, model.nv))
         for joint in range(model.njnt):
             first, dof, (low, high) = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_range[joint]
             match model.jnt_type[joint], bool(model.jnt_limited[joint]):
                 case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE), True):
                     here = self._reference[first]
-                    if winds[joint]:  # bodies do not show whole turns
-                        low, high = max(low, here - np.pi), min(high, here + np.pi)
                     changes[:, dof] = spread * (rng.uniform(low, high, n) - here)
                 case kind.mjJNT_HINGE, False:
                     changes[:, dof] = spread * rng.uniform(-np.pi, np.pi, n)

@@ -23,6 +23,7 @@ from torchrl_gn.dynamics.features.feature import graph_edges
 from torchrl_gn.dynamics.parameters import ParameterReader
 from torchrl_gn.dynamics.predictor import Predictor, check_shapes
 from torchrl_gn.dynamics.program import InputScaling, OutputScaling, PreparedStep, StepProgram, structure_key
+from torchrl_gn.dynamics.unwrapping import Unwrapping
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.precision import without_autocast
@@ -87,6 +88,7 @@ class BoundPredictor(Predictor):
         of_bodies = isinstance(scene, Scene)
         self.delays = delays = DelayedControls(scene) if of_bodies and scene.delays.size else None
         switch = None if delays is None else delays.switch
+        self.unwrapping = Unwrapping(scene) if of_bodies and scene.unwrapped.size else None
         self.activations = ActivationLaws(scene, switch) if of_bodies and scene.activations.size else None
         self.register_buffer("movable", torch.as_tensor(_learned(scene)), persistent=False)
         self.register_buffer("reference_state", reference_state(scene, model.layout), persistent=False)
@@ -207,6 +209,7 @@ class BoundPredictor(Predictor):
             controls=self.controls,
             activations=self.activations,
             delays=self.delays,
+            unwrapping=self.unwrapping,
             node_features=cast(nn.ModuleList, self.features["nodes"]),
             edge_features=cast(nn.ModuleList, self.features["edges"]),
             projection=self.projection,
@@ -263,7 +266,7 @@ def _learned(scene: Scene) -> np.ndarray:
         first = BODY_STATE.delta_size
         known = scene.activations.mask(len(learned), scene.activations.known)
         learned[:, first : first + known.shape[1]] &= ~known
-        learned[:, first + known.shape[1] :] = False  # past controls
+        learned[:, first + known.shape[1] :] = False  # past controls and unwrapped angles
     return learned
 
 
@@ -426,9 +429,8 @@ def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
         )
     if isinstance(scene, Scene) and "position" in model.layout.names and model.layout != scene.layout:
         raise ValueError(
-            f"The model's states have {model.layout.size} numbers a node, those of scene {scene.name!r} with its"
-            f" actuators' activations and past controls {scene.layout.size}: build the model with"
-            " ForwardModel.for_scene."
+            f"The model's states hold {model.layout.names} of a node, those of scene {scene.name!r}"
+            f" {scene.layout.names}: build the model with ForwardModel.for_scene."
         )
     if varies and model.marks_edges:
         raise ValueError(

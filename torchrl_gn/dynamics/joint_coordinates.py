@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
@@ -38,8 +39,8 @@ class JointCoordinates(Float64Buffers):
     """Coordinates and rates of joints from body states, differentiable.
 
     Of bodies whose joints :func:`~torchrl_gn.scenes.force_elements.joint_groups` knows. A hinge's angle is the one
-    nearest to the middle of its range; the middle one of three hinges is taken for within 90 degrees of its own. Of
-    states that the joints do not allow, it takes one near.
+    nearest to that in the state, if it holds one (``Scene.unwrapped``), else to the middle of its range; the middle one
+    of three hinges is taken for within 90 degrees of its own. Of states that joints do not allow, it takes one near.
 
     Args:
         scene: the scene.
@@ -59,6 +60,10 @@ class JointCoordinates(Float64Buffers):
     to_joints: Tensor
     to_position: Tensor
     to_velocity: Tensor
+    winds: Tensor
+    angle: Tensor
+    node: Tensor
+    channel: Tensor
 
     def __init__(self, scene: Scene, *, partly: bool = False) -> None:
         super().__init__()
@@ -104,6 +109,12 @@ class JointCoordinates(Float64Buffers):
                 "to_velocity": np.argsort(places[1]),
             }
         )
+        self.any_winds = bool(len(scene.unwrapped.joint))
+        angle = np.full(model.njnt, len(scene.unwrapped.joint))
+        angle[scene.unwrapped.joint] = np.arange(len(scene.unwrapped.joint))
+        channel = scene.state_size - scene.unwrapped.size + scene.unwrapped.slot
+        held = {"node": scene.unwrapped.node, "channel": channel}
+        self.constants({"winds": angle < len(scene.unwrapped.joint), "angle": angle, **held})
 
     def _of(self, name: str) -> tuple[Tensor, Tensor]:
         """Nodes ``[K]`` of a group and their joints ``[K, n]``."""
@@ -163,7 +174,15 @@ class JointCoordinates(Float64Buffers):
 
         none = state.new_zeros((*state.shape[:-2], 1))
         columns = zip(*parts, strict=True) if parts else ((),) * 4
-        return JointStates(*(torch.cat((*column, none), dim=-1)[..., self.to_joints] for column in columns))
+        found = JointStates(*(torch.cat((*column, none), dim=-1)[..., self.to_joints] for column in columns))
+        return self._unwrapped(found, state) if self.any_winds else found
+
+    def _unwrapped(self, found: JointStates, state: Tensor) -> JointStates:
+        """Joints with the angles nearest to those that the state holds."""
+        held = pad(state[..., self.node, self.channel], (0, 1))[..., self.angle]
+        away = found.coordinate - held
+        nearest = held + torch.atan2(away.sin(), away.cos())
+        return found._replace(coordinate=torch.where(self.winds, nearest, found.coordinate))
 
     def _angles(self, sine: Tensor, cosine: Tensor, which: Tensor) -> Tensor:
         """Angles within half a turn of the middle of the joints' ranges; sine and cosine may have any length."""

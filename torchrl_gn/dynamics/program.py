@@ -15,6 +15,7 @@ from torchrl_gn.dynamics.delayed_controls import DelayedControls
 from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.physics import Physics
+from torchrl_gn.dynamics.unwrapping import Unwrapping
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
@@ -99,6 +100,7 @@ class StepProgram:
     controls: ControlInputs  # actions to edges
     activations: ActivationLaws | None  # of actuators that have some; None without
     delays: DelayedControls | None  # of actuators that act late; None without
+    unwrapping: Unwrapping | None  # of joints whose whole turns matter; None without
     node_features: nn.ModuleList  # modules from StepInputs to node features
     edge_features: nn.ModuleList  # modules to edge features
     nodes: InputScaling  # scaling of the node features

@@ -117,7 +117,7 @@ def fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
     fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
     if not isinstance(scene, Scene):
         return fixed
-    return fixed | {"past_control"} | ({"activation"} if scene.activations.known.all() else set())
+    return fixed | {"past_control", "unwrapped_angle"} | ({"activation"} if scene.activations.known.all() else set())
 
 
 class ErrorSums:

@@ -241,9 +241,9 @@ BODY_STATE = StateLayout(
 """State of a rigid body in the world frame: metres, unit quaternion, m/s, rad/s (13 channels)."""
 
 
-def body_layout(activations: int = 0, past_controls: int = 0) -> StateLayout:
-    """State of a rigid body, and behind :data:`BODY_STATE` what it carries of actuators."""
-    carried = (("activation", activations), ("past_control", past_controls))
+def body_layout(activations: int = 0, past_controls: int = 0, unwrapped_angles: int = 0) -> StateLayout:
+    """State of a rigid body, and behind :data:`BODY_STATE` what it does not show of its actuators and joints."""
+    carried = (("activation", activations), ("past_control", past_controls), ("unwrapped_angle", unwrapped_angles))
     further = [Component(name, count, "scalar") for name, count in carried if count]
     return StateLayout((*BODY_STATE.components, *further)) if further else BODY_STATE
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.actuator_channels import ActuatorChannels, holding_nodes
+from torchrl_gn.scenes.node_channels import NodeChannels, moved_nodes, numbered
 from torchrl_gn.scenes.topology import EdgePair
 
 _DYN = mujoco.mjtDyn
@@ -16,9 +16,10 @@ _KNOWN = (_DYN.mjDYN_INTEGRATOR, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT, _DYN
 
 
 @dataclass(frozen=True, eq=False)
-class Activations(ActuatorChannels):
-    """The ``na`` activations of a model (``mjData.act``), in its order."""
+class Activations(NodeChannels):
+    """The ``na`` activations of a model (``mjData.act``), in order, each at the first node that its actuator moves."""
 
+    actuator: np.ndarray  # [na] actuator of each
     known: np.ndarray  # [na] bool, whether it changes by one of MuJoCo's laws, see ActivationLaws
 
 
@@ -26,8 +27,8 @@ def find_activations(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: n
     """Activations of a model whose actuators act at edge ``pairs`` in the slots ``action`` ``[P, C]``."""
     order = np.argsort(model.actuator_actadr)
     actuators = np.repeat(order, np.maximum(model.actuator_actnum[order], 0))
-    node, slot = holding_nodes(actuators.tolist(), pairs, action)
-    return Activations(actuators, node, slot, _known(model, actuators))
+    node, slot = numbered(moved_nodes(actuators.tolist(), pairs, action))
+    return Activations(node, slot, actuators, _known(model, actuators))
 
 
 def _known(model: mujoco.MjModel, actuators: np.ndarray) -> np.ndarray:

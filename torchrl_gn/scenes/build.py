@@ -20,6 +20,7 @@ from torchrl_gn.scenes.simulated_invariance import confirmed
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import EdgePair, Topology, find_joint_anchors, named, offset, topology
 from torchrl_gn.scenes.transmissions import find_transmissions
+from torchrl_gn.scenes.unwrapped_angles import find_unwrapped_angles
 from torchrl_gn.scenes.yaw_frame import find_yaw_frame
 
 _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the state
@@ -74,6 +75,8 @@ def build_scene(
     data = mujoco.MjData(model)
     activations = find_activations(model, pairs, transmissions.action)
     delays = find_delays(model, pairs, transmissions.action, substeps)
+    unwrapped = find_unwrapped_angles(model, graph, transmissions.action)
+    held = [each.mask(len(node_names)) for each in (activations, delays, unwrapped)]
     bodies_move = movable_components(model, data, graph.body)
     mujoco.mj_resetData(model, data)
     mujoco.mj_kinematics(model, data)
@@ -93,13 +96,14 @@ def build_scene(
         receivers=ends[:, ::-1].flatten(),
         edge_action=np.repeat(transmissions.action, 2, axis=0),
         static=static,
-        movable=np.concatenate((bodies_move, *(each.mask(len(node_names)) for each in (activations, delays))), axis=1),
+        movable=np.concatenate((bodies_move, *held), axis=1),
         translation_invariant=invariant,
         joint_anchors=find_joint_anchors(model, data, graph),
         yaw_frame=yaw_frame,
         contact_points=find_contact_points(model, data, graph),
         activations=activations,
         delays=delays,
+        unwrapped=unwrapped,
         mocaps=mocaps,
         action_low=np.concatenate((low, mocaps.low)),
         action_high=np.concatenate((high, mocaps.high)),

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.constraints import active_constraints, joined_frames, joins_bodies
-from torchrl_gn.scenes.force_elements import straight_joints, winding_joints
+from torchrl_gn.scenes.force_elements import straight_joints
 from torchrl_gn.scenes.tendons import length_follows, tendon_joints
 from torchrl_gn.scenes.topology import topology
 
@@ -32,7 +32,7 @@ class Coupling:
 def couplings(scene: Scene) -> tuple[list[Coupling], list[int]]:
     """Constraints of joints and tendons whose violation follows from body states, and other such constraints."""
     model, found, others = scene.model, [], []
-    straight = straight_joints(scene) & ~winding_joints(scene)  # whole turns do not show
+    straight = straight_joints(scene)
     for equality in active_constraints(model):
         kind = _EQUALITY(model.eq_type[equality])
         ends = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])

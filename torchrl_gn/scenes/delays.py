@@ -8,16 +8,17 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.actuator_channels import ActuatorChannels, holding_nodes
+from torchrl_gn.scenes.node_channels import NodeChannels, moved_nodes, numbered
 from torchrl_gn.scenes.topology import EdgePair
 
 _ROUNDING = 1e-6  # of a physics step
 
 
 @dataclass(frozen=True, eq=False)
-class Delays(ActuatorChannels):
+class Delays(NodeChannels):
     """Controls of past steps that are still to act, as given, not yet clipped; age by age for each late actuator."""
 
+    actuator: np.ndarray  # [K] actuator of each
     age: np.ndarray  # [K] how many control steps ago each was given, from 1
     lag: np.ndarray  # [A] physics steps by which each actuator's control acts late; 0 without delay
 
@@ -73,8 +74,8 @@ def find_delays(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: np.nda
         lag[late] = np.ceil(model.actuator_delay[late] / model.opt.timestep)
     held = [(actuator, age) for actuator in range(model.nu) for age in range(1, -(-lag[actuator] // substeps) + 1)]
     actuator, age = (np.array([each[part] for each in held], dtype=np.int64) for part in (0, 1))
-    node, slot = holding_nodes(actuator.tolist(), pairs, action)
-    return Delays(actuator, node, slot, age, lag)
+    node, slot = numbered(moved_nodes(actuator.tolist(), pairs, action))
+    return Delays(node, slot, actuator, age, lag)
 
 
 def round_delays(spec: mujoco.MjSpec) -> None:

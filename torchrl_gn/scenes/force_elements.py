@@ -98,9 +98,8 @@ def limited_joints(model: mujoco.MjModel) -> np.ndarray:
     return model.jnt_limited.astype(bool) & in_force
 
 
-def winding_joints(scene: Scene) -> np.ndarray:
-    """``[J]`` bool, hinges that may make a whole turn, which the state of their body does not show."""
-    model = scene.model
+def winding_joints(model: mujoco.MjModel) -> np.ndarray:
+    """``[J]`` bool, hinges that may make a whole turn, which the pose of their body does not show."""
     wide = np.ptp(model.jnt_range, axis=1) > 2 * np.pi + 1e-9
     return (model.jnt_type == int(_JOINT.mjJNT_HINGE)) & (~limited_joints(model) | wide)
 

@@ -19,6 +19,7 @@ from torchrl_gn.scenes.fingerprint import physics
 from torchrl_gn.scenes.mocap import NEAR_TURN, NO_MOCAP_ACTIONS, MocapActions
 from torchrl_gn.scenes.scene_text import scene_text
 from torchrl_gn.scenes.topology import EdgePair, JointAnchors
+from torchrl_gn.scenes.unwrapped_angles import UnwrappedAngles
 from torchrl_gn.scenes.world_contacts import WorldContacts, find_world_contacts
 from torchrl_gn.scenes.yaw_frame import YawFrame
 
@@ -78,7 +79,7 @@ class Scene:
     edge_action: np.ndarray  # [E, C] actions at each edge, -1 where fewer than C, the most (or 1)
     static: StaticGraph
     # [N, 12 + K] bool: position 3, rotation 3, linear velocity 3, angular velocity 3, in the world frame; activations,
-    # past controls
+    # past controls, unwrapped angles
     movable: np.ndarray
     translation_invariant: np.ndarray  # [3] bool, world axes along which the dynamics do not depend on position
     yaw_frame: YawFrame | None  # if the dynamics do not depend on the yaw
@@ -86,6 +87,7 @@ class Scene:
     contact_points: ContactPoints | None
     activations: Activations  # where states hold those of actuators
     delays: Delays  # of actuators, and where states hold their past controls
+    unwrapped: UnwrappedAngles  # where states hold angles of joints that may make whole turns
     mocaps: MocapActions  # poses that are actions, behind the actuators' controls
     action_low: np.ndarray  # [A] -inf where unbounded
     action_high: np.ndarray  # [A]
@@ -173,12 +175,12 @@ class Scene:
 
     @cached_property
     def layout(self) -> StateLayout:
-        """Channels of a node's state: those of a body, and ``K`` activations and past controls of actuators."""
-        return body_layout(self.activations.size, self.delays.size)
+        """Channels of a node's state: those of a body, and ``K`` of actuators and joints that it does not show."""
+        return body_layout(self.activations.size, self.delays.size, self.unwrapped.size)
 
     @property
     def state_size(self) -> int:
-        """Numbers ``C`` in a node's state: position 3, quaternion 4, velocities 6, ``K`` more of actuators."""
+        """Numbers ``C`` in a node's state: position 3, quaternion 4, velocities 6, ``K`` more."""
         return self.layout.size
 
     def states(self, sensors: np.ndarray, physics: np.ndarray) -> np.ndarray:
@@ -192,6 +194,9 @@ class Scene:
         if self.delays.size:
             past = self.delays.read(self.model, self.substeps, physics)
             parts.append(self.delays.at_nodes(past, self.num_nodes))
+        if self.unwrapped.size:
+            angles = physics[..., 1 + self.model.jnt_qposadr[self.unwrapped.joint]]
+            parts.append(self.unwrapped.at_nodes(angles, self.num_nodes))
         return np.concatenate(parts, axis=-1) if parts[1:] else bodies
 
     @property

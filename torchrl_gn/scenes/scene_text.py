@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.actuator_kinds import actuator_kind
 from torchrl_gn.scenes.constraints import active_constraints
 from torchrl_gn.scenes.contact_pairs import possible_contacts
 from torchrl_gn.scenes.couplings import coupled_joints, couplings
-from torchrl_gn.scenes.force_elements import joint_groups, known_slots, limited_joints, winding_joints
+from torchrl_gn.scenes.force_elements import joint_groups, known_slots, limited_joints
 from torchrl_gn.scenes.tendons import acting_tendons, tendon_joints
 from torchrl_gn.scenes.topology import named
 from torchrl_gn.scenes.world_contacts import MOST_POINTS
@@ -77,9 +76,6 @@ def _notes(scene: Scene) -> list[str]:
     ]
     hidden = [scene.joint_names[joint] for joint in joint_groups(model, scene.body)[1]]
     forces = np.setdiff1d(scene.edge_action[scene.edge_action >= 0], scene.edge_action[::2][known_slots(scene)])
-    turning = np.flatnonzero(winding_joints(scene)).tolist()
-    limited, slots = limited_joints(model), scene.edge_action[::2]
-    held = [each for each in turning if any(_is_servo(model, action) for action in slots[each])]
     notes = {
         "no bounds": scene.unbounded,
         "actuators that move nothing": idle,
@@ -92,10 +88,7 @@ def _notes(scene: Scene) -> list[str]:
             for each in np.flatnonzero(scene.delays.lag)
         ],
         "joints without features, as their bodies do not show them": hidden,
-        "limits without features, as bodies do not show whole turns": [
-            scene.joint_names[each] for each in turning if limited[each]
-        ],
-        "servos that are taken to be within half a turn of their targets": [scene.joint_names[each] for each in held],
+        "joints whose whole turns are state": [scene.joint_names[each] for each in scene.unwrapped.joint],
         "actuators without features of their forces": [scene.actuator_names[action] for action in forces],
         "tendons that pull at joints": [
             f"{name} ({_joint_names(scene, tendon_joints(scene, each))})" for each, name in tendons if each in pulling
@@ -107,10 +100,6 @@ def _notes(scene: Scene) -> list[str]:
         "poses of mocap bodies, actions": scene.mocaps.names,
     }
     return [f"  {what}: {', '.join(names)}" for what, names in notes.items() if names]
-
-
-def _is_servo(model: mujoco.MjModel, action: int) -> bool:
-    return 0 <= action < model.nu and actuator_kind(model, action) == "position"
 
 
 def _joint_names(scene: Scene, joints: Sequence[int]) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.force_elements import FAR, known_moments, line_actuators, straight_joints, winding_joints
+from torchrl_gn.scenes.force_elements import FAR, known_moments, line_actuators, straight_joints
 from torchrl_gn.scenes.lines import geom_in_node, known_tendon, moved_joints, tendon_ends, tendon_pieces
 from torchrl_gn.scenes.topology import site_in_node, topology
 
@@ -70,18 +70,17 @@ def acting_tendons(scene: Scene) -> tuple[list[int], list[int]]:
         joints, fixed = tendon_joints(scene, tendon), is_fixed(model, tendon)
         if not joints or not (own[tendon] or (tendon in driven and not fixed and not straight[joints].all())):
             continue
-        by_length = (np.abs(laws[tendon, :2]) < FAR).any() or laws[tendon, 4] != 0
-        follows = length_follows(scene, tendon, wound=not by_length) and not curved_tendons(model)[tendon]
+        follows = length_follows(scene, tendon) and not curved_tendons(model)[tendon]
         (known if follows else others).append(tendon)
     return known, others
 
 
-def length_follows(scene: Scene, tendon: int, *, wound: bool = False) -> bool:
-    """Whether a tendon's length and moments follow from body states; ``wound``: but for whole turns of its joints."""
+def length_follows(scene: Scene, tendon: int) -> bool:
+    """Whether a tendon's length and moments follow from body states."""
     joints = tendon_joints(scene, tendon)
     if not is_fixed(scene.model, tendon):
         return known_tendon(scene.model, tendon) and bool(known_moments(scene)[joints].all())
-    return bool(straight_joints(scene)[joints].all()) and (wound or not winding_joints(scene)[joints].any())
+    return bool(straight_joints(scene)[joints].all())
 
 
 def curved_tendons(model: mujoco.MjModel) -> np.ndarray:

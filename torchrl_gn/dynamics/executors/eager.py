@@ -46,6 +46,8 @@ class EagerExecutor:
 def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> CanonicalState:
     """Canonical state of ``[*B, N, 13]``, with the change that the program's physics predict in its frame."""
     canonical = program.canonicalizer(state, program.parameters)
+    if program.unwrapping is not None:
+        canonical = canonical._replace(unwrapped=program.unwrapping(canonical, program.parameters))
     if program.activations is not None or program.delays is not None:
         canonical = _with_actuators(program, canonical, state, action[..., : program.controls.present])
     if program.physics is None:
@@ -145,10 +147,11 @@ def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predi
         assert program.position_weight is not None
         change = program.projection(state, matrices, change, program.position_weight, program.parameters)
     known = [step.change for step in (canonical.activations, canonical.delays) if step is not None]
+    known += [] if canonical.unwrapped is None else [canonical.unwrapped]
     if not known:
         return change
-    of_actuators = predicted[..., BODY_STATE.delta_size :] + torch.cat(known, dim=-1)
-    return torch.cat((change[..., : BODY_STATE.delta_size], of_actuators), dim=-1)
+    carried = predicted[..., BODY_STATE.delta_size :] + torch.cat(known, dim=-1)
+    return torch.cat((change[..., : BODY_STATE.delta_size], carried), dim=-1)
 
 
 def step(

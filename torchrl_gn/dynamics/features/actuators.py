@@ -21,7 +21,7 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
 from torchrl_gn.scenes.activations import muscle_actuators
-from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators, winding_joints
+from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
@@ -72,7 +72,6 @@ class _Bound(Float64Buffers):
     sums: Tensor
     bound_low: Tensor
     bound_high: Tensor
-    winds: Tensor
     holds: Tensor
     is_servo: Tensor
     line: Tensor
@@ -96,12 +95,8 @@ class _Bound(Float64Buffers):
         has = model.jnt_actfrclimited.astype(bool) & ((action[: model.njnt] >= 0).sum(1) == 1)
         bounds[: model.njnt][has] = model.jnt_actfrcrange[has]
         self.constants({"sums": sums, "bound_low": bounds[:, :1], "bound_high": bounds[:, 1:]})
-        # Body states do not show whole turns: a servo's joint that may make some is taken to be near its target.
-        winds = np.zeros(action.shape, dtype=bool)
-        winds[: model.njnt] = winding_joints(scene)[:, None]
         laws = actuator_laws(scene)[::2]
         holds, acts = laws[..., 4] != 0, laws[..., 8] != 0  # a position; at all
-        winds &= holds & acts & (sums.sum(1) == 1).reshape(action.shape)
         self.lines = self._lines(scene, action)
         muscles = np.isin(action, np.flatnonzero(muscle_actuators(model)))
         self.muscles = MuscleForces(model, np.where(muscles, action, -1)) if muscles.any() else None
@@ -110,8 +105,7 @@ class _Bound(Float64Buffers):
         self.any_driven = bool((driven >= 0).any())
         driving = {"activated": driven >= 0, "activation": np.where(driven >= 0, driven, model.na)}
         self.constants({**driving, "is_muscle": muscles})
-        self.any_winds = bool(winds.any())
-        self.constants({"winds": winds, "holds": holds, "is_servo": acts & (holds | (laws[..., 5] != 0))})
+        self.constants({"holds": holds, "is_servo": acts & (holds | (laws[..., 5] != 0))})
 
     def _lines(self, scene: Scene, action: np.ndarray) -> LinesAtJoints | None:
         """Register in which slots are which lines; None without lines."""
@@ -164,11 +158,6 @@ class _Bound(Float64Buffers):
         gain, bias, gear = law[..., :3], law[..., 3:6], law[..., 8]
         drives, sums = self._drives(inputs), self.sums.to(state.dtype)
         coordinate, rate = (pad(each, (0, missing)).unsqueeze(-1) for each in (found.coordinate, found.rate))
-        if self.any_winds:
-            slope = bias[..., 1] * gear
-            away = (gain[..., 0] * drives[0] + bias[..., 0]) / torch.where(self.winds, -slope, 1.0) - coordinate
-            nearest = coordinate + away - torch.atan2(away.sin(), away.cos())
-            coordinate = torch.where(self.winds, nearest, coordinate)
         length, velocity = (((each * gear).flatten(-2) @ sums).view(drives[0].shape) for each in (coordinate, rate))
         arm = gear
         if self.lines is not None:

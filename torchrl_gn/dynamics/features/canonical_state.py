@@ -41,6 +41,7 @@ class CanonicalState(NamedTuple):
     change: Tensor | None = None  # [*B, N, 12] in this frame, as known physics predict it; None without physics
     activations: ActivationStep | None = None  # of actuators that have some; None without
     delays: DelayStep | None = None  # of controls, clipped; None without
+    unwrapped: Tensor | None = None  # [*B, N, K] change of angles of joints that may make whole turns; None without
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes.force_elements import limited_joints, winding_joints
+from torchrl_gn.scenes.force_elements import limited_joints
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
@@ -55,7 +55,7 @@ class _Bound(Float64Buffers):
         self.timestep, self.edges = float(scene.timestep), 2 * model.njnt
         self.coordinates = JointCoordinates(scene, partly=True)
         kinds, turns = model.jnt_type, (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
-        limited = limited_joints(model) & ~winding_joints(scene) & self.coordinates.known.numpy()
+        limited = limited_joints(model) & self.coordinates.known.numpy()
         springs = model.jnt_stiffness.reshape(model.njnt, -1)[:, 0] != 0
         self.constants(
             {

@@ -1,4 +1,4 @@
-"""Where body states hold numbers of actuators."""
+"""Where body states hold numbers that bodies do not show: of actuators, and of joints."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from torchrl_gn.scenes.topology import EdgePair
 
 
 @dataclass(frozen=True, eq=False)
-class ActuatorChannels:
-    """Numbers of actuators that body states hold, each at one node (base class)."""
+class NodeChannels:
+    """Numbers that body states hold behind those of the body, each at one node (base class)."""
 
-    actuator: np.ndarray  # [K] actuator of each
-    node: np.ndarray  # [K] node that holds it: the first one that the actuator moves
+    node: np.ndarray  # [K] node that holds each
     slot: np.ndarray  # [K] which of the node's numbers of this kind it is
 
     @property
@@ -36,14 +35,16 @@ class ActuatorChannels:
         return found
 
 
-def holding_nodes(
-    actuators: Iterable[int], pairs: Sequence[EdgePair], action: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and slots ``[K]`` for numbers of ``actuators`` that act at edge ``pairs`` in the slots ``action``."""
-    nodes = []
+def numbered(nodes: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes ``[K]``, and which of its node's numbers each is ``[K]``."""
+    nodes = list(nodes)
+    slots = [nodes[:index].count(each) for index, each in enumerate(nodes)]
+    return np.array(nodes, dtype=np.int64), np.array(slots, dtype=np.int64)
+
+
+def moved_nodes(actuators: Iterable[int], pairs: Sequence[EdgePair], action: np.ndarray) -> Iterable[int]:
+    """The first node that each of some actuators moves, which act at edge ``pairs`` in the slots ``action``."""
     for actuator in actuators:
         acting = np.flatnonzero((action == actuator).any(1))
         pair = pairs[acting[0]] if len(acting) else None
-        nodes.append(1 if pair is None else pair.second or pair.first)
-    slots = [nodes[:index].count(each) for index, each in enumerate(nodes)]
-    return np.array(nodes, dtype=np.int64), np.array(slots, dtype=np.int64)
+        yield 1 if pair is None else pair.second or pair.first

@@ -1,0 +1,47 @@
+"""How the angles of joints that may make whole turns go on in states."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+
+if TYPE_CHECKING:
+    from torchrl_gn.dynamics.features.canonical_state import CanonicalState
+    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+
+
+class Unwrapping(Float64Buffers):
+    """Change of a scene's unwrapped angles in a control step, at the rates at its start.
+
+    The next state's bodies say the angle exactly, but for whole turns (:class:`JointCoordinates`), so that this is to
+    be right within half a turn alone, and errors do not add up.
+    """
+
+    joint: Tensor
+    place: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        held = scene.unwrapped
+        self.timestep, self.joints = float(scene.timestep), int(scene.model.njnt)
+        self.coordinates = JointCoordinates(scene, partly=True)
+        place = np.full((scene.num_nodes, held.size), len(held.joint))
+        place[held.node, held.slot] = np.arange(len(held.joint))
+        self.constants({"joint": held.joint, "place": place})
+
+    def forward(self, canonical: CanonicalState, parameters: PhysicalParameters) -> Tensor:
+        """Change ``[*B, N, K]`` of the angles in canonical states."""
+        state, matrices = canonical[:2]
+        assert matrices is not None
+        joint = parameters.joint[..., : 2 * self.joints : 2, :]
+        found = self.coordinates.joints(state, matrices, parameters.joint_pose, joint)
+        after = found.coordinate + self.timestep * found.rate
+        held = state[..., self.coordinates.node, self.coordinates.channel]
+        return pad(after[..., self.joint] - held, (0, 1))[..., self.place]

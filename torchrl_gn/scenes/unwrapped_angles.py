@@ -1,0 +1,59 @@
+"""Angles of joints that may make whole turns, where forces depend on these: bodies look alike after each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.scenes.force_elements import joint_groups, limited_joints, winding_joints
+from torchrl_gn.scenes.node_channels import NodeChannels, numbered
+from torchrl_gn.scenes.tendons import is_fixed
+from torchrl_gn.scenes.topology import Topology
+
+
+@dataclass(frozen=True, eq=False)
+class UnwrappedAngles(NodeChannels):
+    """Angles of hinges as MuJoCo counts them, beyond a turn too, each at the node that the hinge moves."""
+
+    joint: np.ndarray  # [K] joint of each
+
+
+def find_unwrapped_angles(model: mujoco.MjModel, graph: Topology, action: np.ndarray) -> UnwrappedAngles:
+    """Hinges that may make whole turns on which a force depends; ``action`` ``[P, C]``: actuators at each edge pair."""
+    groups, others = joint_groups(model, graph.body)
+    matters = winding_joints(model) & _has_angle_forces(model, action[: model.njnt])
+    # Angles that do not follow from bodies at all, or but within 90 degrees.
+    matters[[*others, *(joints[1] for _, joints in groups["three"])]] = False
+    joint = np.flatnonzero(matters)
+    node, slot = numbered(graph.node_of_body[model.jnt_bodyid[joint]].tolist())
+    return UnwrappedAngles(node, slot, joint)
+
+
+def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
+    """``[J]`` bool, joints at which a force depends on the angle: of a limit, spring, servo, tendon or coupling."""
+    found = limited_joints(model) | (model.jnt_stiffness.reshape(model.njnt, -1) != 0).any(1)
+    fixed, affine = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
+    none, sloped = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+    by_gain = np.where(model.actuator_gaintype == affine, model.actuator_gainprm[:, 1] != 0, True)
+    by_bias = np.where(model.actuator_biastype == sloped, model.actuator_biasprm[:, 1] != 0, True)
+    by_gain[model.actuator_gaintype == fixed] = False
+    by_bias[model.actuator_biastype == none] = False
+    acts = np.append(by_gain | by_bias, False)  # behind them stands no actuator, -1
+    found |= acts[action].any(1)
+    found[_coupled(model, mujoco.mjtEq.mjEQ_JOINT)] = True
+    tendons = model.tendon_limited.astype(bool) | (model.tendon_stiffness.reshape(model.ntendon, -1) != 0).any(1)
+    tendons[_coupled(model, mujoco.mjtEq.mjEQ_TENDON)] = True
+    for tendon in np.flatnonzero(tendons):
+        parts = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+        if is_fixed(model, tendon):
+            found[model.wrap_objid[parts]] = True
+    return found
+
+
+def _coupled(model: mujoco.MjModel, kind: mujoco.mjtEq) -> np.ndarray:
+    """Joints or tendons of constraints of a kind."""
+    some = model.eq_type == int(kind)
+    ends = np.concatenate((model.eq_obj1id[some], model.eq_obj2id[some]))
+    return ends[ends >= 0]
