@@ -33,7 +33,7 @@ def find_unwrapped_angles(model: mujoco.MjModel, graph: Topology, action: np.nda
 
 def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
     """``[J]`` bool, joints at which a force depends on the angle: of a limit, spring, servo, tendon or coupling."""
-    found = limited_joints(model) | (model.jnt_stiffness.reshape(model.njnt, -1) != 0).any(1)
+    found = limited_joints(model) | _sprung(model, "jnt")
     fixed, affine = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
     none, sloped = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
     by_gain = np.where(model.actuator_gaintype == affine, model.actuator_gainprm[:, 1] != 0, True)
@@ -43,13 +43,20 @@ def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
     acts = np.append(by_gain | by_bias, False)  # behind them stands no actuator, -1
     found |= acts[action].any(1)
     found[_coupled(model, mujoco.mjtEq.mjEQ_JOINT)] = True
-    tendons = model.tendon_limited.astype(bool) | (model.tendon_stiffness.reshape(model.ntendon, -1) != 0).any(1)
+    tendons = model.tendon_limited.astype(bool) | _sprung(model, "tendon")
     tendons[_coupled(model, mujoco.mjtEq.mjEQ_TENDON)] = True
     for tendon in np.flatnonzero(tendons):
         parts = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
         if is_fixed(model, tendon):
             found[model.wrap_objid[parts]] = True
     return found
+
+
+def _sprung(model: mujoco.MjModel, kind: str) -> np.ndarray:
+    """Joints or tendons with a spring, ``[n]`` bool."""
+    arrays = [getattr(model, f"{kind}_{name}", None) for name in ("stiffness", "stiffnesspoly")]  # since MuJoCo 3.7
+    stiff = [np.any(each != 0, axis=tuple(range(1, each.ndim))) for each in arrays if each is not None]
+    return np.logical_or.reduce(stiff)
 
 
 def _coupled(model: mujoco.MjModel, kind: mujoco.mjtEq) -> np.ndarray:
