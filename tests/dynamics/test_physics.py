@@ -117,6 +117,25 @@ def test_joint_logs_follow_mujoco_whatever_the_order_of_joints():
     torch.testing.assert_close(swapped, MujocoPhysics(scene, tree)(state, action), rtol=0, atol=1e-12)
 
 
+WIDE = """<mujoco><option timestep="0.005"/><worldbody>
+  <body><joint name="wide" axis="0 0 1" range="-400 400" limited="true" damping=".2"/><geom size=".1"/></body></worldbody>
+  <actuator><position joint="wide" kp="3" ctrlrange="-2 2"/></actuator></mujoco>"""
+
+
+def test_robots_known_by_their_encoders_may_have_joints_of_more_than_a_turn():
+    """Encoders show angles but for whole turns: they are taken for within half a turn, as before."""
+    scene = load_scene(WIDE)
+    assert scene.state_size == 14
+    log = simulate_log(scene, 2, 40, 0, delay=0, time_constant=0.0, play=0.0, quantum=0.0, noise=0.0)
+    tree, data = log_tree(log, "wide"), log_trajectories(log, 20)[0]
+    after = MujocoPhysics(scene, tree)(data["state"][:, 0], data["action"][:, 0])
+    assert after.shape == data["state"][:, 1].shape and after.isfinite().all()
+    if hasattr(mujoco.MjModel, "actuator_history"):  # since MuJoCo 3.5
+        late = load_scene(WIDE.replace("<position", '<position delay=".01" nsample="9"'))
+        with pytest.raises(UnsupportedSceneError, match="a state that the states given do not show"):
+            MujocoPhysics(late, tree)
+
+
 def test_physics_act_by_the_present_commands_of_robots_with_past_ones():
     scene = load_scene("acrobot")
     log = simulate_log(scene, 3, 60, 0, delay=0, time_constant=0.0, play=0.0, quantum=0.0, noise=0.0)

@@ -70,7 +70,7 @@ class MujocoPhysics(Physics):
         self._data: list[mujoco.MjData] = []
         model = scene.model
         shown = 1 + model.nq + model.nv + model.na + (model.nhistory if scene.delays.size else 0)
-        if scene.physics_size != shown or (scene.state_size > BODY_STATE.size and tree is not None):
+        if scene.physics_size != shown or (tree is not None and (model.na or scene.delays.size)):
             raise UnsupportedSceneError(f"Scene {scene.name!r} has a state that the states given do not show.")
         if tree is None:
             self.joints, self.coordinates = None, JointCoordinates(scene)

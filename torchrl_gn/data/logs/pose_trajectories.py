@@ -46,7 +46,7 @@ def pose_trajectories(
         names = [scene.node_names[node] for node in nodes]
         raise ValueError(
             f"The log has {counts[0]} bodies and {counts[1]} actions; scene {scene.name!r} moves {names} by"
-            f" {scene.num_actions} actions, and must have no activations and no delays."
+            f" {scene.num_actions} actions, and must have no activations, delays or joints whose whole turns are state."
         )
     begins = np.r_[0, np.cumsum(log.length)]
     chosen = range(len(log.length)) if episodes is None else [int(episode) for episode in episodes]
