@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, cast
 
+import mujoco
 import numpy as np
 import pytest
 import torch
