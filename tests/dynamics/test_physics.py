@@ -119,8 +119,8 @@ def test_joint_logs_follow_mujoco_whatever_the_order_of_joints():
 
 
 WIDE = """<mujoco><option timestep="0.005"/><worldbody>
-  <body><joint name="wide" axis="0 0 1" range="-400 400" limited="true" damping=".2"/><geom size=".1"/></body></worldbody>
-  <actuator><position joint="wide" kp="3" ctrlrange="-2 2"/></actuator></mujoco>"""
+  <body><joint name="wide" axis="0 0 1" range="-400 400" limited="true" damping=".2"/><geom size=".1"/></body>
+  </worldbody><actuator><position joint="wide" kp="3" ctrlrange="-2 2"/></actuator></mujoco>"""
 
 
 def test_robots_known_by_their_encoders_may_have_joints_of_more_than_a_turn():
