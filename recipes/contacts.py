@@ -119,7 +119,9 @@ def alike(trajectories: TensorDict, copies: int, seed: int) -> TensorDict:
 
 def make_trainer(cfg: DictConfig, bound: BoundPredictor, data: dict[str, TensorDict]) -> Trainer:
     """Wire data, loss and optimiser together; the weights with the best poses in validation are kept."""
-    loss = ForwardModelLoss(bound, noise=cfg.noise, generator=torch.Generator().manual_seed(cfg.seed))
+    loss = ForwardModelLoss(
+        bound, noise=cfg.noise, size_floor=cfg.size_floor, generator=torch.Generator().manual_seed(cfg.seed)
+    )
     unroll = None
     if cfg.unroll_fraction > 0:
         windows = {"batch_size": cfg.unroll_batch_size, "window": cfg.unroll_steps}
