@@ -60,7 +60,7 @@ class Simulator:
         self.memory = min(2**23 * num_threads, 2**28) if memory is None else memory
         self._pool = Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.scene.model) for _ in range(num_threads)]
-        self._times = self.scene.delays.times(self.scene.model)
+        self._times = self.scene.delays.times(self.scene.model)  # where physics hold times: the present, then past ones
         self.start_poses: dict[int, Any] = {}  # of each variant from MJCF, once states of it were drawn
         self.control_limits: dict[float, Any] = {}  # of a scene from MJCF by knot interval, once controls were drawn
 
@@ -195,7 +195,7 @@ class Simulator:
         # Summed in MuJoCo's order.
         sums = np.cumsum(np.full(after.shape[1], timestep))
         after[zero, :, 0] = sums
-        if len(self._times) > 1:
+        if len(self._times) > 1:  # buffers of delayed controls: their times before the start are those given
             past = after[zero][..., self._times[1:]] - 1.0
             when = np.concatenate([np.zeros(1), sums])[np.rint(past / timestep).astype(int).clip(0, len(sums))]
             before = given[zero][:, None, self._times[1:]]
