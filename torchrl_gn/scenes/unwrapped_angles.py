@@ -45,7 +45,7 @@ def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
     found[_coupled(model, mujoco.mjtEq.mjEQ_JOINT)] = True
     tendons = model.tendon_limited.astype(bool) | _sprung(model, "tendon")
     tendons[_coupled(model, mujoco.mjtEq.mjEQ_TENDON)] = True
-    for tendon in np.flatnonzero(tendons):
+    for tendon in np.flatnonzero(tendons).tolist():
         parts = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
         if is_fixed(model, tendon):
             found[model.wrap_objid[parts]] = True
