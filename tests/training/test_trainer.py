@@ -268,6 +268,31 @@ def test_costly_windows_get_fewer_steps_for_their_share(make_trainer):
         Trainer(trainer.loss, trainer.buffer, trainer.optimizer, trainer.budget, unroll_cost=0)
 
 
+def test_windows_whose_rollouts_diverge_are_drawn_anew(make_trainer):
+    """One wild sample of a batch must not end a training; when all batches have some, it ends without a change."""
+    trainer = make_trainer(Budget(steps=10), unroll=0.3)
+    inner, drawn, bad = trainer.loss.forward, [], {0, 2, 3, 4}
+
+    def diverging(batch):
+        out = inner(batch)
+        if batch.ndim > 1:
+            drawn.append(len(drawn))
+            if drawn[-1] in bad:
+                out["loss_forward_model"] = out["loss_forward_model"] * math.inf
+        return out
+
+    trainer.loss.forward = diverging
+    losses = [progress.loss for progress in trainer.run()]
+    assert len(losses) == trainer.step == 10 and all(map(math.isfinite, losses)) and len(drawn) == 3 + len(bad)
+    assert all(value.isfinite().all() for value in weights(trainer).values())
+    trainer.budget, before = Budget(steps=11), weights(trainer)
+    bad.update(range(100))
+    with pytest.raises(FloatingPointError, match="loss is inf at step 10"):
+        list(trainer.run())
+    assert len(drawn) == 3 + 4 + 10
+    assert_same(before, weights(trainer))
+
+
 def test_a_loss_that_is_not_finite_stops_before_any_weight_changes(make_trainer):
     trainer = make_trainer(Budget(steps=10))
     for _ in itertools.islice(trainer.run(), 3):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +22,8 @@ from torchrl_gn.training.nested_state import require_amounts, require_like
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 from torchrl_gn.training.recorded_update import RecordedUpdates
 from torchrl_gn.training.workers import Workers
+
+_WINDOW_BATCHES = 10  # of windows, drawn for an update whose rollouts diverge
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,9 @@ class Trainer:
     def run(self) -> Iterator[Progress]:
         """Train until the budget is spent, yielding after every step.
 
-        FloatingPointError, and no change, if the loss or the gradient is not finite. Ctrl-C and SIGTERM wait until a
-        step and its validation are whole, so that :meth:`state_dict` resumes exactly after them, too.
+        FloatingPointError, and no change, if the loss or the gradient is not finite; of windows, in which rollouts may
+        diverge, if those of ten batches in a row are not. Ctrl-C and SIGTERM wait until a step and its validation are
+        whole, so that :meth:`state_dict` resumes exactly after them, too.
         """
         module, fraction = self.workers.wrap(self.loss), self.workers.agree(lambda: self.fraction)
         with let_in_at_once():  # it may take minutes
@@ -116,12 +119,18 @@ class Trainer:
             yield Progress(self.step, self.seconds, fraction, loss, validation)
             self._lap("caller", start)
 
-    @without_autocast
     def _update(self, module: nn.Module, fraction: float) -> float:
+        if self.unroll is None or fraction < 1 - self.unroll_fraction - 1e-9:  # tolerates rounding
+            return self._update_on(self.buffer, module, fraction)
+        for _ in range(_WINDOW_BATCHES - 1):
+            with suppress(FloatingPointError):
+                return self._update_on(self.unroll, module, fraction)
+        return self._update_on(self.unroll, module, fraction)
+
+    @without_autocast
+    def _update_on(self, buffer: ReplayBuffer, module: nn.Module, fraction: float) -> float:
+        """Draw a batch and update on it; return the loss. FloatingPointError, and no change, if that is not finite."""
         clock = self._now()
-        buffer = self.buffer
-        if self.unroll is not None and fraction >= 1 - self.unroll_fraction - 1e-9:  # tolerates rounding
-            buffer = self.unroll
         batch = buffer.sample().to(self.device)
         clock = self._lap("sampling", clock)
         if self._recorded is not None and (value := self._recorded(batch, self.step, fraction)) is not None:
