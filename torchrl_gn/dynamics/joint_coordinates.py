@@ -109,12 +109,14 @@ class JointCoordinates(Float64Buffers):
                 "to_velocity": np.argsort(places[1]),
             }
         )
-        self.any_winds = bool(len(scene.unwrapped.joint))
-        angle = np.full(model.njnt, len(scene.unwrapped.joint))
-        angle[scene.unwrapped.joint] = np.arange(len(scene.unwrapped.joint))
-        channel = scene.state_size - scene.unwrapped.size + scene.unwrapped.slot
-        held = {"node": scene.unwrapped.node, "channel": channel}
-        self.constants({"winds": angle < len(scene.unwrapped.joint), "angle": angle, **held})
+        unwrapped, count = scene.unwrapped, len(scene.unwrapped.joint)
+        self.any_winds = count > 0
+        if not self.any_winds:  # torch.export saves no empty tensors
+            return
+        angle = np.full(model.njnt, count)
+        angle[unwrapped.joint] = np.arange(count)
+        channel = scene.state_size - unwrapped.size + unwrapped.slot
+        self.constants({"winds": angle < count, "angle": angle, "node": unwrapped.node, "channel": channel})
 
     def _of(self, name: str) -> tuple[Tensor, Tensor]:
         """Nodes ``[K]`` of a group and their joints ``[K, n]``."""
