@@ -283,21 +283,6 @@ def test_package_is_typed():
     assert (PACKAGE / "py.typed").exists()
 
 
-# Words that the field does not use, and the field's own (docs/glossary.md).
-RETIRED = {
-    r"linking|mechanism": "constraint projection, joint anchors",
-    r"pins?|pinned|pin[_ ]finder": "joint anchor, anchor estimation",
-    r"levers?|parent_arm": "anchor offset",
-    r"headings?": "yaw, yaw frame",
-    r"live (channels?|components?)": "movable components",
-    r"SceneValues|static_key|static values": "physical parameters",
-    r"JointChain|carried_by": "kinematic tree, parent",
-    r"constant prediction": "persistence baseline",
-    r"rivals?|contestants?": "baseline",
-    r"foreseen|FixTask": "planned, freeze goal",
-}
-
-
 def test_what_tests_import_late_exists():
     """A name that a function of a test imports is looked up only when the test runs, which may be a slow one."""
     files = [*Path(__file__).parent.rglob("*.py")]
@@ -313,6 +298,21 @@ def test_what_tests_import_late_exists():
         if f"{module}.{name}" not in MODULES and not hasattr(importlib.import_module(module), name)
     ]
     assert not missing
+
+
+# Words that the field does not use, and the field's own (docs/glossary.md).
+RETIRED = {
+    r"linking|mechanism": "constraint projection, joint anchors",
+    r"pins?|pinned|pin[_ ]finder": "joint anchor, anchor estimation",
+    r"levers?|parent_arm": "anchor offset",
+    r"headings?": "yaw, yaw frame",
+    r"live (channels?|components?)": "movable components",
+    r"SceneValues|static_key|static values": "physical parameters",
+    r"JointChain|carried_by": "kinematic tree, parent",
+    r"constant prediction": "persistence baseline",
+    r"rivals?|contestants?": "baseline",
+    r"foreseen|FixTask": "planned, freeze goal",
+}
 
 
 @pytest.mark.slow

@@ -58,8 +58,6 @@ class ActivationLaws(Float64Buffers):
         )
         kind = np.where(runs, model.actuator_dyntype[actuator], -1)
         limited, ranges = model.actuator_actlimited[actuator].astype(bool), model.actuator_actrange[actuator]
-        place = np.full((scene.num_nodes, found.size), len(actuator))
-        place[found.node, found.slot] = np.arange(len(actuator))
         is_muscle, early = kind == int(_DYN.mjDYN_MUSCLE), model.actuator_actearly[actuator].astype(bool)
         self.any_muscle, self.any_early = bool(is_muscle.any()), bool(early.any())
         self.switches = switch is not None and bool((switch[actuator] < self.steps).any())
@@ -67,7 +65,7 @@ class ActivationLaws(Float64Buffers):
             {
                 "node": found.node,
                 "channel": BODY_STATE.size + found.slot,
-                "place": place,
+                "place": found.places(scene.num_nodes),
                 "control": actuator,
                 "switch": np.full(len(actuator), self.steps) if switch is None else switch[actuator],
                 "keeps": self._keeps(kind, np.maximum(model.actuator_dynprm[actuator, 0], _TINY)),

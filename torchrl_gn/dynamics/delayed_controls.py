@@ -42,8 +42,6 @@ class DelayedControls(Float64Buffers):
         held, count, steps = scene.delays, scene.num_actions, scene.substeps
         oldest = -(-held.lag // steps)
         self.switch = np.where(oldest > 0, held.lag - (oldest - 1) * steps, steps)  # [A]
-        place = np.full((scene.num_nodes, held.size), len(held.actuator))
-        place[held.node, held.slot] = np.arange(len(held.actuator))
         past = list(zip(held.actuator.tolist(), held.age.tolist(), strict=True))
         # Controls by actuator and age: the present ones, and the past ones behind them.
         where = {key: index for index, key in enumerate([*((each, 0) for each in range(count)), *past])}
@@ -53,7 +51,7 @@ class DelayedControls(Float64Buffers):
             {
                 "node": held.node,
                 "channel": BODY_STATE.size + scene.activations.size + held.slot,
-                "place": place,
+                "place": held.places(scene.num_nodes),
                 "source": np.array([where[actuator, age - 1] for actuator, age in past]),
                 "first": np.array([where[each] for each in acting]),
                 "later": np.array([where[actuator, max(age - 1, 0)] for actuator, age in acting]),

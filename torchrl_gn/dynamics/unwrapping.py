@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -32,9 +31,7 @@ class Unwrapping(Float64Buffers):
         held = scene.unwrapped
         self.timestep, self.joints = float(scene.timestep), int(scene.model.njnt)
         self.coordinates = JointCoordinates(scene, partly=True)
-        place = np.full((scene.num_nodes, held.size), len(held.joint))
-        place[held.node, held.slot] = np.arange(len(held.joint))
-        self.constants({"joint": held.joint, "place": place})
+        self.constants({"joint": held.joint, "place": held.places(scene.num_nodes)})
 
     def forward(self, canonical: CanonicalState, parameters: PhysicalParameters) -> Tensor:
         """Change ``[*B, N, K]`` of the angles in canonical states."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -83,17 +83,12 @@ def round_delays(spec: mujoco.MjSpec) -> None:
 
     At multiples of the physics step MuJoCo's own lag hangs on how the time is rounded; half a step below, it does not.
     """
-    for actuator, lag in _lags(spec):
-        if lag:
+    for actuator in spec.actuators:
+        if not (kept := getattr(actuator, "nsample", 0)):  # MuJoCo before 3.5 has none
+            continue
+        late = int(np.ceil(actuator.delay / spec.option.timestep - _ROUNDING))
+        if lag := min(late, kept):
             actuator.delay = (lag - 0.5) * spec.option.timestep
             actuator.nsample = 2 * lag + 1  # enough at half the physics step, too
         else:
             actuator.nsample = 0  # no force follows from it
-
-
-def _lags(spec: mujoco.MjSpec) -> Iterator[tuple[mujoco.MjsActuator, int]]:
-    """Actuators that keep past controls, and by how many physics steps each acts late."""
-    for actuator in spec.actuators:
-        if kept := getattr(actuator, "nsample", 0):  # MuJoCo before 3.5 has none
-            late = int(np.ceil(actuator.delay / spec.option.timestep - _ROUNDING))
-            yield actuator, min(late, kept)

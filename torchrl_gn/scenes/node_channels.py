@@ -28,6 +28,12 @@ class NodeChannels:
         found[self.node, self.slot] = True if which is None else which
         return found
 
+    def places(self, nodes: int) -> np.ndarray:
+        """``[nodes, size]`` which of the ``K`` numbers is where; ``K`` where none is."""
+        found = np.full((nodes, self.size), len(self.node))
+        found[self.node, self.slot] = np.arange(len(self.node))
+        return found
+
     def at_nodes(self, numbers: np.ndarray, nodes: int) -> np.ndarray:
         """Numbers ``[*B, K]`` as channels ``[*B, nodes, size]`` of their nodes, 0 elsewhere."""
         found = np.zeros((*numbers.shape[:-1], nodes, self.size))
