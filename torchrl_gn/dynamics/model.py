@@ -18,8 +18,10 @@ from torchrl_gn.dynamics.features import (
     Actuators,
     BodyState,
     Canonicalizer,
+    Constraints,
     Contacts,
     Controls,
+    Couplings,
     Feature,
     JointAxes,
     Joints,
@@ -65,6 +67,8 @@ class ForwardModel(nn.Module):
         parent_relative: predict each body's change twice, in the frame of all and relative to its parent's. The second
             adds up along the tree, the sum of both counts. What a joint does is seen at the joint alone, not in the sum
             of all joints before it. Paper: the first.
+        least_scales: divide a feature that hardly varied in data by its :meth:`Feature.least_scales` at least. False:
+            those of constraints and couplings alone.
         physics: known physics of one robot, which the network corrects, see
             :class:`~torchrl_gn.dynamics.physics.Physics`; a function or module of state and action.
         core: name of the network, one of :data:`~torchrl_gn.networks.CORES`.
@@ -87,6 +91,7 @@ class ForwardModel(nn.Module):
         integrate: bool = True,
         project: bool = True,
         parent_relative: bool = True,
+        least_scales: bool = True,
         physics: Callable[[Tensor, Tensor], Tensor] | None = None,
         core: str = "gn",
         counts: Sequence[int] | None = None,
@@ -102,6 +107,7 @@ class ForwardModel(nn.Module):
         self.parameter_names = parameter_names if parameters == "scene" else ParameterNames()
         self.canonicalizer = Canonicalizer() if canonicalizer is None else canonicalizer
         self.integrate, self.project, self.parent_relative = integrate, project, parent_relative
+        self.least_scales = least_scales
         self.core_name, self.core_options = core, core_options
 
         def count(part: str) -> int:
@@ -118,12 +124,17 @@ class ForwardModel(nn.Module):
         if parameters == "inferred":
             # The anchor offsets say how long bodies are.
             static = self.inferred_size + GraphSize(6 if project else 0, 0, 0)
-        of_nodes, of_edges = (
-            [scale for feature in self.features if feature.part == part for scale in feature.least_scales(layout)]
-            for part in ("nodes", "edges")
-        )
-        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=DYNAMIC_FLOOR, least=of_nodes)
-        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=DYNAMIC_FLOOR, least=of_edges)
+
+        def least(part: str) -> list[float]:
+            scales: list[float] = []
+            for feature in self.features:
+                bounded = least_scales or isinstance(feature, (Constraints, Couplings))
+                if feature.part == part:
+                    scales += feature.least_scales(layout) if bounded else [0.0] * feature.size(layout)
+            return scales
+
+        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=DYNAMIC_FLOOR, least=least("nodes"))
+        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=DYNAMIC_FLOOR, least=least("edges"))
         self.parameter_node_normalizer = Normalizer(static.nodes, limit=_PARAMETER_LIMIT)
         self.parameter_edge_normalizer = Normalizer(static.edges, limit=_PARAMETER_LIMIT)
         static += GraphSize(0, int(self.marks_edges), 0)
@@ -252,6 +263,7 @@ class ForwardModel(nn.Module):
             "integrate": self.integrate,
             "project": self.project,
             "parent_relative": self.parent_relative,
+            "least_scales": self.least_scales,
             "physics": None if self.physics is None else self.physics.description(),
             "core": self.core_name,
             "counts": None if self.core.counts is None else list(self.core.counts),
@@ -268,7 +280,8 @@ class ForwardModel(nn.Module):
 
         ValueError if it has unknown names, or needs physics that are not given: those of MJCF rebuild themselves.
         """
-        rest = {"parent_relative": False, **description}  # models of before 28 November 2026 say nothing of it
+        # Older models say nothing of these two.
+        rest = {"parent_relative": False, "least_scales": False, **description}
         known = physics_from_description(rest.pop("physics", None), physics)
         features = []
         for each in rest.pop("features"):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchrl_gn.dynamics.features.controls import controls_per_edge, require_slots
-from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.dynamics.features.feature import CLIPPED_SCALE, Feature, StepInputs
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.joint_moments import LinesAtJoints
 from torchrl_gn.dynamics.lines import Lines
@@ -61,6 +61,9 @@ class Actuators(Feature):
 
     def size(self, layout: StateLayout) -> int:
         return _SIZE * self.per_joint
+
+    def least_scales(self, layout: StateLayout) -> list[float]:
+        return [0.0, 0.0, CLIPPED_SCALE, CLIPPED_SCALE] * self.per_joint  # a servo that hardly ever errs in data
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         self.require_bodies(scene, layout)

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 
+CLIPPED_SCALE = 0.1  # least standard deviation of a number clipped to 1, as of a velocity (m/s) that fades to 0
+
+
 class StepInputs(NamedTuple):
     """What features are computed from."""
 

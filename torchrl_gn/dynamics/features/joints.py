@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.dynamics.features.feature import CLIPPED_SCALE, Feature, StepInputs
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
@@ -37,6 +37,9 @@ class Joints(Feature):
 
     def size(self, layout: StateLayout) -> int:
         return _SIZE
+
+    def least_scales(self, layout: StateLayout) -> list[float]:
+        return [0.0] * 4 + [CLIPPED_SCALE] * 5  # a limit that data hardly reach
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         self.require_bodies(scene, layout)

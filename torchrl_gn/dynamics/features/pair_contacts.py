@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.dynamics.features.feature import CLIPPED_SCALE, Feature, StepInputs
 from torchrl_gn.maths.box_distance import segment_to_box
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.quaternion import turned_by
@@ -51,6 +51,10 @@ class PairContacts(Feature):
 
     def size(self, layout: StateLayout) -> int:
         return _SIZE * self.places
+
+    def least_scales(self, layout: StateLayout) -> list[float]:
+        # Two bodies that hardly ever meet in data may meet later.
+        return [_NEAR, *[CLIPPED_SCALE] * (_SIZE - 4), *[_NEAR] * 3] * self.places
 
     def added_edges(self, scene: Scene) -> np.ndarray:
         nodes = _pairs(scene).nodes

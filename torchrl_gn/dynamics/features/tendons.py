@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.dynamics.features.feature import CLIPPED_SCALE, Feature, StepInputs
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.tendon_states import TendonStates
 from torchrl_gn.maths.float64_buffers import Float64Buffers
@@ -48,6 +48,10 @@ class Tendons(Feature):
 
     def size(self, layout: StateLayout) -> int:
         return feature_size(self.vectors) * self.per_joint
+
+    def least_scales(self, layout: StateLayout) -> list[float]:
+        each = [0.0] * 2 + [CLIPPED_SCALE] * 4 + [0.0] * 2 + [CLIPPED_SCALE]  # a limit that data hardly reach
+        return [*each, *[0.0] * (feature_size(self.vectors) - len(each))] * self.per_joint
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         self.require_bodies(scene, layout)

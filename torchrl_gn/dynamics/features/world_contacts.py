@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_gn.dynamics.features.contacts import Contacts
-from torchrl_gn.dynamics.features.feature import Feature, StepInputs
+from torchrl_gn.dynamics.features.feature import CLIPPED_SCALE, Feature, StepInputs
 from torchrl_gn.maths import surface_distance
 from torchrl_gn.maths.box_distance import segment_to_box
 from torchrl_gn.maths.float64_buffers import Float64Buffers
@@ -49,6 +49,10 @@ class WorldContacts(Feature):
 
     def size(self, layout: StateLayout) -> int:
         return _SIZE * MOST_POINTS
+
+    def least_scales(self, layout: StateLayout) -> list[float]:
+        # A body that hardly ever meets the world in data may fall on it later.
+        return [_NEAR, *[CLIPPED_SCALE] * (_SIZE - 1)] * MOST_POINTS
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         self.require_bodies(scene, layout)
