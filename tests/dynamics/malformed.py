@@ -125,7 +125,9 @@ def _of_model(given: dict, state: Tensor, actions: Tensor, channels: int, many: 
             continue
         out, stored = calls[-1].run()
         both_too = {"gradient": torch.ones_like(out), "states": out if many else state, "actions": actions}
-        calls.append(Call("rollout_adjoint", **both_too, **given, stored=stored, **options, of_weights=of_weights))
+        given_too = both_too | given | {"stored": stored} | options
+        for of_inputs in (True, False)[: 1 + of_weights]:
+            calls.append(Call("rollout_adjoint", **given_too, of_weights=of_weights, of_inputs=of_inputs))
     return calls
 
 

@@ -64,10 +64,23 @@ def test_steps_that_are_computed_again_give_the_same_gradient(quick, inputs, dty
         states, kept = OPS.rollout_keeping(state, actions, *model(predictor).values(), 13, True, 2, 1)
         assert kept.numel() > 0
         found = [
-            OPS.rollout_adjoint(states.cos(), states, actions, *model(predictor).values(), given, True, 2, False)[:2]
+            OPS.rollout_adjoint(states.cos(), states, actions, *model(predictor).values(), given, True, 2, False, True)[:2]
             for given in (kept, kept.new_empty(0))
         ]
         assert equal(*found) and found[0][1].norm() > 0
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_gradients_of_weights_are_the_same_without_those_of_states(quick, inputs, many):
+    predictor = quick("joints", torch.float32)
+    state, actions = inputs(predictor, 26)
+    state[1, :, 2] += 0.1  # of the other state maths
+    actions, given = actions if many else actions[:, 0].clone(), model(predictor).values()
+    out, kept = OPS.rollout_keeping(state, actions, *given, 13, many, 1, 0 if many else 2)
+    rest = (out.cos(), out if many else state, actions, *given, kept, many, 1, True)
+    all_, alone = (OPS.rollout_adjoint(*rest, of_inputs) for of_inputs in (True, False))
+    assert torch.equal(alone[2], all_[2]) and torch.equal(alone[3], all_[3]) and all_[2].norm() > 0
+    assert all_[0].norm() > 0 and not alone[0].numel() and not alone[1].numel()
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -228,7 +241,8 @@ def test_operators_pass_torchs_own_checks(quick, inputs, many, of_weights):
     out, kept = OPS.rollout_keeping(state, actions, *given.values(), 13, many, 1, 0)
     torch.library.opcheck(OPS.rollout_keeping.default, (state, actions, *given.values(), 13, many, 1, 0))
     rest = (out if many else state, actions, *given.values(), kept, many, 1, of_weights)
-    torch.library.opcheck(OPS.rollout_adjoint.default, (torch.ones_like(out), *rest))
+    for of_inputs in (True, False)[: 1 + of_weights]:
+        torch.library.opcheck(OPS.rollout_adjoint.default, (torch.ones_like(out), *rest, of_inputs))
     numbers = torch.randn(23, requires_grad=True)
     torch.library.opcheck(OPS.pack.default, (numbers, [3, 5, 2, 4], many))
 
@@ -353,20 +367,20 @@ def test_states_and_actions_that_do_not_fit_are_refused(quick, inputs):
     states, kept = OPS.rollout_keeping(state, actions, *model(predictor).values(), 13, True, 1, 1)
     rest = (states, actions, *model(predictor).values())
     with pytest.raises(ValueError, match="gradient does not fit"):
-        OPS.rollout_adjoint(states[:, 1:], *rest, kept, True, 1, False)
+        OPS.rollout_adjoint(states[:, 1:], *rest, kept, True, 1, False, True)
     for some in (states[:, :1], states[:, 1:]):
         with wrong:
-            OPS.rollout_adjoint(states, some, *rest[1:], kept, True, 1, False)
+            OPS.rollout_adjoint(states, some, *rest[1:], kept, True, 1, False, True)
     for other in (kept[1:], kept.double()):
         with pytest.raises(ValueError, match="is of another call"):
-            OPS.rollout_adjoint(states, *rest, other, True, 1, False)
+            OPS.rollout_adjoint(states, *rest, other, True, 1, False, True)
     with pytest.raises(ValueError, match="one step alone"):
         OPS.rollout_keeping(state, actions, *model(predictor).values(), 13, True, 1, 2)
     for gradient in (states.mT, states.half(), states[0]):
         with pytest.raises(ValueError, match="gradient does not fit"):
-            OPS.rollout_adjoint(gradient, *rest, kept, True, 1, False)
+            OPS.rollout_adjoint(gradient, *rest, kept, True, 1, False, True)
     with pytest.raises(ValueError, match="is of another call"):
-        OPS.rollout_adjoint(states, *rest, kept, True, 3, False)  # threads that share the samples otherwise
+        OPS.rollout_adjoint(states, *rest, kept, True, 3, False, True)  # threads that share the samples otherwise
     for keep in (-1, 3):
         with pytest.raises(ValueError, match="0, 1 or 2"):
             OPS.rollout_keeping(state, actions, *model(predictor).values(), 13, True, 1, keep)

@@ -73,8 +73,8 @@ class Network {
     }
   }
 
-  // Reads grad_output and what forward() stored, writes grad_nodes and grad_edges.
-  void backward(T* ws, int S, const T* stored) const {
+  // Reads grad_output and what forward() stored; writes grad_nodes and grad_edges, if they are wanted.
+  void backward(T* ws, int S, const T* stored, bool of_inputs) const {
     for (int64_t b = 0; b < words_.unread_count; b++) clear(ws, S, structure_.list(words_.unread)[b]);
     for (int64_t i = words_.layer_count; i-- > 0;) {
       const LayerWords& layer = layers_[i];
@@ -82,7 +82,7 @@ class Network {
         for (const GatherWords& gather : gathers)
           if (gather.clears) clear(ws, S, gather.source);
       pre_activations(i, ws, S, stored, [&](int64_t start, int rows, const T* grad, const T* slopes) {
-        pull(layer, ws, S, start, rows, grad, slopes);
+        pull(layer, ws, S, start, rows, grad, slopes, of_inputs || !reads_inputs_alone(layer));
       });
     }
   }
@@ -278,14 +278,22 @@ class Network {
     }
   }
 
-  // Gradients of a chunk's inputs. Rows come in the order of items, for one order of sums whatever the chunks.
-  void pull(const LayerWords& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes) const {
+  // Whether a layer multiplies nothing but the network's nodes and edges.
+  bool reads_inputs_alone(const LayerWords& layer) const {
+    const Gathers all = inputs(layer);
+    return std::all_of(all.begin(), all.end(), [](const GatherWords& g) { return g.source < 2; });
+  }
+
+  // Gradients of a chunk's added rows and, if they are wanted, of what it multiplies. Rows come in the order of items,
+  // for one order of sums whatever the chunks.
+  void pull(const LayerWords& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes,
+            bool of_products) const {
     int64_t width = layer.width, depth = padded(layer.depth);
     const bool direct = layer.direct && depth == layer.depth;
     T* results = direct ? gradients(ws, S, inputs(layer).first->source) + start * depth : this->results(ws);
     const T* init[kChunk];
     std::fill_n(init, rows, zeros_.data());
-    for (int64_t k = 0; k < width; k += kDepth) {
+    for (int64_t k = 0; k < width && of_products; k += kDepth) {
       int64_t count = std::min<int64_t>(kDepth, width - k);
       multiply_slopes(grad + k, slopes ? slopes + k : nullptr, width, rows, count, ws);
       multiply(weights_ + (kBfloat16 ? layer.paired_backward : layer.backward), ws, rows, k, count, width, depth, init, results);
@@ -297,10 +305,11 @@ class Network {
       const T* from = results + row * depth + g.column;
       (g.writes ? accumulate_rows<T, false> : accumulate_rows<T, true>)(to, g.width, from, depth, now, g.width);
     };
-    for (const GatherWords& g : inputs(layer))
+    const Gathers multiplied{inputs(layer).first, of_products ? layer.input_count : 0};
+    for (const GatherWords& g : multiplied)
       if (g.in_order && g.apart) scatter(g, 0, start, 0, rows);
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
-      for (const GatherWords& g : inputs(layer))
+      for (const GatherWords& g : multiplied)
         for (int64_t j = offsets(g)[item]; j < offsets(g)[item + 1] && !(g.in_order && g.apart); j++)
           scatter(g, j, sample, row, now);
       for (const GatherWords& g : added(layer))

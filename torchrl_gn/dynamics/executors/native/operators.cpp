@@ -318,14 +318,14 @@ Tensor rollout(const Tensor& state, const Tensor& actions, const Tensor& structu
   return run(state, actions, model, channels, many, threads, kNothing, nullptr);
 }
 
-// Gradients in state, actions, packed weights and tables; the last two empty without `of_weights`. `states` is the start
-// state, with `many` the rollout's result.
+// Gradients in state and actions, empty without `of_inputs`, and in packed weights and tables, empty without `of_weights`.
+// `states` is the start state, with `many` the rollout's result.
 std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradient_, const Tensor& states_,
                                                            const Tensor& actions_, const Tensor& structure,
                                                            const Tensor& weights, const Tensor& tables,
                                                            const OptionalTensor& sample_tables, const Tensor& numbers,
                                                            const Tensor& stored, bool many, int64_t threads,
-                                                           bool of_weights) {
+                                                           bool of_weights, bool of_inputs) {
   for (const Tensor* each : {&gradient_, &states_, &actions_, &stored}) check_memory(*each);
   const Tensor gradient = gradient_.contiguous(), states = states_.contiguous(), actions = actions_.contiguous();
   const Model model{structure, weights, tables, sample_tables, numbers};
@@ -338,11 +338,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
   std::vector<int64_t> shape = states.sizes().vec();
   if (many) shape.erase(shape.end() - 3);
   gn::Call& call = prepared.call;
-  const Tensor of_state = Pool::empty(shape, states.scalar_type()), of_actions = at::empty_like(actions);
+  const Tensor of_state = of_inputs ? Pool::empty(shape, states.scalar_type()) : at::empty_like(nothing);
+  const Tensor of_actions = of_inputs ? at::empty_like(actions) : at::empty_like(nothing);
   const Tensor of_packed = of_weights ? at::zeros_like(weights) : nothing;
   const Tensor of_tables = of_weights ? at::zeros_like(tables) : at::empty_like(nothing);  // results share no memory
   call.out = array(gradient);
-  call.grad_state = array(of_state), call.grad_actions = array(of_actions);
+  call.of_inputs = of_inputs, call.grad_state = array(of_state), call.grad_actions = array(of_actions);
   if (of_weights) {
     TORCH_CHECK_VALUE(weights.scalar_type() == tables.scalar_type(), "There is no gradient of bfloat16 weights.");
     call.grad_weights = of_packed.data_ptr(), call.grad_tables = of_tables.data_ptr();
@@ -511,7 +512,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint_shape(const Tensor& g
                                                                  const Tensor& weights, const Tensor& tables,
                                                                  const OptionalTensor& sample_tables,
                                                                  const Tensor& numbers, const Tensor& stored, bool many,
-                                                                 int64_t, bool of_weights) {
+                                                                 int64_t, bool of_weights, bool of_inputs) {
   check_shapes(states, 2 + many, actions, 1 + many, {&gradient, &structure, &weights, &tables, &numbers, &stored},
                sample_tables);
   std::vector<c10::SymInt> shape = states.sym_sizes().vec();
@@ -519,6 +520,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint_shape(const Tensor& g
   auto like = [&](const Tensor& tensor) {
     return of_weights ? at::empty_like(tensor) : at::empty({0}, tables.options());
   };
+  if (!of_inputs) return {at::empty({0}, states.options()), at::empty({0}, actions.options()), like(weights), like(tables)};
   return {at::empty_symint(shape, states.options()), at::empty_symint(actions.sym_sizes(), actions.options()),
           like(weights), like(tables)};
 }
@@ -554,12 +556,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> adjoint_autograd(const Tensor& gradie
                                                             const Tensor& weights, const Tensor& tables,
                                                             const OptionalTensor& sample_tables, const Tensor& numbers,
                                                             const Tensor& stored, bool many, int64_t threads,
-                                                            bool of_weights) {
+                                                            bool of_weights, bool of_inputs) {
   static const auto op = typed<decltype(rollout_adjoint)>("torchrl_gn::rollout_adjoint");
   auto found = [&] {
     at::AutoDispatchBelowADInplaceOrView guard;
     return op.call(gradient, states, actions, structure, weights, tables, sample_tables, numbers, stored, many, threads,
-                   of_weights);
+                   of_weights, of_inputs);
   }();
   const bool differentiable = needs(gradient) || needs(states) || needs(actions) || needs(weights) || needs(tables);
   if (!at::GradMode::is_enabled() || !differentiable) return found;
@@ -589,6 +591,7 @@ struct Rollout : torch::autograd::Function<Rollout> {
     context->saved_data["many"] = many;
     context->saved_data["threads"] = threads;
     context->saved_data["of_weights"] = of_weights;
+    context->saved_data["of_inputs"] = needs(state) || needs(actions);
     return out;
   }
   static variable_list backward(AutogradContext* context, variable_list gradients) {
@@ -596,16 +599,17 @@ struct Rollout : torch::autograd::Function<Rollout> {
     const variable_list saved = context->get_saved_variables();
     const OptionalTensor own = saved[5].defined() ? OptionalTensor(saved[5]) : std::nullopt;
     const bool many = context->saved_data["many"].toBool();
-    const bool trained = context->saved_data["of_weights"].toBool();
+    const bool trained = context->saved_data["of_weights"].toBool(), moved = context->saved_data["of_inputs"].toBool();
     auto [of_state, of_actions, of_weights, of_tables] = [&] {
       try {
         return op.call(gradients[0], saved[0], saved[1], saved[2], saved[3], saved[4], own, saved[6],
-                       context->saved_data["stored"].toTensor(), many, context->saved_data["threads"].toInt(), trained);
+                       context->saved_data["stored"].toTensor(), many, context->saved_data["threads"].toInt(), trained,
+                       moved);
       } catch (const std::bad_alloc&) {  // of which autograd would make a RuntimeError
         TORCH_CHECK_WITH(OutOfMemoryError, false, "There is not enough memory for the gradient of a native step.");
       }
     }();
-    return {of_state, of_actions, Tensor(), trained ? of_weights : Tensor(), trained ? of_tables : Tensor(),
+    return {moved ? of_state : Tensor(), moved ? of_actions : Tensor(), Tensor(), trained ? of_weights : Tensor(), trained ? of_tables : Tensor(),
             Tensor(), Tensor(), Tensor(), Tensor(), Tensor()};
   }
 };
@@ -650,7 +654,7 @@ TORCH_LIBRARY(torchrl_gn, library) {
       " Tensor? sample_tables, Tensor numbers, int channels, bool many, int threads, int keep) -> (Tensor, Tensor)");
   library.def(
       "rollout_adjoint(Tensor gradient, Tensor states, Tensor actions, Tensor structure, Tensor weights, Tensor tables,"
-      " Tensor? sample_tables, Tensor numbers, Tensor stored, bool many, int threads, bool of_weights)"
+      " Tensor? sample_tables, Tensor numbers, Tensor stored, bool many, int threads, bool of_weights, bool of_inputs)"
       " -> (Tensor, Tensor, Tensor, Tensor)");
   library.def("pack(Tensor numbers, int[] shapes, bool weights) -> Tensor");
   library.def(

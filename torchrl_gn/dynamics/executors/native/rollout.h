@@ -153,7 +153,7 @@ struct Runner {
     }
   }
 
-  // Gradient of the varying channels; that of the constant ones is what their copies receive.
+  // Gradient of the varying channels, if it is wanted; that of the constant ones is what their copies receive.
   // again, room: for the step that is computed again; gradient: of the varying channels; of_weights, of_tables: added to,
   // if given.
   void pull(double* again, T* room, double* gradient, T* of_weights, T* of_tables) const {
@@ -190,13 +190,15 @@ struct Runner {
       });
       run_tape<W, C>(m.adjoint, 0, r);
       to_network(m.adjoint, 0, 0, m.outputs, m.output_width, network.grad_output(ws, count));
-      network.backward(ws, count, derivatives);
+      const bool of_inputs = call.of_inputs || t > 0;
+      network.backward(ws, count, derivatives, of_inputs);
       if (of_weights) network.weight_gradients(ws, count, derivatives, of_weights, of_tables);
+      if (!of_inputs) return;
       from_network(m.adjoint, 5, 0, m.node_inputs, m.node_width, network.grad_nodes(ws, count));
       from_network(m.adjoint, 5, m.node_inputs, m.edge_inputs, m.edge_width, network.grad_edges(ws, count));
       run_tape<W, C>(m.adjoint, 1, r);
       for (int64_t i = 0; i < n; ++i) std::memcpy(&gradient[i * L], result(m.adjoint, 1, i), sizeof(double) * L);
-      for (int64_t i = 0; i < A; ++i)
+      for (int64_t i = 0; i < A && call.of_inputs; ++i)
         for (int lane = 0; lane < count; ++lane)
           call.grad_actions.set((sample(lane) * call.steps + t) * A + i, result(m.adjoint, 1, n + i)[lane]);
     }
