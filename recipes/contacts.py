@@ -6,7 +6,7 @@
 Learns from a log of body poses, for a scene whose MJCF describes them: by default ContactNets' cube on its table.
 Reports distance and angle between predicted and true pose, means over the steps of rollouts over `length` steps from
 the first state of each test episode, of the model and of MuJoCo with the MJCF's numbers. Without a log it simulates
-throws. No figure of the paper. Ctrl-C saves everything; the same `run_dir` goes on.
+throws, and shows MuJoCo at half its physics step: how far they are determined. No figure of the paper. Ctrl-C saves everything; the same `run_dir` goes on.
 
 Writes config.yaml, metrics.json and the checkpoint to its run folder. All options: recipes/config/contacts.yaml.
 Results: docs/results/contacts-with-the-world.md.
@@ -29,7 +29,7 @@ from _common.models import build_model
 from _common.progress import cut_short_note, train_with_progress
 from torchrl_gn.data import Simulator, load_pose_log, pose_trajectories, sample_start_states, trajectory_buffer
 from torchrl_gn.dynamics import BoundPredictor, MujocoPhysics
-from torchrl_gn.evaluation import pose_errors
+from torchrl_gn.evaluation import pose_errors, with_half_step
 from torchrl_gn.maths import quaternion
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import Scene, load_scene
@@ -80,6 +80,9 @@ def throws(cfg: DictConfig, scene: Scene, split: int, count: int) -> TensorDict:
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
         pose, rate = 1 + model.jnt_qposadr[joint], rates[model.jnt_dofadr[joint]]
         turn = rng.normal(size=(count, 4))
+        if cfg.throw.turn is not None:  # about the axis drawn
+            half = np.deg2rad(cfg.throw.turn / 2) * rng.uniform(size=count)
+            turn[:, 0] = np.linalg.norm(turn[:, 1:], axis=1) / np.tan(half)
         physics[:, pose + 2] += rng.uniform(*cfg.throw.lift, size=count)
         physics[:, pose + 3 : pose + 7] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
         physics[:, rate : rate + 3] = cfg.throw.speed * rng.normal(size=(count, 3))
@@ -171,13 +174,14 @@ def main(cfg: DictConfig) -> None:
     base = int(np.flatnonzero(scene.predicted)[0])
     errors = {"model": pose_errors(bound, data["test"])}
     if scene.physics_size == 1 + scene.model.nq + scene.model.nv:
-        errors["MuJoCo"] = pose_errors(MujocoPhysics(scene), data["test"], node=base)
+        name, truth = ("MuJoCo", scene) if cfg.log else ("MuJoCo at half its step", with_half_step(scene))
+        errors[name] = pose_errors(MujocoPhysics(truth), data["test"], node=base)
     steps = cast(torch.Tensor, data["test"]["action"]).shape[1]
     print(f"{scene.node_names[base]!r} over {steps} steps, means over {len(data['test'])} rollouts:")
     metrics: dict[str, float] = {"steps": trainer.step, "training_seconds": trainer.seconds, "tests": len(data["test"])}
     for name, found in errors.items():
         numbers = found.to_metrics()
-        print(f"{name:8} {numbers['position_error']:.4f} m  {numbers['rotation_error']:.4f} rad")
+        print(f"{name:23} {numbers['position_error']:.4f} m  {numbers['rotation_error']:.4f} rad")
         metrics |= {f"{name}/{key}": value for key, value in numbers.items()}
     if note := cut_short_note(trainer, run.path):
         print(note)

@@ -28,7 +28,7 @@ def recipe(load):
 def log(recipe, tmp_path_factory):
     """Seven throws of the recipe's cube."""
     options = {"system": None, "timestep": 0.00675676, "length": 14, "data_seed": 0}
-    cfg = OmegaConf.create(options | {"throw": {"lift": [0.1, 0.2], "speed": 1.0, "spin": 5.0, "joints": 0.0}})
+    cfg = OmegaConf.create(options | {"throw": {"lift": [0.1, 0.2], "turn": None, "speed": 1.0, "spin": 5.0, "joints": 0.0}})
     state = recipe.throws(cfg, recipe.make_scene(cfg), 0, 7)["state"]
     path = tmp_path_factory.mktemp("log") / "falls.npz"
     np.savez(path, state=np.asarray(state)[:, :, 1], length=np.full(7, 15))
@@ -53,10 +53,21 @@ def test_robots_are_thrown_with_moving_joints(recipe):
     scene = zoo.load("tumbler")
     cfg = OmegaConf.create({"length": 3, "data_seed": 0})
     for joints in (0.0, 2.0):
-        cfg.throw = {"lift": [0.1, 0.2], "speed": 1.0, "spin": 5.0, "joints": joints}
+        cfg.throw = {"lift": [0.1, 0.2], "turn": None, "speed": 1.0, "spin": 5.0, "joints": joints}
         state = recipe.throws(cfg, scene, 0, 40)["state"][:, 0]
         moved = (state[:, 2:, 10:13] - state[:, 1:2, 10:13]).norm(dim=-1)  # relative to the base, rad/s
         assert moved.max() < 1e-9 if joints == 0 else 0.5 < moved.square().mean().sqrt() < 5
+
+
+def test_throws_turn_bodies_as_far_as_asked(recipe):
+    scene = zoo.load("tumbler")
+    cfg = OmegaConf.create({"length": 1, "data_seed": 0})
+    upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    for turn, least, most in ((90, 80, 90), (10, 8, 10), (None, 150, 180)):
+        cfg.throw = {"lift": [0.1, 0.2], "turn": turn, "speed": 0.0, "spin": 0.0, "joints": 0.0}
+        base = recipe.throws(cfg, scene, 0, 60)["state"][:, 0, 1, 3:7]
+        degrees = torch.rad2deg(quaternion.angle(base, upright.expand_as(base)))
+        assert least < degrees.max() <= most + 1e-6 and degrees.min() < most / 4
 
 
 def test_copies_are_cubes_on_other_faces(recipe, log):

@@ -15,6 +15,7 @@ from torchrl_gn.evaluation.figures import plot_planning_curves as plot_planning_
 from torchrl_gn.evaluation.figures import plot_rewards as plot_rewards
 from torchrl_gn.evaluation.figures import plot_training_curve as plot_training_curve
 from torchrl_gn.evaluation.half_step import half_step_errors as half_step_errors
+from torchrl_gn.evaluation.half_step import with_half_step as with_half_step
 from torchrl_gn.evaluation.joint_errors import JointErrors as JointErrors
 from torchrl_gn.evaluation.joint_errors import joint_errors as joint_errors
 from torchrl_gn.evaluation.motion_figures import plot_body_trajectory as plot_body_trajectory

@@ -33,11 +33,7 @@ def half_step_errors(
     Raises:
         KeyError: if they have no ``physics``, as those of a data set.
     """
-    model = copy.copy(scene.model)
-    model.opt.timestep /= 2
-    if scene.delays.size:
-        model.actuator_delay[:] = np.maximum(2 * scene.delays.lag - 0.5, 0) * model.opt.timestep
-    simulator = Simulator(replace(scene, model=model, substeps=2 * scene.substeps), num_threads)
+    simulator = Simulator(with_half_step(scene), num_threads)
     state, physics, action = (cast(Tensor, trajectories[key]) for key in ("state", "physics", "action"))
     horizons, (count, steps) = sorted(horizons), action.shape[:2]
     predicted = torch.as_tensor(np.flatnonzero(scene.predicted))
@@ -51,3 +47,12 @@ def half_step_errors(
     errors = [single.error("one_step_error", 1, count, steps, fixed)]
     errors += [rollouts.error(f"rollout_error_{horizon}", horizon, count, horizon, fixed) for horizon in horizons]
     return ErrorTable({error.name: error for error in errors}, state.new_zeros((0, 1, *state.shape[2:])))
+
+
+def with_half_step(scene: Scene) -> Scene:
+    """The scene, simulated at half its physics step; the control step is the same."""
+    model = copy.copy(scene.model)
+    model.opt.timestep /= 2
+    if scene.delays.size:
+        model.actuator_delay[:] = np.maximum(2 * scene.delays.lag - 0.5, 0) * model.opt.timestep
+    return replace(scene, model=model, substeps=2 * scene.substeps)
