@@ -34,8 +34,7 @@ struct Call {
   const double* numbers;   // [B, numbers] of the model and of each sample, sample stride below
   int64_t number_stride;
   const void* sample_tables;  // every layer's [I, B, out padded to kPanel], one after the other; null: none has any
-  int64_t of_inputs;       // adjoint: whether the gradients of states and actions are wanted
-  Array grad_state;        // adjoint: [B, size]
+  Array grad_state;        // adjoint: [B, size]; null: neither this nor the next is wanted
   Array grad_actions;      // adjoint: [B, T, A]
   void* stored;            // what the adjoint needs, of stored_count() numbers; null: it computes the steps again
   int64_t keeps_all;       // of one step also the activations, for gradients of the weights

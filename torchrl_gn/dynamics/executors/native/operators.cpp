@@ -343,7 +343,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
   const Tensor of_packed = of_weights ? at::zeros_like(weights) : nothing;
   const Tensor of_tables = of_weights ? at::zeros_like(tables) : at::empty_like(nothing);  // results share no memory
   call.out = array(gradient);
-  call.of_inputs = of_inputs, call.grad_state = array(of_state), call.grad_actions = array(of_actions);
+  if (of_inputs) call.grad_state = array(of_state), call.grad_actions = array(of_actions);
   if (of_weights) {
     TORCH_CHECK_VALUE(weights.scalar_type() == tables.scalar_type(), "There is no gradient of bfloat16 weights.");
     call.grad_weights = of_packed.data_ptr(), call.grad_tables = of_tables.data_ptr();

@@ -190,7 +190,7 @@ struct Runner {
       });
       run_tape<W, C>(m.adjoint, 0, r);
       to_network(m.adjoint, 0, 0, m.outputs, m.output_width, network.grad_output(ws, count));
-      const bool of_inputs = call.of_inputs || t > 0;
+      const bool of_inputs = call.grad_state.data || t > 0;
       network.backward(ws, count, derivatives, of_inputs);
       if (of_weights) network.weight_gradients(ws, count, derivatives, of_weights, of_tables);
       if (!of_inputs) return;
@@ -198,7 +198,7 @@ struct Runner {
       from_network(m.adjoint, 5, m.node_inputs, m.edge_inputs, m.edge_width, network.grad_edges(ws, count));
       run_tape<W, C>(m.adjoint, 1, r);
       for (int64_t i = 0; i < n; ++i) std::memcpy(&gradient[i * L], result(m.adjoint, 1, i), sizeof(double) * L);
-      for (int64_t i = 0; i < A && call.of_inputs; ++i)
+      for (int64_t i = 0; i < A && call.grad_actions.data; ++i)
         for (int lane = 0; lane < count; ++lane)
           call.grad_actions.set((sample(lane) * call.steps + t) * A + i, result(m.adjoint, 1, n + i)[lane]);
     }
