@@ -87,7 +87,8 @@ def throws(cfg: DictConfig, scene: Scene, split: int, count: int) -> TensorDict:
         physics[:, pose + 3 : pose + 7] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
         physics[:, rate : rate + 3] = cfg.throw.speed * rng.normal(size=(count, 3))
         physics[:, rate + 3 : rate + 6] = cfg.throw.spin * rng.normal(size=(count, 3))
-    idle = torch.zeros(count, cfg.length, scene.num_actions, dtype=torch.float64)
+    length = cfg.length if split or cfg.train_length is None else cfg.train_length
+    idle = torch.zeros(count, length, scene.num_actions, dtype=torch.float64)
     state = Simulator(scene).rollout(torch.from_numpy(physics), idle)["state"]
     return TensorDict({"state": state, "action": idle}, [count])
 

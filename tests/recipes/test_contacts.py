@@ -27,7 +27,7 @@ def recipe(load):
 @pytest.fixture(scope="module")
 def log(recipe, tmp_path_factory):
     """Seven throws of the recipe's cube."""
-    options = {"system": None, "timestep": 0.00675676, "length": 14, "data_seed": 0}
+    options = {"system": None, "timestep": 0.00675676, "length": 14, "train_length": None, "data_seed": 0}
     cfg = OmegaConf.create(options | {"throw": {"lift": [0.1, 0.2], "turn": None, "speed": 1.0, "spin": 5.0, "joints": 0.0}})
     state = recipe.throws(cfg, recipe.make_scene(cfg), 0, 7)["state"]
     path = tmp_path_factory.mktemp("log") / "falls.npz"
@@ -51,7 +51,7 @@ def test_splits_share_no_episode(recipe, log):
 
 def test_robots_are_thrown_with_moving_joints(recipe):
     scene = zoo.load("tumbler")
-    cfg = OmegaConf.create({"length": 3, "data_seed": 0})
+    cfg = OmegaConf.create({"length": 3, "train_length": None, "data_seed": 0})
     for joints in (0.0, 2.0):
         cfg.throw = {"lift": [0.1, 0.2], "turn": None, "speed": 1.0, "spin": 5.0, "joints": joints}
         state = recipe.throws(cfg, scene, 0, 40)["state"][:, 0]
@@ -61,11 +61,13 @@ def test_robots_are_thrown_with_moving_joints(recipe):
 
 def test_throws_turn_bodies_as_far_as_asked(recipe):
     scene = zoo.load("tumbler")
-    cfg = OmegaConf.create({"length": 1, "data_seed": 0})
+    cfg = OmegaConf.create({"length": 4, "train_length": 1, "data_seed": 0})
     upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
     for turn, least, most in ((90, 80, 90), (10, 8, 10), (None, 150, 180)):
         cfg.throw = {"lift": [0.1, 0.2], "turn": turn, "speed": 0.0, "spin": 0.0, "joints": 0.0}
-        base = recipe.throws(cfg, scene, 0, 60)["state"][:, 0, 1, 3:7]
+        state = recipe.throws(cfg, scene, 0, 60)["state"]
+        assert state.shape[1] == 2 and recipe.throws(cfg, scene, 1, 2)["state"].shape[1] == 5
+        base = state[:, 0, 1, 3:7]
         degrees = torch.rad2deg(quaternion.angle(base, upright.expand_as(base)))
         assert least < degrees.max() <= most + 1e-6 and degrees.min() < most / 4
 
