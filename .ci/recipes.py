@@ -84,6 +84,9 @@ inference_model steps=10 baselines=true {DATA} test.systems=10 run_dir=runs/infe
 
 real_robot steps=5 simulated.episodes=40 run_dir=runs/real_robot
 
+ensemble system=pendulum members=2 steps=5 hidden=8 data.train=20 data.calibration=20 data.test=10 data.other=10
+    run_dir=runs/ensemble
+
 contacts steps=5 "episodes={{train: 10, validation: 3, test: 3}}" run_dir=runs/contacts
 
 mpc system=swimmer6 planner=[gn,ilqg,cem,mppi,random] horizon=4 steps=3 episodes=2 gn.warm_up=2 gn.samples=4

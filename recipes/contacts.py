@@ -6,7 +6,8 @@
 Learns from a log of body poses, for a scene whose MJCF describes them: by default ContactNets' cube on its table.
 Reports distance and angle between predicted and true pose, means over the steps of rollouts over `length` steps from
 the first state of each test episode, of the model and of MuJoCo with the MJCF's numbers. Without a log it simulates
-throws, and shows MuJoCo at half its physics step: how far they are determined. No figure of the paper. Ctrl-C saves everything; the same `run_dir` goes on.
+throws, and shows MuJoCo at half its physics step: how far they are determined. No figure of the paper. Ctrl-C saves
+everything; the same `run_dir` goes on.
 
 Writes config.yaml, metrics.json and the checkpoint to its run folder. All options: recipes/config/contacts.yaml.
 Results: docs/results/contacts-with-the-world.md.

@@ -18,12 +18,15 @@ if TYPE_CHECKING:
     from torchrl_gn.data import create_dataset as create_dataset
     from torchrl_gn.data import load_dataset as load_dataset
     from torchrl_gn.data import trajectory_buffer as trajectory_buffer
+    from torchrl_gn.dynamics import Ensemble as Ensemble
     from torchrl_gn.dynamics import ForwardModel as ForwardModel
     from torchrl_gn.dynamics import export_c as export_c
     from torchrl_gn.dynamics import export_step as export_step
     from torchrl_gn.dynamics import specialize as specialize
     from torchrl_gn.envs import ModelEnv as ModelEnv
     from torchrl_gn.envs import SceneEnv as SceneEnv
+    from torchrl_gn.evaluation import calibrate as calibrate
+    from torchrl_gn.evaluation import evaluate_coverage as evaluate_coverage
     from torchrl_gn.evaluation import evaluate_errors as evaluate_errors
     from torchrl_gn.evaluation import rollout_video as rollout_video
     from torchrl_gn.identification import IdentifyingModel as IdentifyingModel
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from torchrl_gn.rewards import make_reward as make_reward
     from torchrl_gn.scenes import load_scene as load_scene
     from torchrl_gn.training import fit as fit
+    from torchrl_gn.training import fit_ensemble as fit_ensemble
     from torchrl_gn.training import load_pretrained as load_pretrained
     from torchrl_gn.training import pretrained_names as pretrained_names
     from torchrl_gn.training import save_checkpoint as save_checkpoint
@@ -47,15 +51,15 @@ __version__ = "0.1.0"
 # The main names, by the folder that defines them; imported at their first use.
 _FOLDERS = {
     "data": ("collect_trajectories", "create_dataset", "load_dataset", "trajectory_buffer"),
-    "dynamics": ("ForwardModel", "export_c", "export_step", "specialize"),
+    "dynamics": ("Ensemble", "ForwardModel", "export_c", "export_step", "specialize"),
     "envs": ("ModelEnv", "SceneEnv"),
-    "evaluation": ("evaluate_errors", "rollout_video"),
+    "evaluation": ("calibrate", "evaluate_coverage", "evaluate_errors", "rollout_video"),
     "identification": ("IdentifyingModel",),
     "objectives": ("ForwardModelLoss", "IdentificationLoss", "SHACLoss", "SVGLoss"),
     "planners": ("GradientPlanner", "ILQGPlanner", "PlanAhead"),
     "rewards": ("available_rewards", "make_reward"),
     "scenes": ("load_scene",),
-    "training": ("fit", "load_pretrained", "pretrained_names", "save_checkpoint"),
+    "training": ("fit", "fit_ensemble", "load_pretrained", "pretrained_names", "save_checkpoint"),
 }
 _PLACES = {name: folder for folder, names in _FOLDERS.items() for name in names}
 

@@ -64,7 +64,9 @@ def test_steps_that_are_computed_again_give_the_same_gradient(quick, inputs, dty
         states, kept = OPS.rollout_keeping(state, actions, *model(predictor).values(), 13, True, 2, 1)
         assert kept.numel() > 0
         found = [
-            OPS.rollout_adjoint(states.cos(), states, actions, *model(predictor).values(), given, True, 2, False, True)[:2]
+            OPS.rollout_adjoint(states.cos(), states, actions, *model(predictor).values(), given, True, 2, False, True)[
+                :2
+            ]
             for given in (kept, kept.new_empty(0))
         ]
         assert equal(*found) and found[0][1].norm() > 0

@@ -28,7 +28,9 @@ def recipe(load):
 def log(recipe, tmp_path_factory):
     """Seven throws of the recipe's cube."""
     options = {"system": None, "timestep": 0.00675676, "length": 14, "train_length": None, "data_seed": 0}
-    cfg = OmegaConf.create(options | {"throw": {"lift": [0.1, 0.2], "turn": None, "speed": 1.0, "spin": 5.0, "joints": 0.0}})
+    cfg = OmegaConf.create(
+        options | {"throw": {"lift": [0.1, 0.2], "turn": None, "speed": 1.0, "spin": 5.0, "joints": 0.0}}
+    )
     state = recipe.throws(cfg, recipe.make_scene(cfg), 0, 7)["state"]
     path = tmp_path_factory.mktemp("log") / "falls.npz"
     np.savez(path, state=np.asarray(state)[:, :, 1], length=np.full(7, 15))

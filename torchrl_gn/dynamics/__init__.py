@@ -3,6 +3,9 @@
 from torchrl_gn.dynamics.as_predictor import as_predictor as as_predictor
 from torchrl_gn.dynamics.bound import BoundPredictor as BoundPredictor
 from torchrl_gn.dynamics.bound import UnseenParameterWarning as UnseenParameterWarning
+from torchrl_gn.dynamics.ensemble import BoundEnsemble as BoundEnsemble
+from torchrl_gn.dynamics.ensemble import Calibration as Calibration
+from torchrl_gn.dynamics.ensemble import Ensemble as Ensemble
 from torchrl_gn.dynamics.export import export_c as export_c
 from torchrl_gn.dynamics.export import export_step as export_step
 from torchrl_gn.dynamics.features import Activations as Activations

@@ -6,6 +6,7 @@ import copy
 import json
 import warnings
 from dataclasses import replace
+from typing import cast, overload
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics.bound import BoundPredictor, UnseenParameterWarning, static_graph
+from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.dynamics.executors import EXECUTORS, CudaExecutor, EagerExecutor, NativeExecutor
 from torchrl_gn.dynamics.predictor import Predictor, check_shapes, check_steps, require_bound
 from torchrl_gn.dynamics.program import Executor, InputScaling, PreparedStep, StepProgram, structure_key
@@ -229,18 +231,30 @@ class SpecializedPredictor(Predictor):
         return "\n".join(lines)
 
 
+@overload
 def specialize(
     predictor: BoundPredictor, *, executor: str = "native", dtype: torch.dtype | None = None
-) -> SpecializedPredictor:
+) -> SpecializedPredictor: ...
+
+
+@overload
+def specialize(
+    predictor: BoundEnsemble, *, executor: str = "native", dtype: torch.dtype | None = None
+) -> BoundEnsemble: ...
+
+
+def specialize(
+    predictor: BoundPredictor | BoundEnsemble, *, executor: str = "native", dtype: torch.dtype | None = None
+) -> SpecializedPredictor | BoundEnsemble:
     """Fold everything that a scene does not need out of its forward model.
 
     The result predicts the same with fewer operations: static features and biases become tables, adjacent linear layers
     are merged, features, components, nodes and edges that do not matter are left out. A core without
     :meth:`~torchrl_gn.networks.Core.fold` is evaluated as it is. It is a snapshot: :meth:`SpecializedPredictor.refresh`
-    takes weights that training has changed.
+    takes weights that training has changed. Of an ensemble, each member is specialised.
 
     Args:
-        predictor: a model bound to a scene.
+        predictor: a model bound to a scene, or an ensemble.
         executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"native"`` runs steps, rollouts and their
             gradients in C++ that is built once, a minute, and kept; where it cannot (a GPU, a recurrent core, float16,
             no compiler), as ``"eager"``, and ``print`` says why. ``"eager"`` runs torch operations anywhere.
@@ -258,6 +272,10 @@ def specialize(
         ValueError: if the executor is not known.
     """
     require_bound(predictor)
+    if isinstance(predictor, BoundEnsemble):
+        members = cast("list[BoundPredictor]", predictor.members)  # each is looked at again
+        made = [specialize(each, executor=executor, dtype=dtype) for each in members]
+        return BoundEnsemble(made, predictor.calibration)
     if not isinstance(predictor, BoundPredictor):
         raise TypeError(f"specialize() takes a bound model, not {type(predictor).__name__}: use model.bind(scene).")
     if executor not in EXECUTORS:

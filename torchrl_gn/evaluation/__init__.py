@@ -2,6 +2,9 @@
 
 from torchrl_gn.drawing.geometry import kinetic_energy as kinetic_energy
 from torchrl_gn.evaluation.baselines import baseline_errors as baseline_errors
+from torchrl_gn.evaluation.calibration import Coverage as Coverage
+from torchrl_gn.evaluation.calibration import calibrate as calibrate
+from torchrl_gn.evaluation.calibration import evaluate_coverage as evaluate_coverage
 from torchrl_gn.evaluation.error_table import ErrorTable as ErrorTable
 from torchrl_gn.evaluation.error_table import PredictionError as PredictionError
 from torchrl_gn.evaluation.error_table import summary as summary
@@ -18,6 +21,7 @@ from torchrl_gn.evaluation.half_step import half_step_errors as half_step_errors
 from torchrl_gn.evaluation.half_step import with_half_step as with_half_step
 from torchrl_gn.evaluation.joint_errors import JointErrors as JointErrors
 from torchrl_gn.evaluation.joint_errors import joint_errors as joint_errors
+from torchrl_gn.evaluation.motion_figures import plot_band as plot_band
 from torchrl_gn.evaluation.motion_figures import plot_body_trajectory as plot_body_trajectory
 from torchrl_gn.evaluation.motion_figures import plot_joints as plot_joints
 from torchrl_gn.evaluation.motion_figures import plot_motions as plot_motions

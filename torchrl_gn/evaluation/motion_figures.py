@@ -64,6 +64,42 @@ def plot_body_trajectory(
     return save(figure, path)
 
 
+def plot_band(
+    truth: Tensor, mean: Tensor, std: Tensor, scene: Scene, path: str | os.PathLike, *, node: int | str | None = None
+) -> Path:
+    """True states of one body, and an ensemble's prediction with bands of one and two standard deviations.
+
+    ``truth`` and ``mean`` are ``[T + 1, N, 13]``, ``std`` ``[T + 1, N, 12]``; ``node`` as of
+    :func:`plot_body_trajectory`.
+    """
+    if truth.shape != mean.shape or truth.shape[1:] != (scene.num_nodes, scene.state_size):
+        shapes = f"[T + 1, {scene.num_nodes}, {scene.state_size}], got {list(truth.shape)} and {list(mean.shape)}"
+        raise ValueError(f"Truth and mean of scene {scene.name!r} must both be {shapes}.")
+    index = node_index(scene, node)
+    true, middle, size = (each[:, index].detach().double().cpu().numpy() for each in (truth, mean, std))
+    time = np.arange(len(true)) * scene.timestep
+    figure = new_figure((9.0, 3.4))
+    panels = [panel for panel in _PANELS if panel[0] in ("position", "linear_velocity")]
+    for axes, (name, label, channels) in zip(figure.subplots(1, 2), panels, strict=True):
+        where, of_std = BODY_STATE.slices[name], BODY_STATE.delta_slices[name]
+        for channel, letter in enumerate(channels):
+            color, center = AXES[channel], middle[:, where][:, channel]
+            for width, alpha in ((2, 0.12), (1, 0.2)):
+                reach = width * size[:, of_std][:, channel]
+                axes.fill_between(time, center - reach, center + reach, color=color, alpha=alpha, linewidth=0)
+            axes.plot(time, true[:, where][:, channel], color=color, linewidth=1.6, label=letter)
+            axes.plot(time, center, color=color, **_PREDICTED)
+        _widen(axes, np.concatenate((true[:, where], middle[:, where])))
+        axes.set_title(label, loc="left", fontsize=10, color=INK)
+        axes.set_xlabel("time [s]", fontsize=9)
+        axes.legend(ncols=len(channels), fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1.01, 0.98))
+        axes.margins(x=0.01)
+        clean(axes)
+    title = "truth (lines) and prediction (dashed) with one and two standard deviations"
+    figure.suptitle(f"{scene.name}, {scene.node_names[index]}: {title}", fontsize=11)
+    return save(figure, path)
+
+
 def plot_motions(
     panels: Mapping[str, tuple[Tensor, Tensor]],
     scene: Scene,

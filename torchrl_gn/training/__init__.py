@@ -9,6 +9,7 @@ from torchrl_gn.training.checkpoint import pretrained_names as pretrained_names
 from torchrl_gn.training.checkpoint import save_checkpoint as save_checkpoint
 from torchrl_gn.training.fit import History as History
 from torchrl_gn.training.fit import fit as fit
+from torchrl_gn.training.fit import fit_ensemble as fit_ensemble
 from torchrl_gn.training.fit_physics import fit_physics as fit_physics
 from torchrl_gn.training.fit_value import ImitationHistory as ImitationHistory
 from torchrl_gn.training.fit_value import ValueHistory as ValueHistory

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 import torchrl_gn
-from torchrl_gn.dynamics import BoundPredictor, ForwardModel
+from torchrl_gn.dynamics import BoundPredictor, Ensemble, ForwardModel
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths import Normalizer
 from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue
@@ -33,9 +33,10 @@ _IN_HEADER = 4  # version, which it reads too, that has the description in the h
 _DESCRIPTION = "description"  # name of the tensor with the bytes of the description's JSON
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
-Trained = ForwardModel | IdentifyingModel | Agent | StateValue | BoundedPolicy  # what a checkpoint can hold
+Trained = ForwardModel | Ensemble | IdentifyingModel | Agent | StateValue | BoundedPolicy  # what a checkpoint can hold
 KINDS: dict[str, type[Trained]] = {
     "forward_model": ForwardModel,
+    "ensemble": Ensemble,
     "identifying_model": IdentifyingModel,
     "agent": Agent,
     "state_value": StateValue,
@@ -77,6 +78,11 @@ class Checkpoint:
     def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundPredictor:
         """The forward model joined to a scene, see :meth:`ForwardModel.bind`."""
         return self.model.bind(scene, **options)
+
+    @property
+    def ensemble(self) -> Ensemble:
+        """The ensemble; CheckpointError if it is another kind of model."""
+        return self._as(Ensemble)
 
     @property
     def agent(self) -> Agent:

@@ -11,7 +11,7 @@ from torch import nn
 from tqdm import tqdm
 
 from torchrl_gn.data import trajectory_buffer
-from torchrl_gn.dynamics import BoundPredictor
+from torchrl_gn.dynamics import BoundEnsemble, BoundPredictor
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training.budget import Budget
@@ -112,6 +112,40 @@ def fit(
                 bar.update(round(min(100 * now.fraction, 100)) - bar.n)
     trainer.restore_best()
     return history
+
+
+def fit_ensemble(
+    ensemble: BoundEnsemble,
+    trajectories: TensorDictBase,
+    *,
+    minutes: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    **options,
+) -> list[History]:
+    """Train the members of an ensemble on the same trajectories, each on batches of its own.
+
+    Args:
+        ensemble: bound to the scene, ``Ensemble.for_scene(scene).bind(scene)``; trained in place.
+        trajectories: as of :func:`fit`.
+        minutes: training time of all members together; default: one for each, if ``steps`` is not given.
+        steps: number of optimiser steps of each member.
+        seed: the members' seeds count from here.
+        **options: of :func:`fit`.
+
+    Raises:
+        TypeError: for an ensemble that is not bound, or specialised.
+
+    As :func:`fit` otherwise.
+    """
+    members = [each for each in getattr(ensemble, "members", []) if isinstance(each, BoundPredictor)]
+    if not isinstance(ensemble, BoundEnsemble) or len(members) < len(ensemble.members):
+        raise TypeError("fit_ensemble() takes a bound ensemble: Ensemble.for_scene(scene).bind(scene).")
+    own = None if minutes is None else minutes / len(members)
+    return [
+        fit(member, trajectories, minutes=own, steps=steps, seed=seed + index, **options)
+        for index, member in enumerate(members)
+    ]
 
 
 def _make_optimizer(module: nn.Module, optimizer: Optimizer, lr: float | None) -> ScheduledOptimizer:

@@ -1,0 +1,133 @@
+"""Ensembles: what their members predict together, and how they are kept."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.dynamics import BoundEnsemble, Ensemble, ForwardModel, specialize
+from torchrl_gn.dynamics.ensemble import mean_and_spread
+from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.training import CheckpointError, load_pretrained, save_checkpoint
+
+from ..sizes import SMALL
+
+COUNT, BATCH, STEPS = 3, 4, 2
+
+
+@pytest.fixture
+def make_ensemble(scenes, make_model):
+    def make(name: str = "cheetah") -> Ensemble:
+        return Ensemble([make_model(scenes[name], seed=seed) for seed in range(COUNT)])
+
+    return make
+
+
+def calibrated(ensemble: Ensemble, steps: int = 1) -> Ensemble:
+    """With factors of 2, 3, ... and floors of 0.01."""
+    count = len(BODY_STATE.names)
+    factor = torch.arange(2.0, 2 + steps).unsqueeze(-1).expand(-1, count)
+    ensemble.calibration.set(factor, torch.full((steps, count), 0.01))
+    return ensemble
+
+
+def test_members_about_a_mean():
+    generator = torch.Generator().manual_seed(0)
+    states = torch.randn(6, 5, 13, dtype=torch.float64, generator=generator)
+    states[..., 3:7] = quaternion.normalize(states[..., 3:7])
+    change = 0.3 * torch.randn(2000, 6, 5, 12, dtype=torch.float64, generator=generator)
+    members = BODY_STATE.apply(states.expand(2000, -1, -1, -1), change)
+    members[:, ..., 3:7] *= torch.where(torch.rand(2000, 6, 5, 1, generator=generator) < 0.5, -1.0, 1.0)  # q and -q
+    mean, spread = mean_and_spread(members, BODY_STATE)
+    assert BODY_STATE.delta(states, mean).abs().max() < 0.05
+    torch.testing.assert_close(spread, torch.full_like(spread, 0.3), rtol=0.1, atol=0)
+
+
+def test_members_that_are_not_finite_make_the_spread_infinite():
+    members = torch.zeros(3, 4, 2, 13, dtype=torch.float64)
+    members[..., 3], members[..., 0] = 1.0, torch.tensor([1.0, 2.0, 6.0]).view(3, 1, 1)
+    members[2, 1, 0, 8], members[:, 2, 1, 0] = torch.nan, torch.inf
+    mean, spread = mean_and_spread(members, BODY_STATE)
+    torch.testing.assert_close(mean[..., 0][[0, 3]], torch.full((2, 2), 3.0).double())
+    torch.testing.assert_close(spread[[0, 3]][..., 0], torch.full((2, 2), 7.0).double().sqrt())
+    assert (mean[1, :, 0] == 1.5).all() and spread[1].isinf().all()
+    assert spread[2].isinf().all() and mean[2].isnan().all()
+
+
+def test_it_predicts_the_members_and_how_far_off_they_may_be(scenes, make_ensemble, random_states, random_actions):
+    scene, ensemble = scenes["cheetah"], calibrated(make_ensemble(), STEPS)
+    bound = ensemble.bind(scene)
+    state, actions = random_states(scene, BATCH), torch.stack([random_actions(scene, BATCH)] * (STEPS + 1), 1)
+    mean, std, members = bound.predict(state, actions)
+    expected = torch.stack([model.bind(scene).rollout(state, actions)[0] for model in ensemble.models])
+    torch.testing.assert_close(members, expected)
+    torch.testing.assert_close(bound.step(state, actions[:, 0]), expected[:, :, 1])
+    wanted_mean, spread = mean_and_spread(expected, scene.layout)
+    torch.testing.assert_close(mean, wanted_mean)
+    assert not std[:, 0].any()
+    factors = torch.tensor([2.0, 3.0, 3.0]).view(-1, 1, 1)  # the last holds for all further steps
+    moves = torch.as_tensor(scene.movable)
+    torch.testing.assert_close(std[:, 1:], factors * (spread[:, 1:].square() + 1e-4).sqrt() * moves)
+    entries = bound(TensorDict({"state": state, "action": actions[:, 0]}, [BATCH]))
+    torch.testing.assert_close(entries["next", "state"], mean[:, 1])
+    torch.testing.assert_close(entries["next", "state_std"], std[:, 1])
+
+
+def test_gradients_pass_through_the_mean_and_its_standard_deviation(
+    scenes, make_ensemble, random_states, random_actions
+):
+    scene = scenes["cheetah"]
+    bound = calibrated(make_ensemble()).bind(scene)
+    action = random_actions(scene, BATCH).requires_grad_()
+    mean, std, _ = bound.predict(random_states(scene, BATCH), action.unsqueeze(1))
+    for value in (mean, std):
+        (gradient,) = torch.autograd.grad(value.sum(), action, retain_graph=True)
+        assert gradient.isfinite().all() and gradient.norm() > 0
+
+
+def test_specialised_members_predict_the_same(scenes, make_ensemble, random_states, random_actions):
+    scene = scenes["cheetah"]
+    bound = calibrated(make_ensemble()).bind(scene)
+    quick = specialize(bound, executor="eager")
+    state, actions = random_states(scene, BATCH), random_actions(scene, BATCH).unsqueeze(1)
+    assert isinstance(quick, BoundEnsemble)
+    for one, other in zip(quick.predict(state, actions), bound.predict(state, actions), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    with pytest.raises(TypeError, match="takes a bound model"):
+        specialize(quick)
+
+
+def test_what_is_not_calibrated_says_so(scenes, make_ensemble, random_states, random_actions):
+    scene = scenes["cheetah"]
+    with pytest.raises(RuntimeError, match="not calibrated.*calibrate"):
+        make_ensemble().bind(scene).predict(random_states(scene), random_actions(scene).unsqueeze(0))
+
+
+def test_members_must_be_alike(scenes):
+    models = [ForwardModel.for_scene(scenes["pendulum"], hidden=hidden) for hidden in (8, 16)]
+    with pytest.raises(ValueError, match="same options"):
+        Ensemble(models)
+    with pytest.raises(ValueError, match="two members or more, not 1"):
+        Ensemble(models[:1])
+    with pytest.raises(ValueError, match="no hidden state"):
+        Ensemble.for_scene(scenes["pendulum"], count=2, core="recurrent", **SMALL).bind(scenes["pendulum"])
+    made = Ensemble.for_scene("pendulum", **SMALL)
+    first, second = (next(model.core.parameters()) for model in made.models[:2])
+    assert len(made.models) == 5 and not torch.equal(first, second)
+
+
+def test_checkpoints_hold_ensembles(scenes, make_ensemble, random_states, random_actions, tmp_path):
+    scene, path = scenes["cheetah"], tmp_path / "ensemble.safetensors"
+    ensemble = calibrated(make_ensemble(), STEPS)
+    save_checkpoint(path, ensemble, scene=scene)
+    checkpoint = load_pretrained(path)
+    state, actions = random_states(scene, BATCH), random_actions(scene, BATCH).unsqueeze(1)
+    found = checkpoint.ensemble.bind(checkpoint.scene()).predict(state, actions)
+    for one, other in zip(found, ensemble.bind(scene).predict(state, actions), strict=True):
+        assert torch.equal(one, other)
+    with pytest.raises(CheckpointError, match="Ensemble, no ForwardModel"):
+        _ = checkpoint.model
+    description = ensemble.description()
+    assert Ensemble.from_description(description).description() == description

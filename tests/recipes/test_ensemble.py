@@ -1,0 +1,34 @@
+"""The recipe that trains, calibrates and tests an ensemble."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+SMALL = (
+    "system=pendulum",
+    "members=2",
+    "steps=5",
+    "hidden=8",
+    "data={train: 20, calibration: 20, test: 10, other: 10}",
+)
+
+
+@pytest.mark.slow
+def test_coverage_is_measured_and_the_ensemble_kept(call, tmp_path):
+    run = tmp_path / "run"
+    code, output, errors = call(*SMALL, "data.length=12", "horizons=[1,12]", f"run_dir={run}", recipe="ensemble")
+    assert code == 0, errors
+    assert output.count("within 1 / 2 std") == 2 and "control that changes 3 times as slowly" in output
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["steps"] == 10 and all(
+        0 <= metrics[f"{split}/one_12/orientation"] <= 1 for split in ("test", "other")
+    )
+    assert (run / "prediction.png").is_file() and (run / "checkpoint" / "checkpoint.safetensors").is_file()
+
+
+def test_horizons_fit_the_trajectories(call, tmp_path):
+    code, output, errors = call(*SMALL, "data.length=50", f"run_dir={tmp_path / 'run'}", recipe="ensemble")
+    assert code == 1 and "horizons=[1, 10, 50, 100] must be up to data.length=50" in output + errors
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,215 @@
+"""Ensembles: forward models that differ in their weights alone, and how sure they are together."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_gn.dynamics.model import ForwardModel
+from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.precision import without_autocast
+from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.scenes import KinematicTree, Scene
+from torchrl_gn.scenes.load import as_scene
+
+
+class Calibration(Float64Buffers):
+    """Standard deviations from the spread of an ensemble's members.
+
+    After ``t`` steps that of a channel is ``factor[t] * sqrt(spread ** 2 + floor[t] ** 2)``; after more steps than were
+    fitted, with the last numbers. :func:`~torchrl_gn.evaluation.calibrate` fits them.
+
+    Args:
+        steps: number of steps ``T`` that it has numbers for; 0: not fitted.
+        components: number of components of the state ``C``.
+    """
+
+    factor: Tensor  # [T, C]
+    floor: Tensor  # [T, C], in the components' units
+
+    def __init__(self, steps: int, components: int) -> None:
+        super().__init__()
+        self.register_buffer("factor", torch.zeros(steps, components, dtype=torch.float64))
+        self.register_buffer("floor", torch.zeros(steps, components, dtype=torch.float64))
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there are numbers for any step."""
+        return len(self.factor) > 0
+
+    def set(self, factor: Tensor, floor: Tensor) -> None:
+        """Take numbers ``[T, C]``, for any number of steps."""
+        self.factor, self.floor = (each.double().to(self.factor.device) for each in (factor, floor))
+
+    def forward(self, spread: Tensor, layout: StateLayout) -> Tensor:
+        """Standard deviations ``[*B, T, N, D]`` of the spread after steps 1 to T; RuntimeError before it is fitted.
+
+        Of channels that cannot move they are meaningless.
+        """
+        if not self.fitted:
+            raise RuntimeError(
+                "The ensemble is not calibrated: its members' spread is several times smaller than their error. Call"
+                " torchrl_gn.evaluation.calibrate(ensemble, trajectories) with trajectories of no member's training."
+            )
+        step = torch.arange(spread.shape[-3], device=spread.device).clamp(max=len(self.factor) - 1)
+        parts = []
+        for index, (_, where) in enumerate(layout.delta_slices.items()):
+            factor, floor = (each[step, index].view(-1, 1, 1) for each in (self.factor, self.floor))
+            parts.append(factor * (spread[..., where].square() + floor.square()).sqrt())
+        return torch.cat(parts, dim=-1)
+
+
+class Prediction(NamedTuple):
+    """What an ensemble predicts."""
+
+    mean: Tensor  # [*B, T + 1, N, 13]; the start state comes first
+    std: Tensor  # [*B, T + 1, N, 12] standard deviation of the error: m, rad, m/s, rad/s; inf where a member diverged
+    members: Tensor  # [K, *B, T + 1, N, 13] what each member predicts
+
+
+class Ensemble(nn.Module):
+    """Forward models of one scene that differ in their weights alone (Lakshminarayanan et al. 2017; PETS 2018).
+
+    Where members disagree, none of them is to be trusted. :func:`~torchrl_gn.training.fit_ensemble` trains them, each
+    from weights and batches of its own; :func:`~torchrl_gn.evaluation.calibrate` finds how large errors are where they
+    disagree. Beyond the paper.
+
+    Args:
+        members: two models or more, of the same options.
+
+    Raises:
+        ValueError: if there are fewer, or options differ.
+    """
+
+    def __init__(self, members: Sequence[ForwardModel]) -> None:
+        super().__init__()
+        if len(members) < 2:
+            raise ValueError(f"An ensemble needs two members or more, not {len(members)}.")
+        first = members[0].description()
+        if any(member.description() != first for member in members):
+            raise ValueError("The members of an ensemble must have the same options.")
+        self.members = nn.ModuleList(members)
+        self.calibration = Calibration(0, len(members[0].layout.names))
+
+    @classmethod
+    def for_scene(cls, scene: Scene | KinematicTree | str | os.PathLike, *, count: int = 5, **options) -> Ensemble:
+        """An ensemble with fresh weights, drawn from torch's global generator.
+
+        Args:
+            count: number of members ``K``.
+            **options: of :meth:`ForwardModel.for_scene`.
+        """
+        given = as_scene(scene)
+        return cls([ForwardModel.for_scene(given, **options) for _ in range(count)])
+
+    @property
+    def models(self) -> list[ForwardModel]:
+        """The members."""
+        return list(self.members)  # pyright: ignore[reportReturnType]
+
+    def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundEnsemble:
+        """Join the members to a scene, or that of a name or path; ``options`` of :meth:`ForwardModel.bind`."""
+        known = as_scene(scene)
+        return BoundEnsemble([model.bind(known, **options) for model in self.models], self.calibration)
+
+    def description(self) -> dict:
+        """Plain, JSON-able values for :meth:`from_description`."""
+        model = self.models[0].description()
+        return {"count": len(self.members), "steps": len(self.calibration.factor), "member": model}
+
+    @classmethod
+    def from_description(
+        cls, description: dict, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
+    ) -> Ensemble:
+        """Build the ensemble of a :meth:`description`, with fresh weights, as :meth:`ForwardModel.from_description`."""
+        member = description["member"]
+        made = cls([ForwardModel.from_description(member, physics=physics) for _ in range(description["count"])])
+        made.calibration = Calibration(description["steps"], len(made.models[0].layout.names))
+        return made
+
+
+class BoundEnsemble(TensorDictModuleBase):
+    """Predict the next state of one scene, and how far off that may be.
+
+    Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes the members' mean to ``("next", "state")`` and
+    the standard deviation of its error ``[*B, N, 12]`` to ``("next", "state_std")``. Differentiable, as its members
+    are.
+
+    Args:
+        predictors: the members, bound to one scene or specialised.
+        calibration: of the ensemble.
+
+    Raises:
+        ValueError: if members have hidden states or parameters of each sample.
+    """
+
+    def __init__(self, predictors: Sequence[Predictor], calibration: Calibration) -> None:
+        super().__init__()
+        if any(each.recurrent or each.parameters_key is not None for each in predictors):
+            raise ValueError("Members of an ensemble have no hidden state, and no parameters of each sample.")
+        self.predictors = nn.ModuleList(predictors)
+        self.calibration = calibration
+        self.scene, self.layout = predictors[0].scene, predictors[0].layout
+        self.in_keys: list[NestedKey] = list(predictors[0].in_keys)
+        self.out_keys: list[NestedKey] = [*predictors[0].out_keys, ("next", "state_std")]
+
+    @property
+    def members(self) -> list[Predictor]:
+        """The members."""
+        return list(self.predictors)  # pyright: ignore[reportReturnType]
+
+    def step(self, state: Tensor, action: Tensor) -> Tensor:
+        """Each member's next state ``[K, *B, N, 13]``."""
+        return torch.stack([each.step(state, action)[0] for each in self.members])
+
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """Each member's states ``[K, *B, T + 1, N, 13]`` from one start state under actions ``[*B, T, A]``."""
+        return torch.stack([each.rollout(state, actions)[0] for each in self.members])
+
+    @without_autocast
+    def predict(self, state: Tensor, actions: Tensor) -> Prediction:
+        """Mean, standard deviation and members of rollouts from ``state`` ``[*B, N, 13]``, ``actions`` ``[*B, T, A]``.
+
+        RuntimeError if the ensemble is not calibrated.
+        """
+        members = self.rollout(state, actions)
+        mean, spread = mean_and_spread(members, self.layout)
+        std = self.calibration(spread[..., 1:, :, :], self.layout)
+        std = torch.where(torch.as_tensor(self.scene.movable, device=std.device), std, 0.0)
+        return Prediction(mean, torch.cat((torch.zeros_like(std[..., :1, :, :]), std), dim=-3), members)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the mean of the next states and its standard deviation."""
+        state, action = (tensordict[key] for key in self.in_keys[:2])
+        mean, std, _ = self.predict(state, action.unsqueeze(-2))
+        tensordict.set(self.out_keys[0], mean[..., 1, :, :])
+        return tensordict.set(self.out_keys[1], std[..., 1, :, :])
+
+
+def mean_and_spread(members: Tensor, layout: StateLayout) -> tuple[Tensor, Tensor]:
+    """Mean ``[*B, N, C]`` of states ``[K, *B, N, C]``, and the standard deviation ``[*B, N, D]`` of the members.
+
+    Rotations are averaged as rotation vectors about their mean. Where a member's state is not finite, the mean is that
+    of the others, or NaN without others, and the spread infinite.
+    """
+    finite = members.isfinite().flatten(-2).all(-1)[..., None, None]
+    count = finite.sum(0)
+    # Any finite member is near enough to their mean to begin with.
+    first = finite.to(torch.uint8).argmax(0, keepdim=True)
+    mean = members.gather(0, first.expand_as(members[:1])).squeeze(0)
+    for _ in range(2):
+        change = torch.where(finite, layout.delta(mean, torch.where(finite, members, mean)), 0.0)
+        mean = layout.apply(mean, change.sum(0) / count)
+    change = torch.where(finite, layout.delta(mean, torch.where(finite, members, mean)), 0.0)
+    variance = change.square().sum(0) / (count - 1).clamp(min=1)
+    # The gradient of a root is infinite at 0, in channels that cannot move.
+    spread = torch.where(variance > 0, torch.where(variance > 0, variance, 1.0).sqrt(), 0.0)
+    return mean, torch.where(count == len(members), spread, torch.inf)

@@ -1,0 +1,146 @@
+"""Fit how large an ensemble's errors are where its members disagree, and measure whether that holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread
+from torchrl_gn.evaluation.errors import fixed_components
+
+COVERAGE_HORIZONS = (1, 10, 50, 100)  # steps after which coverage is measured by default
+_CANDIDATES = 21  # factors that are tried
+_ONE, _TWO = 0.6827, 0.9545  # shares of a normal distribution within one and two standard deviations
+
+
+@torch.no_grad()
+def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
+    """Fit an ensemble's standard deviations, in place, to rollouts from the trajectories' first states.
+
+    For every component and step, the floor is the median spread of the members, so that where they agree by chance
+    errors do not count as nothing; the factor is such that one and two standard deviations hold the shares of a normal
+    distribution as nearly as one number allows (scaling; Kuleshov et al. 2018 fit a curve). An ensemble specialised
+    before shares it.
+
+    Args:
+        ensemble: bound to the scene, or specialised.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``, with which no member was
+            trained: some 100 or more.
+
+    Raises:
+        ValueError: if all rollouts diverge. Where some do, the standard deviation is infinite anyway.
+    """
+    error, spread, movable = _errors(ensemble, trajectories)
+    layout, steps = ensemble.layout, error.shape[1]
+    factor, floor = (torch.zeros(steps, len(layout.names), dtype=torch.float64) for _ in range(2))
+    for index, where in enumerate(layout.delta_slices.values()):
+        moves = movable[:, where]
+        for step in range(steps) if moves.any() else ():
+            wrong, between = (each[:, step, :, where][:, moves].flatten() for each in (error, spread))
+            finite = between.isfinite()
+            if not finite.any():
+                raise ValueError(f"All rollouts diverge by step {step + 1}: train the members for longer.")
+            floor[step, index] = between[finite].median()
+            size = (between.square() + floor[step, index].square()).sqrt()
+            ratio = torch.where(size > 0, wrong / size, 0.0)[finite]
+            factor[step, index] = _factor(ratio)
+    ensemble.calibration.set(factor, floor)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Whether standard deviations are what they say, by component and number of steps."""
+
+    names: tuple[str, ...]  # components that can move
+    horizons: tuple[int, ...]  # numbers of steps
+    one: Tensor  # [H, C] share of errors within one standard deviation; 0.68 of a normal distribution
+    two: Tensor  # [H, C] within two; 0.95
+    sharpness: Tensor  # [H, C] root mean square of the standard deviation by that of the error; near 1
+    rank: Tensor  # [H, C] rank correlation of standard deviation and size of the error, over rollouts
+
+    def to_metrics(self) -> dict[str, float]:
+        """Numbers by ``<measure>_<steps>/<component>``."""
+        kinds = {"one": self.one, "two": self.two, "sharpness": self.sharpness, "rank": self.rank}
+        return {
+            f"{kind}_{steps}/{name}": values[row, column].item()
+            for kind, values in kinds.items()
+            for row, steps in enumerate(self.horizons)
+            for column, name in enumerate(self.names)
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{'within 1 / 2 std':22}" + "".join(f"{f'after {steps}':>16}" for steps in self.horizons)]
+        for column, name in enumerate(self.names):
+            cells = [f"{self.one[row, column]:.2f} / {self.two[row, column]:.2f}" for row in range(len(self.horizons))]
+            lines.append(f"{name:22}" + "".join(f"{cell:>16}" for cell in cells))
+        return "\n".join(lines)
+
+
+@torch.no_grad()
+def evaluate_coverage(
+    ensemble: BoundEnsemble, trajectories: TensorDictBase, *, horizons: Sequence[int] = COVERAGE_HORIZONS
+) -> Coverage:
+    """Measure how many errors lie within the stated standard deviations, in rollouts from the first states.
+
+    Args:
+        ensemble: calibrated.
+        trajectories: ``[M]``, neither of the training nor of the calibration.
+        horizons: numbers of steps, each up to the trajectories' length.
+
+    Raises:
+        RuntimeError: if the ensemble is not calibrated.
+        ValueError: if a horizon is longer than the trajectories.
+    """
+    error, spread, movable = _errors(ensemble, trajectories)
+    layout, horizons = ensemble.layout, tuple(sorted({int(each) for each in horizons}))
+    if not horizons or horizons[0] < 1 or horizons[-1] > error.shape[1]:
+        raise ValueError(f"horizons={list(horizons)} must be from 1 to the trajectories' {error.shape[1]} steps.")
+    std = ensemble.calibration(spread, layout)
+    fixed = fixed_components(ensemble.scene, layout)
+    names = tuple(name for name in layout.names if name not in fixed)
+    rows = torch.tensor(horizons) - 1
+    found = torch.zeros(4, len(horizons), len(names), dtype=torch.float64)
+    for column, name in enumerate(names):
+        where = layout.delta_slices[name]
+        moves = movable[:, where]
+        wrong, stated = (each[:, rows][..., where][..., moves] for each in (error, std))  # [M, H, channels]
+        # A diverged rollout states that its error may be anything: nothing is gained by it.
+        known = stated.isfinite()
+        found[0, :, column] = (known & (wrong <= stated)).double().mean((0, 2))
+        found[1, :, column] = (known & (wrong <= 2 * stated)).double().mean((0, 2))
+        sizes = [each.square().mean((0, 2)).sqrt() for each in (stated, wrong)]
+        found[2, :, column] = sizes[0] / sizes[1]
+        whole = [each.square().mean(-1) for each in (stated, wrong)]  # [M, H]
+        found[3, :, column] = torch.stack(
+            [_rank_correlation(*(each[:, row] for each in whole)) for row in range(len(rows))]
+        )
+    return Coverage(names, horizons, *found)
+
+
+def _errors(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    """Size of the mean's error and the members' spread ``[M, T, N, 12]``, and which channels ``[N, 12]`` count."""
+    state, action = trajectories["state"], trajectories["action"]
+    mean, spread = mean_and_spread(ensemble.rollout(state[:, 0], action), ensemble.layout)
+    error = ensemble.layout.delta(mean, state).abs()
+    movable = torch.as_tensor(ensemble.scene.movable & np.asarray(ensemble.scene.predicted)[:, None])
+    return error[:, 1:].double(), spread[:, 1:].double(), movable
+
+
+def _factor(ratios: Tensor) -> Tensor:
+    """The number within one and two of which the shares of ratios are nearest to a normal distribution's."""
+    one, two = (ratios.kthvalue(max(1, round(share * len(ratios)))).values for share in (_ONE, _TWO))
+    # Either gives one share: tails decide what lies between.
+    candidates = torch.lerp(one, two / 2, torch.linspace(0, 1, _CANDIDATES, dtype=ratios.dtype)).unsqueeze(-1)
+    off = [((ratios <= many * candidates).double().mean(-1) - share).abs() for many, share in ((1, _ONE), (2, _TWO))]
+    return candidates[torch.maximum(*off).argmin()].squeeze(-1)
+
+
+def _rank_correlation(a: Tensor, b: Tensor) -> Tensor:
+    """Spearman's correlation of two lists."""
+    ranks = torch.stack([each.argsort().argsort().double() for each in (a, b)])
+    return torch.corrcoef(ranks)[0, 1].nan_to_num(0.0)
