@@ -29,7 +29,7 @@ def calibrated(ensemble: Ensemble, steps: int = 1) -> Ensemble:
     """With factors of 2, 3, ... and floors of 0.01."""
     count = len(BODY_STATE.names)
     factor = torch.arange(2.0, 2 + steps).unsqueeze(-1).expand(-1, count)
-    ensemble.calibration.set(factor, torch.full((steps, count), 0.01))
+    ensemble.calibration.set(factor, torch.full((steps, count), 0.01), torch.ones(count))
     return ensemble
 
 
@@ -73,6 +73,19 @@ def test_it_predicts_the_members_and_how_far_off_they_may_be(scenes, make_ensemb
     entries = bound(TensorDict({"state": state, "action": actions[:, 0]}, [BATCH]))
     torch.testing.assert_close(entries["next", "state"], mean[:, 1])
     torch.testing.assert_close(entries["next", "state_std"], std[:, 1])
+
+
+def test_doubt_is_the_expected_error_by_the_usual_one(scenes, make_ensemble, random_states, random_actions):
+    scene, ensemble = scenes["cheetah"], calibrated(make_ensemble())
+    usual = torch.tensor([0.5, 1.0, 2.0, 0.0])  # the last component counts as fixed
+    ensemble.calibration.set(ensemble.calibration.factor, ensemble.calibration.floor, usual)
+    bound, state, action = ensemble.bind(scene), random_states(scene, BATCH), random_actions(scene, BATCH)
+    std, moves = bound.predict(state, action.unsqueeze(1)).std[:, 1], torch.as_tensor(scene.movable)
+    parts = [std[..., where][:, moves[:, where]].square().mean(-1) for where in scene.layout.delta_slices.values()]
+    wanted = torch.stack([part / by**2 for part, by in zip(parts[:3], usual, strict=False)]).mean(0).sqrt()
+    torch.testing.assert_close(bound.doubt(state, action), wanted)
+    state[1, 2, 8] = torch.nan
+    assert not bound.doubt(state, action)[1].isfinite() and bound.doubt(state, action)[0].isfinite()
 
 
 def test_gradients_pass_through_the_mean_and_its_standard_deviation(

@@ -19,9 +19,11 @@ STEPS = 4
 class Drawn(BoundEnsemble):
     """Members that err at random: by a common and an own part, whose sizes are told only by what the members share."""
 
-    def __init__(self, ensemble: Ensemble, scene, truth: torch.Tensor, common: float, diverges: int = 0) -> None:
+    def __init__(
+        self, ensemble: Ensemble, scene, truth: torch.Tensor, common: float, diverges: int = 0, wild: float = 1
+    ) -> None:
         super().__init__(ensemble.bind(scene).members, ensemble.calibration)
-        self.truth, self.common, self.diverges = truth, common, diverges
+        self.truth, self.common, self.diverges, self.wild = truth, common, diverges, wild
 
     def rollout(self, state, actions):
         generator, count = torch.Generator().manual_seed(len(actions)), len(self.members)
@@ -34,6 +36,12 @@ class Drawn(BoundEnsemble):
         members[0, : self.diverges, 2:] = torch.nan
         return members
 
+    def step(self, state, action):
+        generator, count = torch.Generator().manual_seed(len(action)), len(self.members)
+        size = self.wild * 0.02 * torch.exp(torch.randn(len(state), 1, 1, generator=generator)).double()
+        own = torch.randn(count, *state.shape[:-1], 12, generator=generator).double()
+        return self.layout.apply(state.expand(count, *state.shape), size * own * torch.as_tensor(self.scene.movable))
+
 
 @pytest.fixture
 def draw(scenes, make_model):
@@ -41,10 +49,12 @@ def draw(scenes, make_model):
     scene = scenes["cheetah"]
     made = Ensemble([make_model(scene, seed=seed) for seed in range(5)])
 
-    def draw(count: int, common: float = 0.5, diverges: int = 0):
+    def draw(count: int, common: float = 0.5, diverges: int = 0, wild: float = 1):
         truth = torch.as_tensor(scene.reference_state).expand(count, STEPS + 1, -1, -1).clone()
         action = torch.zeros(count, STEPS, scene.num_actions, dtype=torch.float64)
-        return Drawn(made, scene, truth, common, diverges), TensorDict({"state": truth, "action": action}, [count])
+        return Drawn(made, scene, truth, common, diverges, wild), TensorDict(
+            {"state": truth, "action": action}, [count]
+        )
 
     return draw
 
@@ -58,6 +68,13 @@ def test_calibrated_standard_deviations_hold_what_they_say(draw, common):
     assert found.rank.min() > 0.7 and found.horizons == (1, 4)
     assert found.names == ("position", "orientation", "linear_velocity", "angular_velocity")
     assert ((found.sharpness > 0.4) & (found.sharpness < 2)).all()
+
+
+def test_doubt_is_one_where_it_was_calibrated(draw):
+    calibrate(*draw(300))
+    usual, wild = (evaluate_coverage(*draw(301, wild=wild), horizons=(1,)) for wild in (1, 10))
+    assert usual.doubt == pytest.approx(1, abs=0.2) and 5 < wild.doubt < 10.5  # the floor is part of it
+    assert usual.doubt_rank > 0.7 and wild.doubt_rank > 0.7
 
 
 def test_rollouts_that_diverge_do_not_make_all_others_uncertain(draw):
@@ -80,7 +97,7 @@ def test_numbers_and_table(draw):
     calibrate(ensemble, trajectories)
     found = evaluate_coverage(ensemble, trajectories, horizons=(1, 4))
     metrics = found.to_metrics()
-    assert metrics["one_4/orientation"] == found.one[1, 1].item() and len(metrics) == 4 * 2 * 4
+    assert metrics["one_4/orientation"] == found.one[1, 1].item() and len(metrics) == 4 * 2 * 4 + 2
     assert str(found).splitlines()[2].startswith("orientation") and "after 4" in str(found)
     for wrong in ((0, 1), (5,), ()):
         with pytest.raises(ValueError, match="horizons="):

@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.dynamics import Ensemble, ForwardModel
 from torchrl_gn.dynamics.mujoco_physics import MujocoPhysics
 from torchrl_gn.planners import StateValue
 from torchrl_gn.policies import Agent
@@ -42,6 +42,7 @@ def originals(tmp_path_factory) -> dict[str, tuple[dict, dict]]:
     small = {"hidden": 8, "layers": 1}
     models = {
         "model": ForwardModel.for_scene(scene, **small),
+        "ensemble": Ensemble.for_scene(scene, count=2, **small),
         "physics": ForwardModel.for_scene(scene, physics=MujocoPhysics(scene), **small),
         "agent": Agent(ObservationGraph.swimmer(3), hidden=(8,)),
         "value": StateValue(scene, hidden=[8]),
@@ -116,6 +117,10 @@ FORGED = [
         "too large for a network",
     ),
     ("wide value", "value", model(hidden=[20_000, 20_000]), "far larger network than"),
+    ("members without end", "ensemble", model(count=99_000), "far larger network than"),
+    ("one member", "ensemble", model(count=1), "two members or more, not 1"),
+    ("steps without end", "ensemble", model(steps=99_000_000), "too large for a network"),
+    ("steps more", "ensemble", model(steps=900), "forged"),
     ("ensemble without end", "value", model(members=99_000), "larger network|forged"),
     ("function that is not given", "physics", model(physics={"function": "os:system"}), "a function that a checkpoint"),
     ("physics of nothing", "physics", model(physics={}), "forged"),

@@ -34,20 +34,23 @@ class Calibration(Float64Buffers):
 
     factor: Tensor  # [T, C]
     floor: Tensor  # [T, C], in the components' units
+    typical: Tensor  # [C], root mean square of one step's standard deviations over data; 0 of components that are fixed
 
     def __init__(self, steps: int, components: int) -> None:
         super().__init__()
         self.register_buffer("factor", torch.zeros(steps, components, dtype=torch.float64))
         self.register_buffer("floor", torch.zeros(steps, components, dtype=torch.float64))
+        self.register_buffer("typical", torch.zeros(components, dtype=torch.float64))
 
     @property
     def fitted(self) -> bool:
         """Whether there are numbers for any step."""
         return len(self.factor) > 0
 
-    def set(self, factor: Tensor, floor: Tensor) -> None:
-        """Take numbers ``[T, C]``, for any number of steps."""
-        self.factor, self.floor = (each.double().to(self.factor.device) for each in (factor, floor))
+    def set(self, factor: Tensor, floor: Tensor, typical: Tensor) -> None:
+        """Take numbers ``[T, C]``, for any number of steps, and ``[C]``."""
+        given = (each.double().to(self.factor.device) for each in (factor, floor, typical))
+        self.factor, self.floor, self.typical = given
 
     def forward(self, spread: Tensor, layout: StateLayout) -> Tensor:
         """Standard deviations ``[*B, T, N, D]`` of the spread after steps 1 to T; RuntimeError before it is fitted.
@@ -175,6 +178,19 @@ class BoundEnsemble(TensorDictModuleBase):
         return torch.stack([each.rollout(state, actions)[0] for each in self.members])
 
     @without_autocast
+    def doubt(self, state: Tensor, action: Tensor) -> Tensor:
+        """Expected error of the next step, by what is usual in the calibration's data, ``[*B]``.
+
+        1: as there; 10: ten times as far off. The root mean square, over the components that move, of their standard
+        deviations by the usual ones; infinite if a member is not finite. As cheap as a step of each member.
+        RuntimeError if the ensemble is not calibrated.
+        """
+        _, spread = mean_and_spread(self.step(state, action), self.layout)
+        std = self.calibration(spread.unsqueeze(-3), self.layout).squeeze(-3)
+        ratios = mean_squares(std, self.scene, self.layout) / self.calibration.typical.square()
+        return ratios[..., self.calibration.typical > 0].mean(-1).sqrt()
+
+    @without_autocast
     def predict(self, state: Tensor, actions: Tensor) -> Prediction:
         """Mean, standard deviation and members of rollouts from ``state`` ``[*B, N, 13]``, ``actions`` ``[*B, T, A]``.
 
@@ -192,6 +208,16 @@ class BoundEnsemble(TensorDictModuleBase):
         mean, std, _ = self.predict(state, action.unsqueeze(-2))
         tensordict.set(self.out_keys[0], mean[..., 1, :, :])
         return tensordict.set(self.out_keys[1], std[..., 1, :, :])
+
+
+def mean_squares(values: Tensor, scene: Scene, layout: StateLayout) -> Tensor:
+    """Mean square ``[*B, C]`` of each component of values ``[*B, N, D]``, over the channels that can move."""
+    moves = torch.as_tensor(scene.movable & scene.predicted[:, None], device=values.device)
+    squares = torch.where(moves, values.square(), 0.0)
+    parts = [
+        squares[..., where].sum((-1, -2)) / moves[:, where].sum().clamp(min=1) for where in layout.delta_slices.values()
+    ]
+    return torch.stack(parts, dim=-1)
 
 
 def mean_and_spread(members: Tensor, layout: StateLayout) -> tuple[Tensor, Tensor]:

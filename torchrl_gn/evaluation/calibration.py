@@ -10,11 +10,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread
+from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
 from torchrl_gn.evaluation.errors import fixed_components
 
 COVERAGE_HORIZONS = (1, 10, 50, 100)  # steps after which coverage is measured by default
 _CANDIDATES = 21  # factors that are tried
+_STATES = 5_000  # about so many, whose next step is looked at
 _ONE, _TWO = 0.6827, 0.9545  # shares of a normal distribution within one and two standard deviations
 
 
@@ -49,7 +50,11 @@ def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
             size = (between.square() + floor[step, index].square()).sqrt()
             ratio = torch.where(size > 0, wrong / size, 0.0)[finite]
             factor[step, index] = _factor(ratio)
-    ensemble.calibration.set(factor, floor)
+    ensemble.calibration.set(factor, floor, torch.zeros(len(layout.names)))
+    names, fixed = layout.names, fixed_components(ensemble.scene, layout)
+    typical = _one_step(ensemble, trajectories)[0].mean(0).sqrt()
+    typical[[index for index, name in enumerate(names) if name in fixed]] = 0
+    ensemble.calibration.set(factor, floor, typical)
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,8 @@ class Coverage:
     two: Tensor  # [H, C] within two; 0.95
     sharpness: Tensor  # [H, C] root mean square of the standard deviation by that of the error; near 1
     rank: Tensor  # [H, C] rank correlation of standard deviation and size of the error, over rollouts
+    doubt: Tensor  # [] mean of BoundEnsemble.doubt over the trajectories' states; 1 of the calibration's
+    doubt_rank: Tensor  # [] rank correlation of that and the true error of the next step
 
     def to_metrics(self) -> dict[str, float]:
         """Numbers by ``<measure>_<steps>/<component>``."""
@@ -71,14 +78,17 @@ class Coverage:
             for kind, values in kinds.items()
             for row, steps in enumerate(self.horizons)
             for column, name in enumerate(self.names)
-        }
+        } | {"doubt": self.doubt.item(), "doubt_rank": self.doubt_rank.item()}
 
     def __str__(self) -> str:
         lines = [f"{'within 1 / 2 std':22}" + "".join(f"{f'after {steps}':>16}" for steps in self.horizons)]
         for column, name in enumerate(self.names):
             cells = [f"{self.one[row, column]:.2f} / {self.two[row, column]:.2f}" for row in range(len(self.horizons))]
             lines.append(f"{name:22}" + "".join(f"{cell:>16}" for cell in cells))
-        return "\n".join(lines)
+        doubt = (
+            f"doubt {self.doubt:.2f} (1: as in the calibration's data), rank correlation with the true error of a step"
+        )
+        return "\n".join([*lines, f"{doubt} {self.doubt_rank:.2f}"])
 
 
 @torch.no_grad()
@@ -119,7 +129,11 @@ def evaluate_coverage(
         found[3, :, column] = torch.stack(
             [_rank_correlation(*(each[:, row] for each in whole)) for row in range(len(rows))]
         )
-    return Coverage(names, horizons, *found)
+    stated, wrong = _one_step(ensemble, trajectories)
+    typical = ensemble.calibration.typical
+    moving = typical > 0
+    doubt, true = ((each[:, moving] / typical[moving].square()).mean(-1).sqrt() for each in (stated, wrong))
+    return Coverage(names, horizons, *found, doubt.square().mean().sqrt(), _rank_correlation(doubt, true))
 
 
 def _errors(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -129,6 +143,20 @@ def _errors(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tens
     error = ensemble.layout.delta(mean, state).abs()
     movable = torch.as_tensor(ensemble.scene.movable & np.asarray(ensemble.scene.predicted)[:, None])
     return error[:, 1:].double(), spread[:, 1:].double(), movable
+
+
+def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Mean squares ``[S, C]`` of a step's standard deviations and of its errors, at states spread over trajectories."""
+    state, action = trajectories["state"], trajectories["action"]
+    before, after, given = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1), action.flatten(0, 1)
+    some = slice(None, None, max(1, len(before) // _STATES))
+    before, after, given = before[some], after[some], given[some]
+    mean, spread = mean_and_spread(ensemble.step(before, given), ensemble.layout)
+    std = ensemble.calibration(spread.unsqueeze(-3), ensemble.layout).squeeze(-3)
+    error = ensemble.layout.delta(mean, after)
+    known = std.isfinite().flatten(1).all(1)
+    stated, wrong = (mean_squares(each[known].double(), ensemble.scene, ensemble.layout) for each in (std, error))
+    return stated, wrong
 
 
 def _factor(ratios: Tensor) -> Tensor:
