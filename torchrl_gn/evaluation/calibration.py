@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -133,7 +134,9 @@ def evaluate_coverage(
     typical = ensemble.calibration.typical
     moving = typical > 0
     doubt, true = ((each[:, moving] / typical[moving].square()).mean(-1).sqrt() for each in (stated, wrong))
-    return Coverage(names, horizons, *found, doubt.square().mean().sqrt(), _rank_correlation(doubt, true))
+    one, two, sharpness, rank = found
+    usual, doubt_rank = doubt.square().mean().sqrt(), _rank_correlation(doubt, true)
+    return Coverage(names, horizons, one, two, sharpness, rank, usual, doubt_rank)
 
 
 def _errors(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -147,7 +150,7 @@ def _errors(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tens
 
 def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Mean squares ``[S, C]`` of a step's standard deviations and of its errors, at states spread over trajectories."""
-    state, action = trajectories["state"], trajectories["action"]
+    state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
     before, after, given = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1), action.flatten(0, 1)
     some = slice(None, None, max(1, len(before) // _STATES))
     before, after, given = before[some], after[some], given[some]
