@@ -64,10 +64,15 @@ class Calibration(Float64Buffers):
             )
         step = torch.arange(spread.shape[-3], device=spread.device).clamp(max=len(self.factor) - 1)
         parts = []
-        for index, (_, where) in enumerate(layout.delta_slices.items()):
+        for index, where in enumerate(layout.delta_slices.values()):
             factor, floor = (each[step, index].view(-1, 1, 1) for each in (self.factor, self.floor))
             parts.append(factor * (spread[..., where].square() + floor.square()).sqrt())
         return torch.cat(parts, dim=-1)
+
+    def by_typical(self, squares: Tensor) -> Tensor:
+        """Root mean square ``[*B]``, over the components that move, of mean squares ``[*B, C]`` by the typical ones."""
+        moving = self.typical > 0
+        return (squares[..., moving] / self.typical[moving].square()).mean(-1).sqrt()
 
 
 class Prediction(NamedTuple):
@@ -187,8 +192,7 @@ class BoundEnsemble(TensorDictModuleBase):
         """
         _, spread = mean_and_spread(self.step(state, action), self.layout)
         std = self.calibration(spread.unsqueeze(-3), self.layout).squeeze(-3)
-        ratios = mean_squares(std, self.scene, self.layout) / self.calibration.typical.square()
-        return ratios[..., self.calibration.typical > 0].mean(-1).sqrt()
+        return self.calibration.by_typical(mean_squares(std, self.scene, self.layout))
 
     @without_autocast
     def predict(self, state: Tensor, actions: Tensor) -> Prediction:

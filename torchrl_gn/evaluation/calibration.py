@@ -130,10 +130,7 @@ def evaluate_coverage(
         found[3, :, column] = torch.stack(
             [_rank_correlation(*(each[:, row] for each in whole)) for row in range(len(rows))]
         )
-    stated, wrong = _one_step(ensemble, trajectories)
-    typical = ensemble.calibration.typical
-    moving = typical > 0
-    doubt, true = ((each[:, moving] / typical[moving].square()).mean(-1).sqrt() for each in (stated, wrong))
+    doubt, true = map(ensemble.calibration.by_typical, _one_step(ensemble, trajectories))
     one, two, sharpness, rank = found
     usual, doubt_rank = doubt.square().mean().sqrt(), _rank_correlation(doubt, true)
     return Coverage(names, horizons, one, two, sharpness, rank, usual, doubt_rank)
