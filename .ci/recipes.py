@@ -87,6 +87,9 @@ real_robot steps=5 simulated.episodes=40 run_dir=runs/real_robot
 ensemble system=pendulum members=2 steps=5 hidden=8 data.train=20 data.calibration=20 data.test=10 data.other=10
     run_dir=runs/ensemble
 
+pessimism system=pendulum reward=balance members=2 hidden=8 train_steps=5 "data={{trajectories: 20, length: 10}}"
+    horizon=4 steps=6 episodes=2 "gn={{iterations: 1, warm_up: 1, samples: 2}}" run_dir=runs/pessimism
+
 contacts steps=5 "episodes={{train: 10, validation: 3, test: 3}}" run_dir=runs/contacts
 
 mpc system=swimmer6 planner=[gn,ilqg,cem,mppi,random] horizon=4 steps=3 episodes=2 gn.warm_up=2 gn.samples=4

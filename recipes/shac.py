@@ -128,7 +128,7 @@ def play_round(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float
     """Play every task with exploration; trajectories, and the models' mean error; None if all became unstable."""
     policy = learner.playing()
     played = [task.play(policy.for_scene(task.scene), seed) for task in learner.tasks]
-    errors = [error_of(task.model, new) for task, new in zip(learner.tasks, played, strict=True) if len(new)]
+    errors = [error_of(task.members[0], new) for task, new in zip(learner.tasks, played, strict=True) if len(new)]
     return played, statistics.fmean(errors) if errors else None
 
 
@@ -147,7 +147,7 @@ def make_tasks(cfg: DictConfig, systems: list[str]) -> list[Task]:
 @hydra.main(version_base=None, config_path="config", config_name="shac")
 @clean_exit
 def main(cfg: DictConfig) -> None:
-    for name in ("action_repeat", "average", "rounds", "horizon", "updates", "episodes", "model_steps"):
+    for name in ("action_repeat", "average", "members", "rounds", "horizon", "updates", "episodes", "model_steps"):
         check_count(name, cfg[name], 1)
     if cfg.steps < 1 or cfg.steps % WINDOW or cfg.first.length < WINDOW:
         raise ValueError(

@@ -15,7 +15,15 @@ from torch import Tensor
 from _common.actor_critic import ActorCriticOptimizer, TargetSquares, play, played_windows, windows
 from _common.tensor_files import load_tensors
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor, specialize
+from torchrl_gn.dynamics import (
+    BoundEnsemble,
+    BoundPredictor,
+    Ensemble,
+    ForwardModel,
+    SpecializedPredictor,
+    SplitEnsemble,
+    specialize,
+)
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.objectives import SHACLoss
 from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue, task_invariances
@@ -42,6 +50,13 @@ class Round:
         return self.path / task.folder / f"{what}.safetensors"
 
 
+def new_model(scene: Scene, members: int, options: dict[str, Any]) -> ForwardModel | Ensemble:
+    """A model with fresh weights, or an ensemble."""
+    if members == 1:
+        return ForwardModel.for_scene(scene, **options)
+    return Ensemble.for_scene(scene, count=members, **options)
+
+
 class Task:
     """A scene with its reward, and the model and value that learn for it, with their data on one device.
 
@@ -49,7 +64,7 @@ class Task:
         folder: of its files in a run and in a round.
     """
 
-    model: BoundPredictor
+    model: BoundPredictor | BoundEnsemble
     value: StateValue
     loss: SHACLoss
 
@@ -81,15 +96,17 @@ class Task:
         """Make model, value and loss, or read them from the last round."""
         cfg, config = self.cfg, plain_config(self.cfg)
         if begun is None:
-            model = ForwardModel.for_scene(self.scene, **config["model"])
+            model = new_model(self.scene, cfg.members, config["model"])
             options = {"discount": cfg.discount, "hidden": cfg.hidden}
             self.value = StateValue(self.scene, canonicalizer=self.invariances, **options)
         else:
-            model = load_pretrained(begun.of("model", self)).model
+            model = load_pretrained(begun.of("model", self)).trained
             self.value = load_pretrained(begun.of("value", self)).value
-        self.model = model.to(self.device).bind(self.scene)
+        self.trained = cast("ForwardModel | Ensemble", model).to(self.device)
+        self.model = self.trained.bind(self.scene)
         imagined = ModelEnv(self.model, self.reward)  # until the model has learned: learn_model() takes a snapshot
-        self.loss = SHACLoss(policy, self.value, imagined, steps=cfg.horizon, lmbda=cfg.lmbda).to(self.device)
+        options = {"steps": cfg.horizon, "lmbda": cfg.lmbda, "pessimism": cfg.pessimism}
+        self.loss = SHACLoss(policy, self.value, imagined, **options).to(self.device)
 
     @property
     def newest(self) -> TensorDict:
@@ -102,11 +119,10 @@ class Task:
         steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
         data = cast(TensorDict, torch.cat(cast(Any, self.data)))
         # All samples count alike, as when the results were measured.
-        fit(self.model, data, steps=steps, lr=lr, seed=cfg.seed + index, size_floor=None)
-        if isinstance(snapshot := self.loss.env.world_model, SpecializedPredictor):
-            snapshot.refresh(self.model)
-        else:
-            self.loss.env.world_model = cast(Any, specialize(self.model))
+        for number, member in enumerate(self.members):
+            seed = cfg.seed + index + 1_000_000 * number
+            fit(member, data, steps=steps, lr=lr, seed=seed, size_floor=None)
+        self._take_snapshot()
         newest, rewards = self.newest, None
         if first:
             before, after = newest["state"][:, :-1], newest["state"][:, 1:]
@@ -114,6 +130,22 @@ class Task:
             rewards = reward(before, newest["action"], after, None).flatten(0, 1)
         seen = newest["state"].flatten(0, 1)
         self.loss.fit_normalizers(seen if self.squares is None else self.squares.move(seen), rewards)
+
+    @property
+    def members(self) -> list[BoundPredictor]:
+        """The model, or the members of the ensemble."""
+        return cast(Any, self.model.members) if isinstance(self.model, BoundEnsemble) else [self.model]
+
+    def _take_snapshot(self) -> None:
+        """Imagine with the model as it is now."""
+        env = self.loss.env
+        before = env.world_model.members if isinstance(env.world_model, SplitEnsemble) else [env.world_model]
+        if isinstance(before[0], SpecializedPredictor):
+            for snapshot, member in zip(cast(Any, before), self.members, strict=True):
+                snapshot.refresh(member)
+        else:
+            model = specialize(self.model)
+            env.world_model = cast(Any, model.split() if isinstance(model, BoundEnsemble) else model)
 
     def starts(self) -> Callable[[int], Tensor]:
         """What draws states ``[size, N, 13]`` to imagine from, half of the newest episodes, half of all."""
@@ -180,7 +212,7 @@ class ActorCritic:
         for task in self.tasks:
             task.learn_model(index)
         batches = [task.starts() for task in self.tasks]
-        sizes = {"updates": self.cfg.updates, "batch_size": self.cfg.batch_size}
+        sizes = {"updates": self.cfg.updates, "batch_size": self.cfg.batch_size // self.cfg.members}
         return self.optimizer.learn(batches, **sizes, desc=f"policy, round {index}")
 
     def playing(self) -> BoundedPolicy:
@@ -203,7 +235,7 @@ class ActorCritic:
         config = plain_config(self.cfg)
         for task in self.tasks:
             of.of("model", task).parent.mkdir(exist_ok=True)
-            save_checkpoint(of.of("model", task), task.model, scene=task.scene, config=config)
+            save_checkpoint(of.of("model", task), task.trained, scene=task.scene, config=config)
             save_checkpoint(of.of("value", task), task.value, scene=task.scene, config=config)
         self.save_policy(of.policy, self.policy, training=self.optimizer.state_dict())
 

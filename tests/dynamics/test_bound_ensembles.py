@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.dynamics import BoundEnsemble, Ensemble, ForwardModel, specialize
 from torchrl_gn.dynamics.ensemble import mean_and_spread
+from torchrl_gn.envs import ModelEnv
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.training import CheckpointError, load_pretrained, save_checkpoint
@@ -110,6 +111,38 @@ def test_specialised_members_predict_the_same(scenes, make_ensemble, random_stat
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
     with pytest.raises(TypeError, match="takes a bound model"):
         specialize(quick)
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_split_members_predict_their_shares(scenes, make_ensemble, random_states, random_actions, native):
+    scene = scenes["cheetah"]
+    bound = make_ensemble().bind(scene)
+    bound = specialize(bound) if native else bound
+    env = ModelEnv(bound).by_member()
+    state = random_states(scene, COUNT * BATCH)
+    actions = torch.stack([random_actions(scene, COUNT * BATCH, seed=seed) for seed in range(2)], 1)
+    found = env.imagine(TensorDict({"state": state}, [len(state)]), actions)[0]
+    shares = zip(bound.members, state.chunk(COUNT), actions.chunk(COUNT), strict=True)
+    expected = torch.cat([member.rollout(*share)[0] for member, *share in shares])
+    assert torch.equal(found, expected)
+    stepped = env.step(TensorDict({"state": state, "action": actions[:, 0]}, [len(state)]))
+    torch.testing.assert_close(stepped["next", "state"], expected[:, 1], rtol=1e-6, atol=1e-8)
+    with pytest.raises(ValueError, match="number of samples, 4, must be a multiple of the 3 members"):
+        env.imagine(TensorDict({"state": state[:4]}, [4]), actions[:4])
+
+
+def test_an_ensemble_refuses_samples_of_another_variant(scenes, make_ensemble, random_states, random_actions):
+    scene = scenes["cheetah"]
+    bound = make_ensemble().bind(scene)
+    other = bound.members[0].own_parameters()
+    other["nodes"] = 2 * other["nodes"]
+    entries = {"state": random_states(scene, COUNT), "action": random_actions(scene, COUNT)}
+    rows = TensorDict({**entries, "parameters": other.expand(COUNT)}, [COUNT])
+    for env in (ModelEnv(bound), ModelEnv(bound).by_member()):
+        with pytest.raises(ValueError, match="parameters"):
+            env.step(rows.clone())
+        with pytest.raises(ValueError, match="parameters"):
+            env.imagine(rows.exclude("action"), rows["action"].unsqueeze(1))
 
 
 def test_what_is_not_calibrated_says_so(scenes, make_ensemble, random_states, random_actions):

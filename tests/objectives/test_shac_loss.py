@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 
-from torchrl_gn.dynamics import specialize
+from torchrl_gn.dynamics import Ensemble, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.objectives import SHACLoss
 from torchrl_gn.planners import StatePolicy, StateValue
@@ -111,6 +111,33 @@ def test_a_frozen_part_changes_nothing_for_the_others(model, scenes, starts, fro
         torch.testing.assert_close(dict(loss(batch)), dict(wanted), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("pessimism", [0.0, 1.5])
+def test_an_ensemble_gives_a_lower_bound_of_the_members_returns(scenes, make_model, starts, pessimism):
+    scene = scenes["pendulum"]
+    models = [make_model(scene, seed=seed) for seed in range(3)]
+    options = {"steps": 3, "native": False}
+    loss = make_loss(Ensemble(models), scene, starts, pessimism=pessimism, **options)
+    found = []
+    for model in (Ensemble(models), *models):
+        of = loss if isinstance(model, Ensemble) else make_loss(model, scene, starts, **options)
+        of.load_state_dict(loss.state_dict())
+        torch.manual_seed(1)
+        found.append(of._imagine(starts)[0])
+    together, each = found[0].reshape(3, 32, 3), torch.stack(found[1:])
+    torch.testing.assert_close(together["next", "state"], each["next", "state"])
+    assert torch.equal(together["action"][0, :, 0], together["action"][1, :, 0])  # the same noise
+    value = loss.value
+    total = sum(0.9**k * each["next", "reward"][:, :, k] for k in range(3)).squeeze(-1)
+    total = total + 0.9**3 * value(each["next", "state"][:, :, -1]).squeeze(-1)
+    bound = total.mean(0) - pessimism * total.std(0)
+    torch.manual_seed(1)
+    out = loss(TensorDict({"state": starts}, [32]))
+    wanted = -(bound / value.normalizer.std).mean() - loss.log_alpha.exp() * out["entropy"]
+    torch.testing.assert_close(out["loss_actor"].double(), wanted.double(), rtol=1e-5, atol=1e-6)
+    (out["loss_actor"] + out["loss_value"]).backward()
+    assert all(bool((weight.grad != 0).any()) for weight in loss.policy.network.parameters())
+
+
 class Diverging(nn.Module):
     """A model that overflows for every second sample."""
 
@@ -180,6 +207,8 @@ def test_refuses_what_does_not_fit(model, scenes, starts):
         SHACLoss(loss.policy, loss.value, ModelEnv(loss.env.world_model, loss.env.reward, terminal=loss.value))
     with pytest.raises(ValueError, match="StatePolicy is of scene 'cartpole'"):
         SHACLoss(StatePolicy(load_scene("cartpole")), loss.value, loss.env)
+    with pytest.raises(ValueError, match=r"pessimism=1\.0 needs an ensemble"):
+        SHACLoss(loss.policy, loss.value, loss.env, pessimism=1.0)
     with pytest.raises(RuntimeError, match="call fit_normalizers first"):
         SHACLoss(StatePolicy(scene), loss.value, loss.env)(TensorDict({"state": starts}, [32]))
     with pytest.raises(KeyError, match="needs 'state'"):

@@ -6,6 +6,7 @@ from torchrl_gn.dynamics.bound import UnseenParameterWarning as UnseenParameterW
 from torchrl_gn.dynamics.ensemble import BoundEnsemble as BoundEnsemble
 from torchrl_gn.dynamics.ensemble import Calibration as Calibration
 from torchrl_gn.dynamics.ensemble import Ensemble as Ensemble
+from torchrl_gn.dynamics.ensemble import SplitEnsemble as SplitEnsemble
 from torchrl_gn.dynamics.export import export_c as export_c
 from torchrl_gn.dynamics.export import export_step as export_step
 from torchrl_gn.dynamics.features import Activations as Activations

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_gn.dynamics.ensemble import SplitEnsemble
 from torchrl_gn.dynamics.predictor import Predictor
 
 
@@ -35,9 +36,13 @@ class ModulePredictor:
         self.keys = ["state", "action"] if named else list(module.in_keys[:2])
         self.rest = [key for key in module.in_keys if key not in self.keys]
         self.out_key = ("next", "state") if ("next", "state") in module.out_keys else module.out_keys[0]
+        if hasattr(module, "fixed_batch"):
+            self.fixed_batch = module.fixed_batch
 
     def parameters_in(self, tensordict: TensorDictBase) -> None:
-        """None: only predictors read physical parameters."""
+        """None: only predictors read physical parameters. ValueError for those that members of an ensemble refuse."""
+        for member in getattr(self.module, "members", []):
+            member.parameters_in(tensordict)
 
     def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.select(*self.rest, strict=False)
@@ -63,6 +68,8 @@ class ModulePredictor:
     def rollout(
         self, state: Tensor, actions: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDictBase | None]:
+        if isinstance(self.module, SplitEnsemble):
+            return self.module.rollout(state, actions), None
         states = [state]
         for action in actions.unbind(-2):
             state, hidden_state = self.step(state, action, None, hidden_state)

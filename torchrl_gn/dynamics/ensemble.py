@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -47,6 +47,14 @@ class Calibration(Float64Buffers):
         """Whether there are numbers for any step."""
         return len(self.factor) > 0
 
+    def require_fitted(self) -> None:
+        """RuntimeError before it is fitted."""
+        if not self.fitted:
+            raise RuntimeError(
+                "The ensemble is not calibrated: its members' spread is several times smaller than their error. Call"
+                " torchrl_gn.evaluation.calibrate(ensemble, trajectories) with trajectories of no member's training."
+            )
+
     def set(self, factor: Tensor, floor: Tensor, typical: Tensor) -> None:
         """Take numbers ``[T, C]``, for any number of steps, and ``[C]``."""
         given = (each.double().to(self.factor.device) for each in (factor, floor, typical))
@@ -57,11 +65,7 @@ class Calibration(Float64Buffers):
 
         Of channels that cannot move they are meaningless.
         """
-        if not self.fitted:
-            raise RuntimeError(
-                "The ensemble is not calibrated: its members' spread is several times smaller than their error. Call"
-                " torchrl_gn.evaluation.calibrate(ensemble, trajectories) with trajectories of no member's training."
-            )
+        self.require_fitted()
         step = torch.arange(spread.shape[-3], device=spread.device).clamp(max=len(self.factor) - 1)
         parts = []
         for index, where in enumerate(layout.delta_slices.values()):
@@ -206,12 +210,81 @@ class BoundEnsemble(TensorDictModuleBase):
         std = torch.where(torch.as_tensor(self.scene.movable, device=std.device), std, 0.0)
         return Prediction(mean, torch.cat((torch.zeros_like(std[..., :1, :, :]), std), dim=-3), members)
 
+    def split(self) -> SplitEnsemble:
+        """The members, each with a share of the samples."""
+        return SplitEnsemble(self)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the mean of the next states and its standard deviation."""
+        self.members[0].parameters_in(tensordict)  # refuses another variant
         state, action = (tensordict[key] for key in self.in_keys[:2])
         mean, std, _ = self.predict(state, action.unsqueeze(-2))
         tensordict.set(self.out_keys[0], mean[..., 1, :, :])
         return tensordict.set(self.out_keys[1], std[..., 1, :, :])
+
+
+class SplitEnsemble(TensorDictModuleBase):
+    """Members of an ensemble, each of which predicts its share of the samples (TS-infinity of PETS, Chua et al. 2018).
+
+    Of ``K`` members and samples ``[K B, ...]`` the first predicts the first ``B``, and so on: a sample stays with its
+    member from step to step. As a TensorDict module it reads ``state`` and ``action``, and writes
+    ``("next", "state")``.
+
+    Args:
+        ensemble: bound to a scene, or specialised.
+    """
+
+    def __init__(self, ensemble: BoundEnsemble) -> None:
+        super().__init__()
+        self.ensemble, self.scene, first = ensemble, ensemble.scene, ensemble.members[0]
+        self.fixed_batch = first.fixed_batch
+        self.in_keys: list[NestedKey] = list(first.in_keys)
+        self.out_keys: list[NestedKey] = list(first.out_keys)
+
+    @property
+    def members(self) -> list[Predictor]:
+        """The members."""
+        return self.ensemble.members
+
+    def doubt(self, state: Tensor, action: Tensor) -> Tensor:
+        """Of all members together, as :meth:`BoundEnsemble.doubt`."""
+        return self.ensemble.doubt(state, action)
+
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """States ``[K B, ..., T + 1, N, 13]`` from start states ``[K B, ..., N, 13]``.
+
+        ValueError unless the number of samples is a multiple of ``K``.
+        """
+        return torch.cat([member.rollout(*share)[0] for member, *share in self._shares(state, actions)])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write each sample's next state."""
+        self.members[0].parameters_in(tensordict)  # refuses another variant
+        state, action = (tensordict[key] for key in self.in_keys[:2])
+        after = [member.step(*share)[0] for member, *share in self._shares(state, action)]
+        return tensordict.set(self.out_keys[0], torch.cat(after))
+
+    def _shares(self, state: Tensor, action: Tensor) -> Iterator[tuple[Predictor, Tensor, Tensor]]:
+        """Each member with its samples."""
+        count = len(self.members)
+        if len(state) % count:
+            raise ValueError(f"The number of samples, {len(state)}, must be a multiple of the {count} members.")
+        return zip(self.members, state.chunk(count), action.chunk(count), strict=True)
+
+
+def lower_bound(values: Tensor, pessimism: float) -> Tensor:
+    """Mean of the members' values ``[K, *B]`` less ``pessimism`` times their standard deviation, ``[*B]``.
+
+    Minus infinity where any is.
+    """
+    mean, members = values.mean(0), len(values)
+    if members == 1 or pessimism == 0:
+        return mean
+    off = torch.where(mean.isfinite(), values, 0.0) - torch.where(mean.isfinite(), mean, 0.0)
+    variance = off.square().sum(0) / (members - 1)
+    # The gradient of a root is infinite at 0, where members agree.
+    spread = torch.where(variance > 0, torch.where(variance > 0, variance, 1.0).sqrt(), 0.0)
+    return mean - pessimism * spread
 
 
 def mean_squares(values: Tensor, scene: Scene, layout: StateLayout) -> Tensor:

@@ -81,9 +81,15 @@ def counted_steps(
     )
 
 
-def imagined_steps(env: Any, tensordict: TensorDictBase, states: Tensor, actions: Tensor) -> Imagined:
-    """Rewards of predicted ``states`` ``[*B, H + 1, N, C]`` under ``actions``, as stepping ``env`` gives them."""
+def imagined_steps(
+    env: Any, tensordict: TensorDictBase, states: Tensor, actions: Tensor, trusted: Tensor | None = None
+) -> Imagined:
+    """Rewards of predicted ``states`` ``[*B, H + 1, N, C]`` under ``actions``, as stepping ``env`` gives them.
+
+    A step that is not ``trusted`` ``[*B, H]`` ends an episode as one that is not finite.
+    """
     stable = states[..., 1:, :, :].isfinite().flatten(-2).all(-1)
+    stable = stable if trusted is None else stable & trusted
     steps = counted_steps(env, tensordict, states, actions, stable)
     task = cast(Any, tensordict.get("task", None))
     tasks = _along_steps(task, tensordict.ndim, actions.shape[-2])

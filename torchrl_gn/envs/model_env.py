@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from typing import Any, cast
 
@@ -18,6 +19,7 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.drawing import draw_states
 from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
+from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.episode_ends import Imagined, imagined_steps
@@ -57,13 +59,17 @@ class ModelEnv(ModelBasedEnvBase):
         model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
         done, unstable_reward, terminal: as of :class:`~torchrl_gn.envs.SceneEnv`.
+        trust: of an ensemble, the highest :meth:`~torchrl_gn.dynamics.BoundEnsemble.doubt` of a step; one with more
+            ends the episode, as one that is not finite.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own. A
             :class:`~torchrl_gn.scenes.KinematicTree` needs states ``[M, N, C]``, for example of a log.
         seed: default: drawn from torch's global generator.
 
     Raises:
         TypeError: the model lacks these keys or the scene.
-        ValueError: an entry, the start states or the reward do not fit the scene, or are not finite.
+        ValueError: an entry, the start states or the reward do not fit the scene, or are not finite; or ``trust`` is
+            given with a model that does not say its doubt, or is not positive.
+        RuntimeError: ``trust`` is given with an ensemble that is not calibrated.
     """
 
     _supports_set_state = True
@@ -78,6 +84,7 @@ class ModelEnv(ModelBasedEnvBase):
         terminal: TerminalValue | None = None,
         start_states: StartStates | None = None,
         unstable_reward: float | None = None,
+        trust: float | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
     ):
@@ -99,6 +106,7 @@ class ModelEnv(ModelBasedEnvBase):
         self.ends = done
         self.terminal = terminal_of(terminal, self, self.scene)
         self.unstable_reward, self.spares_learners = finite_reward(unstable_reward), unstable_reward is None
+        self.trust = _checked_trust(trust, model)
         self.starts = StartSampler(self.scene, start_states, seed)
         self._state_shape = self.scene.num_nodes, self.scene.state_size
         self._simulator: Simulator | None = None
@@ -116,6 +124,23 @@ class ModelEnv(ModelBasedEnvBase):
     @property
     def predictor(self) -> Predictor | ModulePredictor:
         return as_predictor(cast(TensorDictModuleBase, self.world_model))
+
+    @property
+    def members(self) -> int:
+        """Number of members of the ensemble that predicts; 1 of another model."""
+        return len(self.world_model.members) if isinstance(self.world_model, BoundEnsemble) else 1
+
+    def by_member(self) -> ModelEnv:
+        """This environment with an ensemble that is :meth:`~torchrl_gn.dynamics.BoundEnsemble.split`; itself without.
+
+        It steps ``[K B]`` samples, the first ``B`` by the first member.
+        """
+        if not isinstance(self.world_model, BoundEnsemble):
+            return self
+        env = copy.copy(self)
+        env._modules = dict(self._modules)  # copies share it
+        env.world_model = cast(Any, self.world_model.split())
+        return env
 
     @property
     def _parameters_key(self) -> NestedKey | None:
@@ -172,12 +197,20 @@ class ModelEnv(ModelBasedEnvBase):
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         self._require_own(state)
-        predicted = self.world_model(self._inputs(tensordict))["next"]
+        inputs = self._inputs(tensordict)
+        predicted = self.world_model(inputs)["next"]
         stable = predicted["state"].isfinite().flatten(-2).all(-1, keepdim=True)
+        if self.trust is not None:
+            stable = stable & self._trusted(state, inputs["action"]).unsqueeze(-1)
         entries: dict[str, Any] = outcome(self, tensordict, state, action, predicted["state"], stable)
         entries |= step_entries(self, tensordict, state, entries)
         entries |= self.carried(tensordict, predicted)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
+
+    def _trusted(self, state: Tensor, action: Tensor) -> Tensor:
+        """Which steps from states ``[*B, N, 13]`` are to be trusted, ``[*B]``."""
+        with torch.no_grad():
+            return cast(Any, self.world_model).doubt(state, action) <= self.trust
 
     def _require_own(self, state: Tensor) -> None:
         """Raise ValueError if quaternions say that a transform has written over the state that a step starts from."""
@@ -246,8 +279,10 @@ class ModelEnv(ModelBasedEnvBase):
         model = self.predictor
         inputs: Any = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
         folded: Any = {} if prepared is None else {"prepared": prepared}
-        states, _ = model.rollout(state, self._with_past(tensordict, actions), *inputs, **folded)
-        return imagined_steps(self, tensordict, states, actions)
+        given = self._with_past(tensordict, actions)
+        states, _ = model.rollout(state, given, *inputs, **folded)
+        trusted = None if self.trust is None else self._trusted(states[..., :-1, :, :], given)
+        return imagined_steps(self, tensordict, states, actions, trusted)
 
     def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:
         """Pictures ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``, as of :class:`SceneEnv`.
@@ -267,3 +302,16 @@ class ModelEnv(ModelBasedEnvBase):
     def __getstate__(self) -> dict:
         # Copies and worker processes start their own threads and MuJoCo data.
         return {**super().__getstate__(), "_simulator": None}
+
+
+def _checked_trust(trust: float | None, model: object) -> float | None:
+    """The highest doubt; ValueError or RuntimeError if there is one that cannot be."""
+    if trust is None:
+        return None
+    if not hasattr(model, "doubt"):
+        raise ValueError(f"trust={trust} needs a model that says its doubt, an ensemble, not {type(model).__name__}.")
+    if not trust > 0:
+        raise ValueError(f"trust={trust} must be positive: 1 is the doubt that is usual in the calibration's data.")
+    if isinstance(model, BoundEnsemble):
+        model.calibration.require_fitted()
+    return float(trust)

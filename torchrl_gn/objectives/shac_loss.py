@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import TDLambdaEstimator
 
+from torchrl_gn.dynamics.ensemble import lower_bound
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.envs.episode_ends import alive_of
 from torchrl_gn.envs.starts import for_learning
@@ -20,6 +21,7 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.objectives.checks import read_entries
 from torchrl_gn.planners import BoundedPolicy, StateValue
+from torchrl_gn.planners.plan import check_pessimism
 
 
 class SHACLoss(LossModule):
@@ -37,6 +39,9 @@ class SHACLoss(LossModule):
     ``target_entropy`` (as in SAC). Where the model diverges the episode ends, at what it costs a
     learner (:class:`~torchrl_gn.envs.SceneEnv`). Steps after the end of an episode do not count.
 
+    In an ensemble every state is imagined from by every one of its ``K`` members, with the same noise of the actions:
+    ``K B`` trajectories. The policy maximises the mean of their returns less ``pessimism`` standard deviations.
+
     Reads ``state`` ``[B, N, 13]``. Writes ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to
     weights of its own; and ``reward``, the mean of imagined steps, and ``entropy``.
 
@@ -47,6 +52,7 @@ class SHACLoss(LossModule):
         steps: ``H``.
         lmbda: :math:`\lambda` of the value's targets.
         target_entropy: default: minus one for every component of an action.
+        pessimism: needs an ensemble; negative: explore what its members disagree on.
 
     Raises:
         ValueError: an option is out of range, or policy, value and environment do not fit together.
@@ -64,6 +70,7 @@ class SHACLoss(LossModule):
         steps: int = 16,
         lmbda: float = 0.95,
         target_entropy: float | None = None,
+        pessimism: float = 0.0,
     ) -> None:
         super().__init__()
         if steps < 1 or steps != int(steps):
@@ -78,11 +85,13 @@ class SHACLoss(LossModule):
                     f"{type(network).__name__} is of scene {network.scene.name!r}, not {env.scene.name!r}."
                 )
             env.scene.require_timestep(network.scene.timestep, f"{type(network).__name__}")
+        check_pessimism(pessimism, env)
         self.policy, self.value, self.steps, self._fitted = policy, value, int(steps), False
+        self.pessimism, self.members = pessimism, env.members
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
         # Not registered, so that the model's weights stay out of parameters().
-        object.__setattr__(self, "env", for_learning(env))
+        object.__setattr__(self, "env", for_learning(env).by_member())
         network = TensorDictModule(value.of_features, ["features"], ["state_value"])
         estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
         object.__setattr__(self, "_estimator", estimator)
@@ -105,6 +114,7 @@ class SHACLoss(LossModule):
         discount = self.value.discount ** torch.arange(self.steps + 1, dtype=reward.dtype, device=reward.device)
         weight = alive * discount.unsqueeze(-1)
         total = (weight[:, :-1] * reward).sum(1) + weight[:, -1] * last.to(reward.dtype)
+        total = lower_bound(total.unflatten(0, (self.members, -1)), self.pessimism)
         alpha, scale = self.log_alpha.exp(), self.value.normalizer.std.to(reward.dtype)
         return TensorDict(
             {
@@ -125,19 +135,22 @@ class SHACLoss(LossModule):
             self.value.normalizer.update(reward / max(1 - self.value.discount, 1e-3))
 
     def _imagine(self, state: Tensor) -> tuple[TensorDict, Tensor]:
-        """Steps ``[B, H]`` of the policy in the model, and estimates ``[B, H]`` of the entropy of its actions."""
+        """Steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of the entropy of its actions."""
+        state = state.repeat(self.members, 1, 1)
         # Not reset(), which asks whether an episode has ended: it would wait for a device.
         now = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
         steps, entropies = [], []
         with frozen(self.env.world_model), self.policy.prepared(), set_exploration_type(ExplorationType.RANDOM):
             for _ in range(self.steps):
-                action, log_prob = self.policy.sample(state := cast(Tensor, now["state"]))
+                action, log_prob = self.policy.sample(state := cast(Tensor, now["state"]), self.members)
                 for each in (state, action):
                     if each.requires_grad:  # neither under no_grad, nor of a frozen policy
                         each.register_hook(_finite_rows)
                 entropies.append(-log_prob)
                 now = self.env.step(now.set("action", action))
-                steps.append(now.select("state", ("next", "state"), ("next", "reward"), ("next", "terminated")))
+                steps.append(
+                    now.select("state", "action", ("next", "state"), ("next", "reward"), ("next", "terminated"))
+                )
                 now = step_mdp(now, exclude_done=True)
         return cast(TensorDict, torch.stack(steps, 1)), torch.stack(entropies, 1)
 

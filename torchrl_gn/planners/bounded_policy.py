@@ -98,10 +98,15 @@ class BoundedPolicy(TensorDictModuleBase):
         """Actions ``[*B, A]`` in states ``[*B, N, 13]``; ValueError for another shape."""
         return self._bounded(self.unbounded(state))
 
-    def sample(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Random actions ``[*B, A]``, reparameterised, and the log densities ``[*B]`` of their scaled ones."""
+    def sample(self, state: Tensor, copies: int = 1) -> tuple[Tensor, Tensor]:
+        """Random actions ``[*B, A]``, reparameterised, and the log densities ``[*B]`` of their scaled ones.
+
+        Each of ``copies`` equal parts of the first dimension gets the same noise.
+        """
         std = self.log_stds.clamp(*_LOG_STD_BOUNDS).exp()
-        noise = torch.randn_like(before := self.unbounded(state))
+        before = self.unbounded(state)
+        noise = torch.randn_like(before if copies == 1 else before.chunk(copies)[0])
+        noise = noise if copies == 1 else torch.cat([noise] * copies)
         before = before + std * noise
         # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)), which does not cancel.
         slope = 2 * (math.log(2) - before - softplus(-2 * before))

@@ -16,12 +16,14 @@ from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
 from torchrl_gn.data.controls import numpy_generator, spline_controls
+from torchrl_gn.dynamics.ensemble import lower_bound
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.planners.plan import (
     KEY,
     RecedingHorizonPlanner,
+    check_pessimism,
     check_plannable,
     device_of,
     flat_rows,
@@ -60,6 +62,8 @@ class GradientPlanner(RecedingHorizonPlanner):
         optimizer: makes the optimiser of the actions, in units of half their range. Default: Adam, learning rate 0.1.
         shrink: factor on the step size after a step without improvement; an improvement doubles it, up to 1.
         action_cost: cost per step and mean squared action, in units of half the range.
+        pessimism: of an ensemble, whose members each follow the actions: plans maximise the mean of the returns less
+            so many of their standard deviations; negative: explore what the members disagree on.
         proposal: policy, for example a :class:`~torchrl_gn.planners.StatePolicy`, whose actions in the model are one of
             the samples.
         propose_every_step: also of the candidates at later control steps: instead of the last perturbed one, or of the
@@ -87,6 +91,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         optimizer: OptimizerFactory | None = None,
         shrink: float = 0.7,
         action_cost: float = 0.0,
+        pessimism: float = 0.0,
         proposal: TensorDictModuleBase | None = None,
         propose_every_step: bool = False,
         seed: int | None = None,
@@ -105,12 +110,13 @@ class GradientPlanner(RecedingHorizonPlanner):
             )
         if not 0 < shrink <= 1:
             raise ValueError(f"shrink must be above 0 and at most 1, got {shrink}")
+        check_pessimism(pessimism, env)
         check_proposal(proposal, propose_every_step, env)
         super().__init__(env)
         self.horizon, self.iterations, self.shrink = horizon, iterations, shrink
         self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
         self.candidates, self.samples, self.noise, self.action_cost = candidates, samples, noise, action_cost
-        self.proposal, self.propose_every_step = proposal, propose_every_step
+        self.proposal, self.propose_every_step, self.pessimism = proposal, propose_every_step, pessimism
         self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)
         low, high = torch.as_tensor(env.scene.action_low), torch.as_tensor(env.scene.action_high)
         self.register_buffer("middle", ((low + high) / 2).float())
@@ -202,12 +208,16 @@ class GradientPlanner(RecedingHorizonPlanner):
 
         ``prepared``: see :meth:`ModelEnv.prepared`.
         """
-        imagined = self.imagined.imagine_steps(starts, self._actions(plan).flatten(0, 1), prepared)
-        total = torch.where(imagined.diverged, -torch.inf, imagined.rewards.sum((-2, -1))).reshape(plan.shape[:2])
+        members, actions = self.imagined.members, self._actions(plan).flatten(0, 1)
+        if members > 1:
+            starts, actions = cast(TensorDictBase, torch.cat([starts] * members)), actions.repeat(members, 1, 1)
+        imagined = self.imagined.by_member().imagine_steps(starts, actions, prepared)
+        total = torch.where(imagined.diverged, -torch.inf, imagined.rewards.sum((-2, -1)))
+        total = total.reshape(members, *plan.shape[:2])
         if self.action_cost:
-            efforts = torch.where(imagined.alive[:, :-1, 0].reshape(plan.shape[:3]), plan.square().mean(-1), 0.0)
-            total = total - self.action_cost * efforts.sum(-1)
-        return total
+            alive = imagined.alive[:, :-1, 0].reshape(members, *plan.shape[:3])
+            total = total - self.action_cost * torch.where(alive, plan.square().mean(-1), 0.0).sum(-1)
+        return lower_bound(total, self.pessimism)
 
     def initial_plan(self, entries: TensorDictBase) -> Tensor:
         """Return the best random sequences ``[B, K, H, A]``, zero actions and the proposal among them."""

@@ -72,6 +72,17 @@ def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int
         )
 
 
+def check_pessimism(pessimism: float, env: ModelEnv) -> None:
+    """Raise ValueError unless finite, and 0 without an ensemble."""
+    if not math.isfinite(pessimism):
+        raise ValueError(f"pessimism={pessimism} must be finite.")
+    if pessimism and env.members == 1:
+        raise ValueError(
+            f"pessimism={pessimism} needs an ensemble, whose members can disagree; {env} has one model. Make the"
+            " environment of a BoundEnsemble, Ensemble.for_scene(scene).bind(scene)."
+        )
+
+
 def check_count(name: str, value: int, least: int) -> None:
     """Raise ValueError unless an option is a whole number of at least ``least``."""
     if not isinstance(value, Integral):
