@@ -90,6 +90,9 @@ ensemble system=pendulum members=2 steps=5 hidden=8 data.train=20 data.calibrati
 pessimism system=pendulum reward=balance members=2 hidden=8 train_steps=5 "data={{trajectories: 20, length: 10}}"
     horizon=4 steps=6 episodes=2 "gn={{iterations: 1, warm_up: 1, samples: 2}}" run_dir=runs/pessimism
 
+adaptation system=swimmer6 seconds=[0.1] robots=2 calibration=5 test=5 length=25
+    "faults=[{{command: 0, gain: 0.0}}]" run_dir=runs/adaptation
+
 contacts steps=5 "episodes={{train: 10, validation: 3, test: 3}}" run_dir=runs/contacts
 
 mpc system=swimmer6 planner=[gn,ilqg,cem,mppi,random] horizon=4 steps=3 episodes=2 gn.warm_up=2 gn.samples=4

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_gn.dynamics.adaptation import AdaptedPredictor
 from torchrl_gn.dynamics.ensemble import SplitEnsemble
 from torchrl_gn.dynamics.predictor import Predictor
 
@@ -40,9 +41,9 @@ class ModulePredictor:
             self.fixed_batch = module.fixed_batch
 
     def parameters_in(self, tensordict: TensorDictBase) -> None:
-        """None: only predictors read physical parameters. ValueError for those that members of an ensemble refuse."""
-        for member in getattr(self.module, "members", []):
-            member.parameters_in(tensordict)
+        """None: only predictors read physical parameters; ValueError for those that predictors within refuse."""
+        if hasattr(self.module, "parameters_in"):
+            self.module.parameters_in(tensordict)
 
     def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.select(*self.rest, strict=False)
@@ -68,7 +69,7 @@ class ModulePredictor:
     def rollout(
         self, state: Tensor, actions: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDictBase | None]:
-        if isinstance(self.module, SplitEnsemble):
+        if isinstance(self.module, (AdaptedPredictor, SplitEnsemble)):
             return self.module.rollout(state, actions), None
         states = [state]
         for action in actions.unbind(-2):

@@ -178,6 +178,10 @@ class BoundEnsemble(TensorDictModuleBase):
         """The members."""
         return list(self.predictors)  # pyright: ignore[reportReturnType]
 
+    def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        """As of the members, which refuse those of another variant."""
+        return self.members[0].parameters_in(tensordict)
+
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """Each member's next state ``[K, *B, N, 13]``."""
         return torch.stack([each.step(state, action)[0] for each in self.members])
@@ -216,7 +220,7 @@ class BoundEnsemble(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the mean of the next states and its standard deviation."""
-        self.members[0].parameters_in(tensordict)  # refuses another variant
+        self.parameters_in(tensordict)
         state, action = (tensordict[key] for key in self.in_keys[:2])
         mean, std, _ = self.predict(state, action.unsqueeze(-2))
         tensordict.set(self.out_keys[0], mean[..., 1, :, :])
@@ -246,6 +250,10 @@ class SplitEnsemble(TensorDictModuleBase):
         """The members."""
         return self.ensemble.members
 
+    def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        """As of the members."""
+        return self.ensemble.parameters_in(tensordict)
+
     def doubt(self, state: Tensor, action: Tensor) -> Tensor:
         """Of all members together, as :meth:`BoundEnsemble.doubt`."""
         return self.ensemble.doubt(state, action)
@@ -259,7 +267,7 @@ class SplitEnsemble(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write each sample's next state."""
-        self.members[0].parameters_in(tensordict)  # refuses another variant
+        self.parameters_in(tensordict)
         state, action = (tensordict[key] for key in self.in_keys[:2])
         after = [member.step(*share)[0] for member, *share in self._shares(state, action)]
         return tensordict.set(self.out_keys[0], torch.cat(after))

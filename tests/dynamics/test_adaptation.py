@@ -1,0 +1,169 @@
+"""Adaptation to what a robot's commands do now."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_gn.data import Simulator, collect_trajectories
+from torchrl_gn.dynamics import AdaptedPredictor, CommandAdaptation, Commands, specialize
+from torchrl_gn.envs import ModelEnv
+from torchrl_gn.planners import GradientPlanner
+from torchrl_gn.training import load_pretrained
+
+STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def predictor(scenes):
+    return specialize(load_pretrained("swimmer6").model.bind(scenes["swimmer6"]), executor="eager")
+
+
+@pytest.fixture(scope="module")
+def unchanged(scenes) -> TensorDict:
+    return collect_trajectories(scenes["swimmer6"], 20, STEPS, seed=1)
+
+
+@pytest.fixture(scope="module")
+def adaptation(predictor, unchanged) -> CommandAdaptation:
+    return CommandAdaptation(predictor, unchanged)
+
+
+def simulated(scenes, gain: Tensor, offset: Tensor, *, count: int = 4) -> TensorDict:
+    """Trajectories of robots ``[count]`` whose commands act as ``gain * command + offset``."""
+    given = collect_trajectories(scenes["swimmer6"], count, STEPS, seed=2)
+    acting = gain * given["action"] + offset
+    state = Simulator(scenes["swimmer6"]).rollout(given["physics"][:, 0], acting)["state"]
+    return TensorDict({"state": state, "action": given["action"]}, [count])
+
+
+def learned(adaptation: CommandAdaptation, stream: TensorDict, *, steps: int = STEPS):
+    belief = adaptation.start(len(stream))
+    for step in range(steps):
+        belief = adaptation.update(
+            belief, stream["state"][:, step], stream["action"][:, step], stream["state"][:, step + 1]
+        )
+    return belief
+
+
+def test_it_finds_gains_and_offsets(scenes, adaptation, predictor):
+    gain = torch.tensor([0.0, 1.0, 0.5, 1.0, 1.0]).double()
+    offset = torch.tensor([0.0, 0.0, 0.0, 0.05, 0.0]).double()
+    stream = simulated(scenes, gain, offset)
+    found = adaptation.read(learned(adaptation, stream, steps=20))
+    torch.testing.assert_close(found.gain, gain.expand(4, 5), rtol=0, atol=0.02)
+    torch.testing.assert_close(found.offset, offset.expand(4, 5), rtol=0, atol=0.02)
+    raw = adaptation.read(learned(adaptation, stream), guarded=False)
+    off = torch.cat(((raw.gain - gain) / raw.gain_std, (raw.offset - offset) / raw.offset_std))
+    assert (off.abs() < 3).double().mean() > 0.9 and raw.gain_std.max() < 0.03
+    adapted = AdaptedPredictor(predictor, Commands(*(part[0] for part in found)))
+    start, actions, true = stream["state"][:, 0], stream["action"], stream["state"]
+    off = [
+        (model - true).square().mean()
+        for model in (predictor.rollout(start, actions)[0], adapted.rollout(start, actions))
+    ]
+    assert off[1] < 1e-2 * off[0]
+
+
+def test_an_unchanged_robot_keeps_its_model(scenes, adaptation):
+    ones, zeros = torch.ones(5).double(), torch.zeros(5).double()
+    found = adaptation.read(learned(adaptation, simulated(scenes, ones, zeros, count=8)))
+    assert (found.gain == 1).double().mean() > 0.9 and (found.gain - 1).abs().max() < 0.05
+
+
+def test_robots_of_a_batch_are_their_own(scenes, adaptation):
+    gain = torch.stack([torch.eye(5)[0], torch.ones(5)]).double().unsqueeze(1)
+    stream = simulated(scenes, gain, torch.zeros(5).double(), count=2)
+    together = adaptation.read(learned(adaptation, stream, steps=10))
+    belief = adaptation.start()
+    for step in range(10):
+        state, action = stream["state"][0], stream["action"][0]
+        belief = adaptation.update(belief, state[step], action[step], state[step + 1])
+    for one, both in zip(adaptation.read(belief), together, strict=True):
+        torch.testing.assert_close(one, both[0], rtol=1e-4, atol=1e-5)
+    assert (together.gain[0, 1:] < 0.2).all() and (together.gain[1] - 1).abs().max() < 0.05
+
+
+def test_a_belief_is_a_value_and_a_lost_step_teaches_nothing(scenes, adaptation):
+    stream = simulated(scenes, torch.zeros(5).double(), torch.zeros(5).double(), count=2)
+    belief = learned(adaptation, stream, steps=3)
+    kept = [part.clone() for part in belief]
+    after = stream["state"][:, 4].clone()
+    after[1, 2, 0] = torch.nan
+    new = adaptation.update(belief, stream["state"][:, 3], stream["action"][:, 3], after)
+    assert all(torch.equal(part, before) for part, before in zip(belief, kept, strict=True))
+    for part, before in zip(new, kept, strict=True):
+        assert torch.equal(part[1], before[1]) and not torch.equal(part[0], before[0])
+
+
+def test_wild_steps_do_not_lead_it_astray(scenes, adaptation):
+    gain = torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0]).double()
+    stream = simulated(scenes, gain, torch.zeros(5).double())
+    stream["state"][:, 15, 1:, 7:10] += 5.0  # 5 m/s in one step, and back in the next
+    found = adaptation.read(learned(adaptation, stream))
+    torch.testing.assert_close(found.gain, gain.expand(4, 5), rtol=0, atol=0.1)
+
+
+def test_it_forgets(scenes, predictor, unchanged):
+    dead = simulated(scenes, torch.zeros(5).double(), torch.zeros(5).double(), count=2)
+    mended = simulated(scenes, torch.ones(5).double(), torch.zeros(5).double(), count=2)
+    adaptation = CommandAdaptation(predictor, unchanged, memory=0.2)
+    belief = learned(adaptation, dead)
+    assert (adaptation.read(belief).gain < 0.1).all()
+    for step in range(STEPS):
+        belief = adaptation.update(
+            belief, mended["state"][:, step], mended["action"][:, step], mended["state"][:, step + 1]
+        )
+    assert (adaptation.read(belief).gain > 0.9).all()
+
+
+def test_planners_use_what_is_known(scenes, predictor):
+    scene = scenes["swimmer6"]
+    adapted = AdaptedPredictor(predictor)
+    env = ModelEnv(adapted, lambda *entries: entries[2][..., 1, :1].float())
+    start = collect_trajectories(scene, 2, 1, seed=0)["state"][:, 0]
+    now = TensorDict({"state": start}, [2])
+    actions = torch.rand(2, 4, 5, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    torch.testing.assert_close(env.imagine(now, actions)[0], predictor.rollout(start, actions)[0])
+    gain, offset = torch.tensor([0.0, 1.0, 0.5, 1.0, 1.0]), torch.tensor([0.0, 0.0, 0.0, 0.2, 0.0])
+    adapted.take(Commands(gain, gain, offset, gain))
+    states = env.imagine(now, actions)[0]
+    torch.testing.assert_close(states, predictor.rollout(start, gain * actions + offset)[0])
+    (gradient,) = torch.autograd.grad(states.sum(), actions)
+    assert (gradient[..., 0] == 0).all() and (gradient[..., 1:] != 0).any()
+    stepped = env.step(now.set("action", actions[:, 0].detach()))
+    torch.testing.assert_close(stepped["next", "state"], states[:, 1], rtol=1e-6, atol=1e-8)
+    copy = AdaptedPredictor(predictor)
+    copy.load_state_dict(adapted.state_dict())
+    assert torch.equal(copy.gain, gain)
+
+
+def test_it_plans_with_a_dead_motor(scenes, predictor):
+    scene = scenes["swimmer6"]
+    gain = torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0])
+    env = ModelEnv(
+        AdaptedPredictor(predictor, Commands(gain, gain, 0 * gain, gain)), lambda *_: _[2][..., 1, :1].float()
+    )
+    planner = GradientPlanner(env, 3, 2, samples=4, seed=0)
+    start = TensorDict({"state": collect_trajectories(scene, 1, 1, seed=0)["state"][:, 0]}, [1])
+    assert planner(start)["action"].shape == (1, 5)
+
+
+def test_what_cannot_be_adapted_is_refused(scenes, make_model, unchanged, predictor):
+    scene = scenes["swimmer6"]
+    with pytest.raises(ValueError, match="without hidden state"):
+        CommandAdaptation(make_model(scene, core="recurrent").bind(scene), unchanged)
+    with pytest.raises(ValueError, match="parameters of each sample"):
+        CommandAdaptation(make_model(scene).bind(scene, parameters_key="parameters"), unchanged)
+    falling = scenes["falling"]
+    with pytest.raises(ValueError, match="no commands to adapt"):
+        CommandAdaptation(make_model(falling).bind(falling), unchanged)
+    with pytest.raises(ValueError, match=r"memory=0, gain_std=0\.5"):
+        CommandAdaptation(predictor, unchanged, memory=0)
+    other = predictor.own_parameters()
+    other["nodes"] = 2 * other["nodes"]
+    rows = TensorDict({"state": unchanged["state"][:, 0], "action": unchanged["action"][:, 0]}, [20])
+    with pytest.raises(ValueError, match="parameters"):
+        AdaptedPredictor(predictor)(rows.set("parameters", other.expand(20)))

@@ -1,0 +1,264 @@
+"""Adaptation while a robot acts: what its commands do now, by recursive Bayes through its forward model."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.maths.precision import without_autocast
+from torchrl_gn.maths.state_layout import StateLayout
+
+_STEP = 0.1  # of a finite difference, in standard deviations of a command
+_JUDGED = 1.0  # seconds over which the model with and without adaptation is judged
+_FREEDOM = 4.0  # degrees of freedom of the errors' distribution
+_EARLY = 5  # fraction of trajectories, 1 / so much, after which the noise is calibrated
+
+
+class Commands(NamedTuple):
+    """What a robot makes of its commands: as the model's of ``gain * command + offset``."""
+
+    gain: Tensor  # [*B, A]; 1 of an unchanged robot, 0 of a dead motor
+    gain_std: Tensor  # [*B, A] standard deviation
+    offset: Tensor  # [*B, A], in the command's unit
+    offset_std: Tensor  # [*B, A]
+
+
+class Belief(NamedTuple):
+    """Belief about a robot's commands, a value; made and read by :class:`CommandAdaptation`."""
+
+    precision: Tensor  # [*B, P, P] what steps told of gains and offsets, without the prior
+    moment: Tensor  # [*B, P]
+    errors: Tensor  # [*B, 2] recent log(1 + squared error by the noise) of one step, without and with adaptation
+
+
+class CommandAdaptation(Float64Buffers):
+    r"""Learn from every step what a robot's commands do: a dead or weak motor, another gear, a shifted zero.
+
+    To first order a command :math:`u` that acts as :math:`g u + b` changes the next velocities by :math:`\sum_j
+    \partial v / \partial u_j ((g_j - 1) u_j + b_j)`, with derivatives of the forward model. Gains and offsets follow
+    by Bayesian linear regression of its errors, recursively: one call of the model with ``A + 1`` commands a step.
+    Prediction costs nothing more: the model reads other commands (:class:`AdaptedPredictor`). Beyond the paper.
+
+    A belief is a value: :meth:`start` gives one, :meth:`update` the next, :meth:`read` gains and offsets with their
+    standard deviations. Batches ``[*B]`` are robots of their own.
+
+    Args:
+        predictor: of one scene, specialised to be quick; neither recurrent nor with parameters of each sample.
+        trajectories: ``[M]`` of the unchanged robot, some 20 or more, with which the predictor was not trained: their
+            errors are the noise.
+        memory: seconds after which a step counts for a third.
+        gain_std: standard deviation of gains before anything is seen.
+        offset_std: of offsets, in standard deviations of the trajectories' commands.
+
+    Raises:
+        ValueError: if the predictor has a hidden state, parameters of each sample or no action, or an option is not
+            positive.
+    """
+
+    middle: Tensor  # [A] of the trajectories' commands
+    unit: Tensor  # [A] their standard deviation
+    weight: Tensor  # [N, V] inverse standard deviation of the errors of one step; 0 of channels that do not move
+    prior: Tensor  # [P] precision of gains and offsets before anything is seen
+    inflation: Tensor  # [] of the variance, as a step's errors are not independent
+    floor: Tensor  # [P] standard deviation that remains, of the unchanged robot after whole trajectories
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        trajectories: TensorDictBase,
+        *,
+        memory: float = 10.0,
+        gain_std: float = 0.5,
+        offset_std: float = 0.1,
+    ) -> None:
+        super().__init__()
+        if predictor.recurrent or predictor.parameters_key is not None:
+            raise ValueError("Adaptation needs a model without hidden state and without parameters of each sample.")
+        if not predictor.scene.num_actions:
+            raise ValueError(f"Scene {predictor.scene.name!r} has no commands to adapt.")
+        if not (min(memory, gain_std, offset_std) > 0):
+            raise ValueError(f"memory={memory}, gain_std={gain_std} and offset_std={offset_std} must be positive.")
+        self.predictor, self.scene = predictor, predictor.scene
+        self._rates = _rate_channels(predictor.layout)
+        self.keep = math.exp(-self.scene.timestep / memory)
+        self._judged = math.exp(-self.scene.timestep / _JUDGED)
+        state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
+        flat = action.flatten(0, -2).double()
+        self.register_buffer("middle", flat.mean(0))
+        self.register_buffer("unit", flat.std(0).clamp(min=1e-9))
+        error = self._error(state[:, :-1], action, state[:, 1:]).flatten(0, 1)
+        spread = error.square().mean(0).sqrt()
+        self.register_buffer("weight", torch.where(spread > 1e-9 * spread.max(), 1 / spread, 0.0))
+        count = action.shape[-1]
+        self.register_buffer("prior", torch.tensor([gain_std] * count + [offset_std] * count).double() ** -2)
+        self.register_buffer("floor", torch.zeros(2 * count, dtype=torch.float64))
+        self.register_buffer("inflation", self.prior.new_ones(()))
+        self._calibrate(state, action)
+
+    def start(self, *batch: int) -> Belief:
+        """Belief before anything is seen, of ``batch`` robots."""
+        size, zeros = len(self.prior), self.prior.new_zeros
+        return Belief(zeros(*batch, size, size), zeros(*batch, size), zeros(*batch, 2))
+
+    @torch.no_grad()
+    @without_autocast
+    def update(self, belief: Belief, state: Tensor, action: Tensor, next_state: Tensor) -> Belief:
+        """Belief after a step from states ``[*B, N, 13]``; the same where the step is not finite."""
+        return self._updated(belief, state, action, next_state, self.keep)
+
+    def _updated(self, belief: Belief, state: Tensor, action: Tensor, next_state: Tensor, keep: float) -> Belief:
+        """Belief after a step, of which what was known before counts ``keep``."""
+        error, by_command = self._error(state, action, next_state), self._by_command(state, action)
+        inputs = self._inputs(by_command, action)  # [*B, N V, P]
+        weighted = (error * self.weight).flatten(-2)
+        mean = self._mean(belief)
+        left = weighted - (inputs @ mean.unsqueeze(-1)).squeeze(-1)
+        count = (self.weight > 0).sum()
+        size = torch.stack([self.inflation * each.square().sum(-1) / count for each in (weighted, left)], -1)
+        # Errors have long tails, as where bodies hit the ground: those of a Student's t weigh less the larger they are.
+        trusted = inputs.mT * ((_FREEDOM + 1) / (_FREEDOM + size[..., 1]))[..., None, None]
+        after = Belief(
+            keep * belief.precision + trusted @ inputs,
+            keep * belief.moment + (trusted @ weighted.unsqueeze(-1)).squeeze(-1),
+            self._judged * belief.errors + (1 - self._judged) * size.log1p(),
+        )
+        # What is not finite, a lost packet or a diverged prediction, teaches nothing.
+        good = next_state.isfinite().flatten(-2).all(-1) & inputs.isfinite().flatten(-2).all(-1)
+        good = good & weighted.isfinite().all(-1)
+        return Belief(
+            *(
+                torch.where(good.reshape(*good.shape, *[1] * (new.ndim - good.ndim)), new, old)
+                for new, old in zip(after, belief, strict=True)
+            )
+        )
+
+    @torch.no_grad()
+    def read(self, belief: Belief, *, guarded: bool = True) -> Commands:
+        """Gains and offsets with their standard deviations.
+
+        ``guarded``: 1 and 0 where that is within two standard deviations, or where in the last second the model
+        predicted no worse without; so an unchanged robot keeps its model.
+        """
+        theta = self._mean(belief)
+        std = (self._covariance(belief).diagonal(dim1=-2, dim2=-1) + self.floor.square()).sqrt()
+        if guarded:
+            without, adapted = belief.errors.unbind(-1)
+            theta = torch.where((adapted < without).unsqueeze(-1) & (theta.abs() > 2 * std), theta, 0.0)
+        gain, shift = theta.chunk(2, -1)
+        gain_std, shift_std = std.chunk(2, -1)
+        return Commands(1 + gain, gain_std, self.unit * shift - gain * self.middle, self.unit * shift_std)
+
+    def _mean(self, belief: Belief) -> Tensor:
+        """Gains less 1, and offsets in units, ``[*B, P]``."""
+        return torch.linalg.solve(belief.precision + torch.diag(self.prior), belief.moment)
+
+    def _covariance(self, belief: Belief) -> Tensor:
+        return torch.linalg.inv(belief.precision + torch.diag(self.prior))
+
+    def _velocities(self, state: Tensor, next_state: Tensor) -> Tensor:
+        """Changes ``[*B, N, V]`` of the components that are rates of others, in float64."""
+        return self.predictor.layout.delta(state, next_state)[..., self._rates].double()
+
+    def _error(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """Error ``[*B, N, V]`` of a step's velocities."""
+        with torch.no_grad():
+            predicted = self.predictor.step(state, action)[0]
+        return self._velocities(state, next_state) - self._velocities(state, predicted)
+
+    def _by_command(self, state: Tensor, action: Tensor) -> Tensor:
+        """Changes of the next velocities ``[*B, N, V, A]`` by a unit of each command."""
+        count, batch = action.shape[-1], action.shape[:-1]
+        # Towards the middle: models clip commands to their bounds.
+        step = torch.where(action.double() > self.middle, -_STEP, _STEP)  # [*B, A]
+        moved = action.double().unsqueeze(0) + torch.diag_embed(step * self.unit).movedim(-1, 0)
+        commands = torch.cat((action.unsqueeze(0).double(), moved)).to(action.dtype)
+        states = state.expand(count + 1, *batch, *state.shape[-2:])
+        after = self._velocities(states, self.predictor.step(states, commands)[0])
+        return (after[1:] - after[:1]).movedim(0, -1) / step[..., None, None, :]
+
+    def _inputs(self, by_command: Tensor, action: Tensor) -> Tensor:
+        """Inputs ``[*B, N V, P]`` of the regression, by the noise."""
+        weighted = by_command * self.weight.unsqueeze(-1)
+        scaled = (action.double() - self.middle) / self.unit
+        return torch.cat((weighted * scaled[..., None, None, :], weighted), -1).flatten(-3, -2)
+
+    @torch.no_grad()
+    @without_autocast
+    def _calibrate(self, state: Tensor, action: Tensor) -> None:
+        """Weigh steps, and find what remains, so that an unchanged robot's gains are within what is stated."""
+        steps, inflation, belief = action.shape[1], self.inflation.clone(), self.start(len(action))
+        early = max(1, steps // _EARLY)
+        for step in range(steps):
+            belief = self._updated(belief, state[:, step], action[:, step], state[:, step + 1], 1.0)
+            if step + 1 == early:
+                square = self._mean(belief).square() / self._covariance(belief).diagonal(dim1=-2, dim2=-1)
+                inflation = square.mean().clamp(min=1.0)
+        self.floor.copy_(self._mean(belief).square().mean(0).sqrt())
+        self.weight /= inflation.sqrt()
+        self.inflation.copy_(inflation)
+
+
+class AdaptedPredictor(TensorDictModuleBase):
+    """A predictor of a robot whose commands act as its own of ``gain * command + offset``.
+
+    For environments, planners and losses, as any model: it rolls out in the predictor's one call, differentiably.
+
+    Args:
+        predictor: of the unchanged robot, as of :class:`CommandAdaptation`.
+        commands: what is known of the robot; default: it is unchanged.
+    """
+
+    gain: Tensor  # [A]
+    offset: Tensor  # [A]
+
+    def __init__(self, predictor: Predictor, commands: Commands | None = None) -> None:
+        super().__init__()
+        self.predictor, self.scene, self.layout = predictor, predictor.scene, predictor.layout
+        self.fixed_batch = predictor.fixed_batch
+        count = predictor.scene.num_actions
+        self.register_buffer("gain", torch.ones(count))
+        self.register_buffer("offset", torch.zeros(count))
+        self.in_keys: list[NestedKey] = list(predictor.in_keys)
+        self.out_keys: list[NestedKey] = list(predictor.out_keys)
+        if commands is not None:
+            self.take(commands)
+
+    def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        """As of the predictor, which refuses those of another variant."""
+        return self.predictor.parameters_in(tensordict)
+
+    def take(self, commands: Commands) -> None:
+        """Take what is known now, in place, so that planners that hold the model see it."""
+        self.gain.copy_(commands.gain)
+        self.offset.copy_(commands.offset)
+
+    def step(self, state: Tensor, action: Tensor) -> Tensor:
+        """Next states ``[*B, N, 13]`` under commands ``[*B, A]``."""
+        return self.predictor.step(state, self._acting(action))[0]
+
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """States ``[*B, T + 1, N, 13]`` from a start state under commands ``[*B, T, A]``."""
+        return self.predictor.rollout(state, self._acting(actions))[0]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the next state."""
+        self.parameters_in(tensordict)
+        state, action = (tensordict[key] for key in self.in_keys[:2])
+        return tensordict.set(self.out_keys[0], self.step(state, action))
+
+    def _acting(self, action: Tensor) -> Tensor:
+        return self.gain.to(action.dtype) * action + self.offset.to(action.dtype)
+
+
+def _rate_channels(layout: StateLayout) -> list[int]:
+    """Channels of a state change that are rates of others."""
+    rates, channels = {component.rate for component in layout.components}, range(layout.delta_size)
+    return [channel for name, where in layout.delta_slices.items() if name in rates for channel in channels[where]]
