@@ -103,7 +103,7 @@ def main(cfg: DictConfig) -> None:
     before = errors(predictor, collect_trajectories(scene, cfg.test, cfg.length, seed=cfg.seed + 1))
     metrics = {f"unchanged/{name}": value for name, value in before.items()}
     print(f"{scene.name}, {cfg.robots} robots; errors relative to standing still, of one step / over 20 steps")
-    print(f"{'fault':34}{'before it':>18}{'without':>18}" + "".join(f"{f'{each:g} s':>18}" for each in seconds))
+    print(f"{'fault':30}{'before it':>22}{'without':>22}" + "".join(f"{f'{each:g} s':>22}" for each in seconds))
     lines: dict[str, Tensor] = {}
     for number, fault in enumerate(as_list(cfg.faults)):
         label = ", ".join(f"{key} {value}" for key, value in fault.items())
@@ -120,7 +120,7 @@ def main(cfg: DictConfig) -> None:
         metrics |= {f"{label}/{at}/{name}": value for at, of in columns.items() for name, value in of.items()}
         metrics[f"{label}/milliseconds"] = milliseconds
         cells = [" / ".join(f"{value:.3g}" for value in of.values()) for of in (before, *columns.values())]
-        tqdm.write(f"{label:34}" + "".join(f"{cell:>18}" for cell in cells))
+        tqdm.write(f"{label:30}" + "".join(f"{cell:>22}" for cell in cells))
         if "command" in fault:
             lines[label] = gains[:, :, fault["command"]].mT
     files = []

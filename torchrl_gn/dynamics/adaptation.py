@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple, cast
 
@@ -98,8 +99,9 @@ class CommandAdaptation(Float64Buffers):
         spread = error.square().mean(0).sqrt()
         self.register_buffer("weight", torch.where(spread > 1e-9 * spread.max(), 1 / spread, 0.0))
         count = action.shape[-1]
-        self.register_buffer("prior", torch.tensor([gain_std] * count + [offset_std] * count).double() ** -2)
-        self.register_buffer("floor", torch.zeros(2 * count, dtype=torch.float64))
+        prior = flat.new_tensor([gain_std] * count + [offset_std] * count)
+        self.register_buffer("prior", prior**-2)
+        self.register_buffer("floor", self.prior.new_zeros(2 * count))
         self.register_buffer("inflation", self.prior.new_ones(()))
         self._calibrate(state, action)
 
@@ -223,9 +225,9 @@ class AdaptedPredictor(TensorDictModuleBase):
         super().__init__()
         self.predictor, self.scene, self.layout = predictor, predictor.scene, predictor.layout
         self.fixed_batch = predictor.fixed_batch
-        count = predictor.scene.num_actions
-        self.register_buffer("gain", torch.ones(count))
-        self.register_buffer("offset", torch.zeros(count))
+        at = next(itertools.chain(predictor.parameters(), predictor.buffers())).device
+        self.register_buffer("gain", torch.ones(predictor.scene.num_actions, device=at))
+        self.register_buffer("offset", torch.zeros(predictor.scene.num_actions, device=at))
         self.in_keys: list[NestedKey] = list(predictor.in_keys)
         self.out_keys: list[NestedKey] = list(predictor.out_keys)
         if commands is not None:

@@ -76,7 +76,9 @@ class Calibration(Float64Buffers):
     def by_typical(self, squares: Tensor) -> Tensor:
         """Root mean square ``[*B]``, over the components that move, of mean squares ``[*B, C]`` by the typical ones."""
         moving = self.typical > 0
-        return (squares[..., moving] / self.typical[moving].square()).mean(-1).sqrt()
+        ratios = squares / torch.where(moving, self.typical.square(), 1.0)
+        # Not picked by a mask: it would wait for a device.
+        return (torch.where(moving, ratios, 0.0).sum(-1) / moving.sum()).sqrt()
 
 
 class Prediction(NamedTuple):
@@ -163,6 +165,9 @@ class BoundEnsemble(TensorDictModuleBase):
         ValueError: if members have hidden states or parameters of each sample.
     """
 
+    movable: Tensor  # [N, D] bool
+    counted: Tensor  # [N, D] bool, of those the ones of bodies that are predicted
+
     def __init__(self, predictors: Sequence[Predictor], calibration: Calibration) -> None:
         super().__init__()
         if any(each.recurrent or each.parameters_key is not None for each in predictors):
@@ -170,6 +175,10 @@ class BoundEnsemble(TensorDictModuleBase):
         self.predictors = nn.ModuleList(predictors)
         self.calibration = calibration
         self.scene, self.layout = predictors[0].scene, predictors[0].layout
+        movable = torch.as_tensor(self.scene.movable, device=calibration.typical.device)
+        self.register_buffer("movable", movable, persistent=False)
+        predicted = torch.as_tensor(self.scene.predicted, device=movable.device)
+        self.register_buffer("counted", movable & predicted.unsqueeze(-1), persistent=False)
         self.in_keys: list[NestedKey] = list(predictors[0].in_keys)
         self.out_keys: list[NestedKey] = [*predictors[0].out_keys, ("next", "state_std")]
 
@@ -200,7 +209,7 @@ class BoundEnsemble(TensorDictModuleBase):
         """
         _, spread = mean_and_spread(self.step(state, action), self.layout)
         std = self.calibration(spread.unsqueeze(-3), self.layout).squeeze(-3)
-        return self.calibration.by_typical(mean_squares(std, self.scene, self.layout))
+        return self.calibration.by_typical(mean_squares(std, self.counted, self.layout))
 
     @without_autocast
     def predict(self, state: Tensor, actions: Tensor) -> Prediction:
@@ -211,7 +220,7 @@ class BoundEnsemble(TensorDictModuleBase):
         members = self.rollout(state, actions)
         mean, spread = mean_and_spread(members, self.layout)
         std = self.calibration(spread[..., 1:, :, :], self.layout)
-        std = torch.where(torch.as_tensor(self.scene.movable, device=std.device), std, 0.0)
+        std = torch.where(self.movable, std, 0.0)
         return Prediction(mean, torch.cat((torch.zeros_like(std[..., :1, :, :]), std), dim=-3), members)
 
     def split(self) -> SplitEnsemble:
@@ -295,12 +304,12 @@ def lower_bound(values: Tensor, pessimism: float) -> Tensor:
     return mean - pessimism * spread
 
 
-def mean_squares(values: Tensor, scene: Scene, layout: StateLayout) -> Tensor:
-    """Mean square ``[*B, C]`` of each component of values ``[*B, N, D]``, over the channels that can move."""
-    moves = torch.as_tensor(scene.movable & scene.predicted[:, None], device=values.device)
-    squares = torch.where(moves, values.square(), 0.0)
+def mean_squares(values: Tensor, counted: Tensor, layout: StateLayout) -> Tensor:
+    """Mean square ``[*B, C]`` of each component of values ``[*B, N, D]``, over channels that are ``counted``."""
+    squares = torch.where(counted, values.square(), 0.0)
     parts = [
-        squares[..., where].sum((-1, -2)) / moves[:, where].sum().clamp(min=1) for where in layout.delta_slices.values()
+        squares[..., where].sum((-1, -2)) / counted[:, where].sum().clamp(min=1)
+        for where in layout.delta_slices.values()
     ]
     return torch.stack(parts, dim=-1)
 

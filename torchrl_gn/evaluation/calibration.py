@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -141,8 +140,7 @@ def _errors(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tens
     state, action = trajectories["state"], trajectories["action"]
     mean, spread = mean_and_spread(ensemble.rollout(state[:, 0], action), ensemble.layout)
     error = ensemble.layout.delta(mean, state).abs()
-    movable = torch.as_tensor(ensemble.scene.movable & np.asarray(ensemble.scene.predicted)[:, None])
-    return error[:, 1:].double(), spread[:, 1:].double(), movable
+    return error[:, 1:].double(), spread[:, 1:].double(), ensemble.counted
 
 
 def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -155,7 +153,7 @@ def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Te
     std = ensemble.calibration(spread.unsqueeze(-3), ensemble.layout).squeeze(-3)
     error = ensemble.layout.delta(mean, after)
     known = std.isfinite().flatten(1).all(1)
-    stated, wrong = (mean_squares(each[known].double(), ensemble.scene, ensemble.layout) for each in (std, error))
+    stated, wrong = (mean_squares(each[known].double(), ensemble.counted, ensemble.layout) for each in (std, error))
     return stated, wrong
 
 
