@@ -98,7 +98,8 @@ def main(cfg: DictConfig) -> None:
     run = RunFolder(cfg.run_dir, "adaptation")
     tracker = open_log(cfg, run, label=f"adaptation-{scene.name}")
     predictor = specialize(load_pretrained(cfg.checkpoint or cfg.system).model.bind(scene))
-    unchanged = collect_trajectories(scene, cfg.calibration, cfg.length, seed=cfg.seed)
+    # As long as what is remembered: a robot that fell an hour ago errs otherwise than one that has just begun.
+    unchanged = collect_trajectories(scene, cfg.calibration, max(at), seed=cfg.seed)
     adaptation = CommandAdaptation(predictor, unchanged, memory=cfg.memory)
     before = errors(predictor, collect_trajectories(scene, cfg.test, cfg.length, seed=cfg.seed + 1))
     metrics = {f"unchanged/{name}": value for name, value in before.items()}

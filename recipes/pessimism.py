@@ -14,6 +14,7 @@ recipes/config/pessimism.yaml. Results: docs/results/pessimism.md.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, cast
 
 import hydra
 import torch
@@ -54,8 +55,9 @@ def promised(imagined: ModelEnv, now: TensorDictBase) -> tuple[Tensor, Tensor]:
     left, members = now["plan", "actions"][:, 0], imagined.members  # of candidates the best
     actions = torch.cat((now["action"].unsqueeze(1), left[:, :-1]), dim=1)
     starts = now.select("state")
-    many = torch.cat([starts] * members), actions.repeat(members, 1, 1)
-    means = imagined.by_member().imagine(*many)[1].mean((-2, -1)).reshape(members, -1)
+    many = cast(TensorDictBase, torch.cat(cast(Any, [starts] * members)))
+    rewards = imagined.by_member().imagine(many, actions.repeat(members, 1, 1))[1]
+    means = rewards.mean((-2, -1)).reshape(members, -1)
     return means.mean(0), means.std(0) if members > 1 else torch.zeros_like(means[0])
 
 

@@ -54,7 +54,7 @@ class CommandAdaptation(Float64Buffers):
     Args:
         predictor: of one scene, specialised to be quick; neither recurrent nor with parameters of each sample.
         trajectories: ``[M]`` of the unchanged robot, some 20 or more, with which the predictor was not trained: their
-            errors are the noise.
+            errors are the noise. Best as long as the memory, in situations that the robot comes into.
         memory: seconds after which a step counts for a third.
         gain_std: standard deviation of gains before anything is seen.
         offset_std: of offsets, in standard deviations of the trajectories' commands.

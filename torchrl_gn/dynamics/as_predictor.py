@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -43,7 +43,7 @@ class ModulePredictor:
     def parameters_in(self, tensordict: TensorDictBase) -> None:
         """None: only predictors read physical parameters; ValueError for those that predictors within refuse."""
         if hasattr(self.module, "parameters_in"):
-            self.module.parameters_in(tensordict)
+            cast(Any, self.module).parameters_in(tensordict)
 
     def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.select(*self.rest, strict=False)

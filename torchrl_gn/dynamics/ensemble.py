@@ -272,13 +272,13 @@ class SplitEnsemble(TensorDictModuleBase):
 
         ValueError unless the number of samples is a multiple of ``K``.
         """
-        return torch.cat([member.rollout(*share)[0] for member, *share in self._shares(state, actions)])
+        return torch.cat([member.rollout(start, given)[0] for member, start, given in self._shares(state, actions)])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write each sample's next state."""
         self.parameters_in(tensordict)
         state, action = (tensordict[key] for key in self.in_keys[:2])
-        after = [member.step(*share)[0] for member, *share in self._shares(state, action)]
+        after = [member.step(before, given)[0] for member, before, given in self._shares(state, action)]
         return tensordict.set(self.out_keys[0], torch.cat(after))
 
     def _shares(self, state: Tensor, action: Tensor) -> Iterator[tuple[Predictor, Tensor, Tensor]]:

@@ -91,7 +91,7 @@ class SHACLoss(LossModule):
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
         # Not registered, so that the model's weights stay out of parameters().
-        object.__setattr__(self, "env", for_learning(env).by_member())
+        object.__setattr__(self, "env", cast(ModelEnv, for_learning(env)).by_member())
         network = TensorDictModule(value.of_features, ["features"], ["state_value"])
         estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
         object.__setattr__(self, "_estimator", estimator)

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -210,7 +210,8 @@ class GradientPlanner(RecedingHorizonPlanner):
         """
         members, actions = self.imagined.members, self._actions(plan).flatten(0, 1)
         if members > 1:
-            starts, actions = cast(TensorDictBase, torch.cat([starts] * members)), actions.repeat(members, 1, 1)
+            starts = cast(TensorDictBase, torch.cat(cast(Any, [starts] * members)))
+            actions = actions.repeat(members, 1, 1)
         imagined = self.imagined.by_member().imagine_steps(starts, actions, prepared)
         total = torch.where(imagined.diverged, -torch.inf, imagined.rewards.sum((-2, -1)))
         total = total.reshape(members, *plan.shape[:2])
