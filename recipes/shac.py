@@ -16,6 +16,7 @@ once, and each has its own value, model and video. All options: recipes/config/s
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import statistics
 import time
@@ -42,6 +43,7 @@ from torchrl_gn.training import RunFolder, Tracker, load_pretrained
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
 MAY_CHANGE = ("rounds", "zero_shot", "threads", "device", "logger", "run_dir")
+FALL = 0.15  # share of the best return that a round may lose
 COLUMNS = {
     "frames": "frames",
     "minutes": "processor minutes",
@@ -65,6 +67,12 @@ def shown(name: str, value: float | None) -> str:
     if value is None:
         return "-"
     return f"{value:,}" if name == "frames" else f"{value:,.4g}"
+
+
+def fallen_back(returns: list[float]) -> int:
+    """How many returns are more than 15 % below the best before them, which is positive."""
+    highest = itertools.accumulate(returns, max)
+    return sum(value < (1 - FALL) * best for value, best in zip(returns, highest, strict=True) if best > 0)
 
 
 def report(
@@ -93,6 +101,7 @@ def report(
         name = f"{task.folder}.gif" if several else "episode.gif"
         rollout_video(task.scene, episodes["state"][0], None, run.file(name))
     best = max(rounds, key=lambda numbers: numbers["reward"])
+    others = {**others, "rounds_fallen_back": float(fallen_back([numbers["return"] for numbers in rounds]))}
     each = {f"round {index}/{name}": value for index, of in enumerate(rounds) for name, value in of.items()}
     return {
         **rounds[-1],

@@ -58,6 +58,26 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     assert code == 0, errors
 
 
+@pytest.mark.slow
+def test_an_ensemble_resumes_too(tmp_path, call):
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    options = ("members=2", "pessimism=1.0")
+    for folder, rounds in ((whole, 2), (resumed, 1), (resumed, 2)):
+        code, _, errors = call(*SMALL, *options, f"rounds={rounds}", f"run_dir={folder}", recipe="shac")
+        assert code == 0 and "warning" not in errors.lower(), errors
+    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (whole, resumed)]
+    for name in ("reward", "return", "frames", "error", "entropy", "loss_value", "rounds_fallen_back"):
+        assert metrics[0][name] == metrics[1][name]
+    assert len(load_pretrained(whole).ensemble.models) == 2
+    code, _, errors = call(*SMALL, "rounds=1", "pessimism=1.0", f"run_dir={tmp_path / 'one'}", recipe="shac")
+    assert code == 1 and "pessimism=1.0 needs an ensemble" in errors
+
+
+def test_rounds_that_fall_back_are_counted(load):
+    count = load("shac").fallen_back
+    assert count([1.0, 2.0, 1.8, 1.6, 3.0, 2.5]) == 2 and count([-3.0, -5.0]) == 0
+
+
 def forge(path, change) -> None:
     """Write a checkpoint again, with another state to resume from."""
     honest = load_pretrained(path)
