@@ -93,6 +93,8 @@ pessimism system=pendulum reward=balance members=2 hidden=8 train_steps=5 "data=
 adaptation system=swimmer6 seconds=[0.1] robots=2 calibration=5 test=5 length=25
     "faults=[{{command: 0, gain: 0.0}}]" run_dir=runs/adaptation
 
+identify_parameters robots=1 window=100 run_dir=runs/identify_parameters
+
 contacts steps=5 "episodes={{train: 10, validation: 3, test: 3}}" run_dir=runs/contacts
 
 mpc system=swimmer6 planner=[gn,ilqg,cem,mppi,random] horizon=4 steps=3 episodes=2 gn.warm_up=2 gn.samples=4

@@ -1,0 +1,203 @@
+"""Identify numbers of a MuJoCo model from trajectories, with intervals, beside mujoco.sysid.
+
+    python recipes/identify_parameters.py [system=arm] [parameters=[dof_armature]] [noise=[0.001, 0.02]]
+
+Simulates robots whose numbers are not those of their model: each number times a random factor. identify_parameters()
+looks for them from the model's, in states that are measured with noise, and says how sure it is. For the arm of
+mujoco.sysid's own test (five hinges, two seconds of sine waves, MuJoCo 3.5 or newer with `pip install mujoco[sysid]`)
+that toolbox looks for the armatures too. Beyond the paper.
+
+Writes config.yaml and metrics.json to its run folder. All options: recipes/config/identify_parameters.yaml. Results:
+docs/results/identified-parameters.md.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+import hydra
+import mujoco
+import numpy as np
+import torch
+from mujoco import rollout
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from tqdm import tqdm
+
+from _common import as_list, clean_exit, finish_run, load_system, open_log, with_help
+from torchrl_gn.data import Simulator, collect_trajectories
+from torchrl_gn.identification import identify_parameters, parameter_names, with_factors
+from torchrl_gn.planners.plan import check_count
+from torchrl_gn.scenes import Scene, load_scene
+from torchrl_gn.training import RunFolder
+
+TIMESTEP, SECONDS = 0.002, 2.0
+ARMATURES = (0.5, 0.4, 0.3, 0.2, 0.1)
+# Links of the arm of mujoco.sysid's test: length, mass, inertia, centre of mass, damping, axis.
+LINKS = (
+    (0.1, 1.0, (0.01, 0.01, 0.005), 0.05, 1.0, "0 0 1"),
+    (0.1, 0.8, (0.008, 0.008, 0.004), 0.05, 0.8, "0 1 0"),
+    (0.1, 0.6, (0.006, 0.006, 0.003), 0.05, 0.6, "0 1 0"),
+    (0.08, 0.4, (0.004, 0.004, 0.002), 0.04, 0.4, "0 0 1"),
+    (0.06, 0.2, (0.002, 0.002, 0.001), 0.03, 0.2, "0 1 0"),
+)
+WAVES = ((5.0, 0.5, 0.0), (4.0, 0.7, 0.5), (3.0, 0.4, 1.0), (2.0, 0.9, 1.5), (1.0, 0.6, 2.0))  # N m, Hz, phase
+
+
+def arm_mjcf(armatures: tuple[float, ...]) -> str:
+    """MJCF of the arm."""
+    bodies, height = "", 0.1
+    for number, ((length, mass, inertia, centre, damping, axis), armature) in enumerate(
+        zip(LINKS, armatures, strict=True), 1
+    ):
+        bodies += f"""<body name="link{number}" pos="0 0 {height}">
+            <inertial pos="0 0 {centre}" mass="{mass}" diaginertia="{" ".join(map(str, inertia))}"/>
+            <joint name="joint{number}" type="hinge" axis="{axis}" range="-3.14 3.14" armature="{armature}"
+                damping="{damping}"/>
+            <geom type="capsule" fromto="0 0 0 0 0 {length}" size="0.03"/>"""
+        height = length
+    names = [f"joint{number}" for number in range(1, len(LINKS) + 1)]
+    motors = "".join(f'<motor name="motor_{name}" joint="{name}" ctrlrange="-10 10"/>' for name in names)
+    sensors = "".join(
+        f'<joint{kind} name="{name}_{kind}" joint="{name}"/>' for kind in ("pos", "vel") for name in names
+    )
+    return f"""<mujoco model="arm"><compiler angle="radian" autolimits="true"/>
+        <option integrator="implicitfast" timestep="{TIMESTEP}"><flag contact="disable"/></option>
+        <worldbody>{bodies}{"</body>" * len(LINKS)}</worldbody>
+        <actuator>{motors}</actuator><sensor>{sensors}</sensor></mujoco>"""
+
+
+def simulate_arm(scene: Scene) -> TensorDict:
+    """One trajectory of the arm under sine waves."""
+    times = TIMESTEP * np.arange(round(SECONDS / TIMESTEP))
+    controls = np.stack([size * np.sin(2 * np.pi * rate * times + phase) for size, rate, phase in WAVES], -1)[None]
+    simulated = Simulator(scene).rollout(np.zeros((1, scene.physics_size)), controls)
+    return TensorDict(
+        {"state": simulated["state"], "physics": simulated["physics"], "action": torch.from_numpy(controls)}, [1]
+    )
+
+
+def with_noise(scene: Scene, trajectories: TensorDict, noise: tuple[float, float], rng: np.random.Generator):
+    """Trajectories as measured: noise of joint coordinates (m, rad) and rates."""
+    physics, model = trajectories["physics"].numpy().copy(), scene.model
+    rates = slice(1 + model.nq, 1 + model.nq + model.nv)
+    for row in physics.reshape(-1, physics.shape[-1]):
+        position = row[1 : 1 + model.nq].copy()
+        mujoco.mj_integratePos(model, position, noise[0] * rng.standard_normal(model.nv), 1.0)
+        row[1 : 1 + model.nq] = position
+    physics[..., rates] += noise[1] * rng.standard_normal(physics[..., rates].shape)
+    measured = {"state": Simulator(scene).observe(physics), "physics": torch.from_numpy(physics)}
+    return TensorDict({**measured, "action": trajectories["action"]}, trajectories.shape)
+
+
+def by_sysid(controls: np.ndarray, noise: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
+    """Armatures of the arm as mujoco.sysid finds them, from 0.01 and within 0.001 to 1, as in its test.
+
+    It sees the arm's joint sensors under controls ``[T, A]``, with noise, and knows the start.
+    """
+    from mujoco import sysid
+
+    spec = mujoco.MjSpec.from_string(arm_mjcf(ARMATURES))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    start = sysid.create_initial_state(model, data.qpos, data.qvel, data.act)
+    states, sensors = (each[0] for each in rollout.rollout(model, data, start, controls[:-1]))
+    sensors = sensors + np.repeat(noise, model.nv) * rng.standard_normal(sensors.shape)
+    seen = sysid.TimeSeries.from_names(states[:, 0], sensors, model)
+    given = sysid.TimeSeries(TIMESTEP * np.arange(len(controls)), controls)
+    found = sysid.ParameterDict()
+    for number in range(1, len(LINKS) + 1):
+        name = f"joint{number}"
+
+        def change(spec: Any, parameter: Any, name: str = name) -> None:
+            spec.joint(name).armature = parameter.value[0]
+
+        found.add(sysid.Parameter(name, nominal=0.5, min_value=0.001, max_value=1.0, modifier=change))
+        found[name].value[:] = 0.01
+    sequences = sysid.ModelSequences("arm", spec, "sines", start, given, seen)
+    residual = sysid.build_residual_fn(models_sequences=[sequences])
+    best, _ = sysid.optimize(initial_params=found, residual_fn=residual, optimizer="mujoco", verbose=False)
+    return np.array([best[f"joint{number}"].value[0] for number in range(1, len(LINKS) + 1)])
+
+
+def chosen_parameters(names: list[str]) -> dict[str, list[str] | None]:
+    """Names by array: ``"dof_armature"`` for all, ``"body_mass torso"`` for one."""
+    found: dict[str, list[str] | None] = {}
+    for each in names:
+        array, _, name = each.partition(" ")
+        found[array] = [*(found.get(array) or []), name] if name else None
+    return found
+
+
+def has_sysid() -> bool:
+    """Whether mujoco.sysid is there with all that it needs."""
+    try:
+        from mujoco import sysid
+    except ImportError:
+        return False
+    return hasattr(sysid, "optimize")
+
+
+def summarize(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Errors, coverage and seconds over the robots."""
+    off, std = (np.stack([row[name] for row in rows]) for name in ("off", "std"))
+    metrics = {
+        "relative error": float(np.sqrt(np.mean(np.square(off)))),
+        "largest relative error": float(np.abs(off).max()),
+        "stated relative error": float(np.sqrt(np.mean(np.square(std)))),
+        "within one": float((np.abs(off) <= std).mean()),
+        "within two": float((np.abs(off) <= 2 * std).mean()),
+        "seconds": statistics.median(row["seconds"] for row in rows),
+    }
+    if "sysid" in rows[0]:
+        other = np.stack([row["sysid"] for row in rows])
+        metrics["mujoco.sysid/relative error"] = float(np.sqrt(np.mean(np.square(other))))
+        metrics["mujoco.sysid/largest relative error"] = float(np.abs(other).max())
+        metrics["mujoco.sysid/seconds"] = statistics.median(row["sysid_seconds"] for row in rows)
+    return metrics
+
+
+@with_help
+@hydra.main(version_base=None, config_path="config", config_name="identify_parameters")
+@clean_exit
+def main(cfg: DictConfig) -> None:
+    check_count("robots", cfg.robots, 1)
+    torch.set_num_threads(cfg.threads)
+    arm = cfg.system == "arm"
+    scene = load_scene(arm_mjcf((0.01,) * len(LINKS)), timestep=TIMESTEP) if arm else load_system(cfg, cfg.system)
+    run = RunFolder(cfg.run_dir, "identify_parameters")
+    tracker = open_log(cfg, run, label=f"identify-{scene.name}")
+    options = {"window": cfg.window, "fit_starts": cfg.fit_starts, "num_threads": cfg.threads, "seed": cfg.seed}
+    chosen, noise = chosen_parameters(as_list(cfg.parameters)), (float(cfg.noise[0]), float(cfg.noise[1]))
+    rng = np.random.default_rng(cfg.seed)
+    names = parameter_names(scene, chosen)
+    rows: list[dict[str, Any]] = []
+    for robot in tqdm(range(cfg.robots), desc="robots", leave=False):
+        factors = np.exp(rng.uniform(-1, 1, len(names)) * np.log(cfg.factor))
+        if arm:
+            factors = np.array(ARMATURES) / 0.01
+        true = with_factors(scene, chosen, factors)
+        if arm:
+            played = simulate_arm(true)
+        else:
+            played = collect_trajectories(true, cfg.trajectories, cfg.steps, seed=cfg.seed + robot)
+        measured = with_noise(true, played, noise, rng)
+        start = time.perf_counter()
+        found = identify_parameters(scene, measured, chosen, **options)
+        row = {"seconds": time.perf_counter() - start, "off": np.log(found.factor / factors), "std": found.log_std}
+        if arm and has_sysid():
+            start = time.perf_counter()
+            row["sysid"] = np.log(by_sysid(measured["action"][0].numpy(), noise, rng) / ARMATURES)
+            row["sysid_seconds"] = time.perf_counter() - start
+        rows.append(row)
+    metrics = summarize(rows)
+    print(f"{scene.name}: {len(names)} numbers of {cfg.robots} robots, noise {noise[0]:g} and {noise[1]:g} / s")
+    for name, value in metrics.items():
+        print(f"  {name:40}{value:.4g}")
+    finish_run(cfg, run, tracker, metrics, step=cfg.robots)
+
+
+if __name__ == "__main__":
+    main()

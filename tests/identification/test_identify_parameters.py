@@ -1,0 +1,102 @@
+"""Numbers of a MuJoCo model from trajectories."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.data import Simulator, collect_trajectories
+from torchrl_gn.identification import identify_parameters, parameter_names, with_factors
+from torchrl_gn.scenes import load_scene
+
+ARM = """<mujoco model="arm"><option integrator="implicitfast" timestep="0.005"/><worldbody>
+  <body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.5" armature="0.05"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" contype="0" conaffinity="0"/>
+    <body name="lower" pos="0.3 0 0"><joint name="elbow" axis="0 1 0" damping="0.2" armature="0.02"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" contype="0" conaffinity="0"/></body></body></worldbody>
+  <actuator><motor joint="shoulder" ctrlrange="-20 20"/><motor joint="elbow" ctrlrange="-5 5"/></actuator></mujoco>"""
+NUMBERS = {"dof_armature": None, "dof_damping": ["elbow"], "body_mass": ["lower"]}
+FACTORS = np.array([3.0, 0.4, 1.7, 1.5])
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_scene(ARM, timestep=0.01)
+
+
+@pytest.fixture(scope="module")
+def played(arm) -> TensorDict:
+    return collect_trajectories(with_factors(arm, NUMBERS, FACTORS), 6, 60, seed=0)
+
+
+def measured(arm, played: TensorDict, seed: int) -> TensorDict:
+    """With noise of 1 mrad and 10 mrad/s."""
+    rng, physics = np.random.default_rng(seed), played["physics"].numpy().copy()
+    physics[..., 1:3] += 1e-3 * rng.standard_normal(physics[..., 1:3].shape)
+    physics[..., 3:5] += 1e-2 * rng.standard_normal(physics[..., 3:5].shape)
+    return TensorDict({"state": Simulator(arm).observe(physics), "action": played["action"]}, played.shape)
+
+
+def test_it_finds_the_numbers_to_rounding(arm, played):
+    found = identify_parameters(arm, played, NUMBERS, window=30)
+    names = ("dof_armature shoulder", "dof_armature elbow", "dof_damping elbow", "body_mass lower")
+    assert found.names == parameter_names(arm, NUMBERS) == names
+    np.testing.assert_allclose(found.factor, FACTORS, rtol=1e-7)
+    np.testing.assert_allclose(found.value[:3], [0.15, 0.008, 0.34], rtol=1e-7)
+    assert found.model.dof_damping[1] == found.value[2] and found.error < 1e-8
+    lower = found.model.body("lower").id
+    np.testing.assert_allclose(found.model.body_inertia[lower], 1.5 * arm.model.body_inertia[lower], rtol=1e-6)
+    assert arm.model.dof_damping[1] == 0.2 and str(found).count("\n") == 3
+    assert (found.interval()[:, 0] <= found.value).all()
+
+
+def test_starts_follow_from_states(arm, played):
+    found = identify_parameters(arm, played.exclude("physics"), NUMBERS, window=30)
+    np.testing.assert_allclose(found.factor, FACTORS, rtol=1e-5)
+
+
+def test_noise_is_within_what_is_stated(arm, played):
+    errors, plain = [], []
+    for seed in range(5):
+        noisy = measured(arm, played, seed)
+        found = identify_parameters(arm, noisy, NUMBERS, window=60, fit_starts=True)
+        errors.append(np.log(found.factor / FACTORS) / found.log_std)
+        assert (found.log_std < 0.1).all()
+        plain.append(np.log(identify_parameters(arm, noisy, NUMBERS, window=60).factor / FACTORS))
+    errors = np.abs(errors)
+    assert (errors < 2).mean() >= 0.8 and (errors < 4).all()
+    # Starts as measured bias the numbers.
+    assert np.square(plain).mean() > np.square(errors * found.log_std).mean()
+
+
+def test_what_nothing_tells_is_unknown(arm):
+    still = {"state": torch.zeros(1, 11, 3, 13).double(), "action": torch.zeros(1, 10, 2).double()}
+    physics = torch.zeros(1, 11, arm.physics_size).double()
+    physics[..., 0] = 0.01 * torch.arange(11)
+    hanging = with_factors(arm, {"dof_damping": None}, np.ones(2))
+    hanging.model.opt.gravity[:] = 0
+    state = Simulator(hanging).rollout(physics[:, 0], still["action"])["state"]
+    data = TensorDict({**still, "state": state, "physics": physics}, [1])
+    found = identify_parameters(hanging, data, {"dof_armature": ["elbow"]}, window=10)
+    assert found.factor == 1 and np.isinf(found.log_std).all()
+
+
+def test_what_does_not_fit_is_named(arm, played):
+    for parameters, what in (
+        ({"nv": None}, "'nv' is no array of mjModel"),
+        ({"dof_armature": ["wrist"]}, r"dof_armature: the model has no 'wrist', only \['shoulder', 'elbow'\]"),
+        ({"dof_frictionloss": ["elbow"]}, "dof_frictionloss of 'elbow' is 0"),
+        ({"dof_frictionloss": None}, "There is no number to identify"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            identify_parameters(arm, played, parameters)
+    with pytest.raises(ValueError, match="window=61 must be from 1 to the trajectories' 60 steps"):
+        identify_parameters(arm, played, NUMBERS, window=61)
+
+
+def test_windows_are_drawn(arm, played):
+    found = identify_parameters(arm, played, {"body_mass": ["lower"]}, window=10, max_windows=3)
+    assert np.isfinite(found.log_std).all() and mujoco.MjModel is type(found.model)

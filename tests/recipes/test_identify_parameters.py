@@ -1,0 +1,25 @@
+"""The recipe that identifies numbers of a model."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+
+@pytest.mark.slow
+def test_the_arm_is_found(call, tmp_path):
+    code, output, errors = call("robots=1", "window=1000", f"run_dir={tmp_path / 'run'}", recipe="identify_parameters")
+    assert code == 0, errors
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["largest relative error"] < 1e-6 and "arm: 5 numbers of 1 robots" in output
+
+
+@pytest.mark.slow
+def test_any_system_is_found(call, tmp_path):
+    options = ("system=pendulum", "parameters=[dof_damping, body_mass pole]", "trajectories=2", "steps=20")
+    options += ("window=10", "robots=2", "noise=[0.001, 0.01]", "fit_starts=true")
+    code, _, errors = call(*options, f"run_dir={tmp_path / 'run'}", recipe="identify_parameters")
+    assert code == 0, errors
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["relative error"] < 0.5 and 0 <= metrics["within two"] <= 1

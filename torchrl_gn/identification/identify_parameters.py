@@ -1,0 +1,321 @@
+"""Identify numbers of a MuJoCo model from trajectories, with intervals."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
+
+_DIFFERENCE = 1e-6  # of logarithms and starts, for one-sided differences
+_DAMPING = (1e-2, 1.0, 1e2, 1e4)  # factors of Levenberg and Marquardt that are tried at once
+_LARGEST = 1.0  # change of a logarithm in one iteration
+_CONVERGED = 1e-9  # largest change of a logarithm
+_REWEIGHED = 3  # times that residuals are weighed anew
+_ROUNDING = 1e-9  # of the motion
+_KINDS = {
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
+    "dof": mujoco.mjtObj.mjOBJ_JOINT,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
+}
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Numbers of a model that explain trajectories."""
+
+    names: tuple[str, ...]  # "dof_armature elbow"
+    factor: np.ndarray  # [P] by which the model's numbers are multiplied
+    log_std: np.ndarray  # [P] standard deviation of its logarithm; infinite if nothing tells the factor
+    value: np.ndarray  # [P] the first of the numbers after that
+    error: float  # root mean square of what is left, by that of standing still
+    model: mujoco.MjModel  # with the new numbers
+
+    def interval(self, deviations: float = 2.0) -> np.ndarray:
+        """Intervals ``[P, 2]`` of the values, of so many standard deviations to each side."""
+        return self.value[:, None] * np.exp(np.outer(self.log_std, [-deviations, deviations]))
+
+    def __str__(self) -> str:
+        low, high = self.interval().T
+        rows = zip(self.names, self.value, low, high, strict=True)
+        return "\n".join(f"{name:40}{value:12.5g}   {a:.5g} to {b:.5g}" for name, value, a, b in rows)
+
+
+def parameter_names(scene: Scene, parameters: Mapping[str, Sequence[str] | None]) -> tuple[str, ...]:
+    """Names of the numbers that ``parameters`` of :func:`identify_parameters` chooses, ``"dof_armature elbow"``."""
+    return _rows(scene.model, parameters)[0]
+
+
+def with_factors(scene: Scene, parameters: Mapping[str, Sequence[str] | None], factors: np.ndarray) -> Scene:
+    """The scene with these numbers of its MuJoCo model multiplied by ``factors`` ``[P]``, to simulate.
+
+    For simulation alone: what models read of the scene stays.
+    """
+    return _changed(scene, _rows(scene.model, parameters)[1], np.log(factors))
+
+
+def identify_parameters(
+    scene: Scene,
+    trajectories: TensorDictBase,
+    parameters: Mapping[str, Sequence[str] | None],
+    *,
+    window: int = 50,
+    max_windows: int = 100,
+    fit_starts: bool = False,
+    iterations: int = 50,
+    num_threads: int | None = None,
+    seed: int = 0,
+) -> Identified:
+    """Find positive numbers of a MuJoCo model with which it simulates what trajectories show.
+
+    Least squares of simulations over windows of the trajectories (multiple shooting) by Levenberg and Marquardt's
+    method, in the logarithms; components are weighed by what is left of them. Standard deviations allow for residuals
+    that are alike within a window (clusters; Liang and Zeger 1986).
+
+    Args:
+        scene: where the search starts.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]``, ``action`` ``[M, T, A]`` and, if known, ``physics``
+            ``[M, T + 1, S]``; else starts follow from states.
+        parameters: names of the bodies, joints, geoms, actuators or tendons by array of ``mjModel``, each multiplied by
+            a factor of its own: ``{"dof_armature": ["elbow"], "body_mass": None}``; None: all whose number is not 0.
+            ``body_mass`` multiplies the inertia too.
+        window: control steps of a simulation. Longer ones see small effects, and fail where motion is chaotic.
+        max_windows: windows that are drawn at random if there are more.
+        fit_starts: find the starts of the windows too, for states that are measured with noise, which would bias the
+            numbers otherwise. Give windows several times as long as the robot has coordinates and rates.
+
+    Raises:
+        UnsupportedSceneError: if starts do not follow from the states.
+        ValueError: if an array, name or window does not fit, or a number is 0.
+        FloatingPointError: if simulations become unstable from the start on.
+    """
+    names, rows = _rows(scene.model, parameters)
+    starts, actions, truth = _windows(scene, trajectories, window, max_windows, np.random.default_rng(seed))
+    problem = _Problem(scene, rows, starts, actions, truth, num_threads)
+    log, left = np.zeros(len(names)), problem.moved
+    for again in range(_REWEIGHED):
+        # Of a model that is far off, starts that fit would be far off too.
+        problem.coordinates = 2 * scene.model.nv if fit_starts and again else 0
+        log = problem.solve(log, iterations)
+        left = problem.weigh(log)
+        if (left <= _ROUNDING * problem.moved).all():  # without noise there is nothing to weigh
+            break
+    error = float(np.sqrt(np.mean((left / problem.moved) ** 2)))
+    model = _changed(scene, rows, log).model
+    value = np.array([getattr(model, array)[index].flat[0] for array, index in rows])
+    return Identified(names, np.exp(log), problem.deviations(log), value, error, model)
+
+
+class _Problem:
+    """Residuals of simulations over windows, and their least squares.
+
+    ``coordinates`` of the starts are found beside the logarithms: none, or all with their rates.
+    """
+
+    def __init__(self, scene: Scene, rows, starts: np.ndarray, actions: np.ndarray, truth: Tensor, num_threads) -> None:
+        self.scene, self.rows, self.starts, self.actions, self.truth = scene, rows, starts, actions, truth
+        self.num_threads, self.coordinates = num_threads, 0
+        self.channels = torch.as_tensor(scene.movable & scene.predicted[:, None])
+        sizes = [where.stop - where.start for where in scene.layout.delta_slices.values()]
+        component = np.broadcast_to(np.repeat(np.arange(len(sizes)), sizes), self.channels.shape)
+        self.component = component[self.channels.numpy()]
+        still = scene.layout.delta(truth, truth[:, :1].expand_as(truth))[..., self.channels].numpy()
+        self.moved = np.maximum(self._rms(still), 1e-12)
+        self.weight = 1 / self.moved
+
+    def residuals(self, logs: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """Weighed differences ``[V, W, T + 1, channels]`` of simulations of logarithms ``[V, P]`` from ``[V, W, S]``.
+
+        Infinite where a simulation is unstable.
+        """
+        variants, count = [_changed(self.scene, self.rows, log) for log in logs], len(self.starts)
+        simulated = Simulator(variants, self.num_threads).rollout(
+            starts.reshape(-1, starts.shape[-1]),
+            np.tile(self.actions, (len(logs), 1, 1)),
+            np.repeat(np.arange(len(logs)), count),
+        )
+        state = simulated["state"].unflatten(0, (len(logs), count))
+        off = self.scene.layout.delta(self.truth.expand_as(state), state)[..., self.channels]
+        off = torch.where(simulated["stable"].view(len(logs), count, 1, 1), off, torch.inf)
+        return off.numpy() * self.weight
+
+    def weigh(self, log: np.ndarray) -> np.ndarray:
+        """Weigh components by what is left of them, ``[channels]``, and return that."""
+        left = self._rms(self.residuals(log[None], self.starts[None])[0] / self.weight)
+        # A component of which hardly more than rounding is left must not become all.
+        self.weight = 1 / np.maximum(left, 1e-6 * self.moved)
+        return left
+
+    def solve(self, log: np.ndarray, iterations: int) -> np.ndarray:
+        """Logarithms ``[P]`` that minimise the residuals' squares, from some on."""
+        damping = 1.0
+        for _ in range(iterations):
+            off, slope, by_start = self._linearized(log)
+            cost = float(np.square(off).sum())
+            if not np.isfinite(cost):
+                raise FloatingPointError("Simulations of the trajectories become unstable: give shorter windows.")
+            reduced, reduced_slope = _without(by_start, off), _without(by_start, slope)
+            flat = reduced_slope.reshape(-1, len(log))
+            curvature, gradient = flat.T @ flat, flat.T @ reduced.ravel()
+            tried = damping * np.array(_DAMPING)
+            scale = np.diag(np.maximum(curvature.diagonal(), 1e-300))
+            steps = np.stack([np.linalg.lstsq(curvature + each * scale, -gradient, rcond=None)[0] for each in tried])
+            steps = steps.clip(-_LARGEST, _LARGEST)
+            starts = np.stack([self._moved(_nearest(by_start, off + slope @ step)) for step in steps])
+            costs = np.square(self.residuals(log + steps, starts)).sum((1, 2, 3))
+            costs = np.where(np.isfinite(costs), costs, np.inf)
+            best = int(costs.argmin())
+            if costs[best] < cost:
+                log, self.starts, damping = log + steps[best], starts[best], max(tried[best] / 10, 1e-12)
+                if np.abs(steps[best]).max() < _CONVERGED or cost - costs[best] < 1e-9 * cost:
+                    break
+            elif damping > 1e8:
+                break
+            else:
+                damping *= 1e4
+        return log
+
+    def deviations(self, log: np.ndarray) -> np.ndarray:
+        """Standard deviations ``[P]`` of the logarithms at the minimum; windows are clusters."""
+        off, slope, by_start = self._linearized(log)
+        off, slope = _without(by_start, off), _without(by_start, slope)
+        windows, count = len(off), len(log)
+        flat = slope.reshape(-1, count)
+        curvature = flat.T @ flat
+        known = curvature.diagonal() > 1e-12 * max(curvature.diagonal().max(), 1e-300)
+        inverse = np.linalg.pinv(curvature)
+        # Residuals of one window are alike; of few windows, those of one step, at least.
+        parts = windows if windows > 2 * count else windows * self.truth.shape[1]
+        scores = np.einsum("wrp,wr->wp", slope.reshape(parts, -1, count), off.reshape(parts, -1))
+        free = max(parts - count - windows * self.coordinates * (parts > windows), 1)
+        covariance = inverse @ (scores.T @ scores) @ inverse * parts / free
+        return np.where(known, np.sqrt(np.maximum(covariance.diagonal(), 0)), np.inf)
+
+    def _linearized(self, log: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals ``[W, R]``, and derivatives ``[W, R, P]`` by logarithms and ``[W, R, Q]`` by the starts."""
+        count, size = len(log), self.coordinates
+        logs = np.concatenate((log[None], log + _DIFFERENCE * np.eye(count), np.tile(log, (size, 1))))
+        changes = _DIFFERENCE * np.eye(size)[:, None].repeat(len(self.starts), 1)  # [Q, W, Q]
+        starts = [self.starts] * (1 + count) + [self._moved(change) for change in changes]
+        found = self.residuals(logs, np.stack(starts)).reshape(1 + count + size, len(self.starts), -1)
+        slopes = np.moveaxis((found[1:] - found[0]) / _DIFFERENCE, 0, -1)
+        return found[0], slopes[..., :count], slopes[..., count:]
+
+    def _moved(self, change: np.ndarray) -> np.ndarray:
+        """Starts ``[W, S]`` after changes ``[W, Q]`` of coordinates and rates."""
+        if not change.shape[-1]:
+            return self.starts
+        model, moved = self.scene.model, self.starts.copy()
+        places, rates = slice(1, 1 + model.nq), slice(1 + model.nq, 1 + model.nq + model.nv)
+        for row, step in zip(moved, change, strict=True):
+            position = row[places].copy()
+            mujoco.mj_integratePos(model, position, step[: model.nv], 1.0)
+            row[places] = position
+        moved[:, rates] += change[:, model.nv :]
+        return moved
+
+    def _rms(self, values: np.ndarray) -> np.ndarray:
+        """Root mean square of each channel's component ``[channels]`` of values ``[W, T, channels]``."""
+        squares = np.square(values).mean((0, 1))
+        means = np.bincount(self.component, squares) / np.maximum(np.bincount(self.component), 1)
+        return np.sqrt(means)[self.component]
+
+
+def _nearest(by_start: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Changes of starts ``[W, Q]`` after which residuals ``[W, R]`` are smallest."""
+    if not by_start.shape[-1]:
+        return np.zeros((len(off), 0))
+    return -(np.linalg.pinv(by_start) @ off[..., None])[..., 0]
+
+
+def _without(by_start: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """What no change of the starts makes of residuals ``[W, R]`` or their derivatives ``[W, R, P]``."""
+    if not by_start.shape[-1]:
+        return values
+    basis = np.linalg.qr(by_start)[0]
+    if values.ndim == 2:
+        return values - (basis @ (basis.transpose(0, 2, 1) @ values[..., None]))[..., 0]
+    return values - basis @ (basis.transpose(0, 2, 1) @ values)
+
+
+def _rows(model: mujoco.MjModel, parameters: Mapping[str, Sequence[str] | None]):
+    """Names of the parameters, and the array and the rows of each."""
+    names, rows = [], []
+    for array, chosen in parameters.items():
+        kind = _KINDS.get(array.split("_")[0])
+        values = getattr(model, array, None)
+        if kind is None or not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
+            raise ValueError(f"{array!r} is no array of mjModel with numbers of {list(_KINDS)}.")
+        count = {"body": model.nbody, "jnt": model.njnt, "dof": model.njnt, "geom": model.ngeom}.get(
+            array.split("_")[0], model.nu if kind == mujoco.mjtObj.mjOBJ_ACTUATOR else model.ntendon
+        )
+        given = [mujoco.mj_id2name(model, kind, index) or f"#{index}" for index in range(count)]
+        if chosen is not None and (unknown := [name for name in chosen if name not in given]):
+            raise ValueError(f"{array}: the model has no {unknown[0]!r}, only {given}.")
+        for name in given if chosen is None else chosen:
+            index = given.index(name)
+            where = [index]
+            if array.startswith("dof_"):
+                where = np.flatnonzero(model.dof_jntid == index).tolist()
+            if not (values[where] != 0).any():
+                if chosen is None:
+                    continue
+                raise ValueError(f"{array} of {name!r} is 0, which no factor changes: give the scene a number first.")
+            names.append(f"{array} {name}")
+            rows.append((array, where))
+    if not names:
+        raise ValueError("There is no number to identify: all that parameters= names are 0.")
+    return tuple(names), rows
+
+
+def _changed(scene: Scene, rows, log: np.ndarray) -> Scene:
+    """The scene with other numbers in its model, to simulate."""
+    model = copy.copy(scene.model)
+    for (array, where), factor in zip(rows, np.exp(log), strict=True):
+        for name in (array, "body_inertia") if array == "body_mass" else (array,):
+            getattr(model, name)[where] *= factor
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(scene, model=model)
+
+
+def _windows(
+    scene: Scene, trajectories: TensorDictBase, window: int, most: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, Tensor]:
+    """Starts ``[W, S]``, actions ``[W, T, A]`` and states ``[W, T + 1, N, C]``."""
+    state, action = (trajectories[key].detach().cpu() for key in ("state", "action"))
+    steps = action.shape[1]
+    if not 1 <= window <= steps:
+        raise ValueError(f"window={window} must be from 1 to the trajectories' {steps} steps.")
+    places = [(one, first) for one in range(len(action)) for first in range(0, steps - window + 1, window)]
+    if len(places) > most:
+        places = [places[each] for each in sorted(rng.choice(len(places), most, replace=False))]
+    truth = torch.stack([state[one, first : first + window + 1] for one, first in places]).double()
+    actions = torch.stack([action[one, first : first + window] for one, first in places]).double().numpy()
+    if (known := trajectories.get("physics", None)) is not None:
+        starts = torch.stack([known[one, first] for one, first in places]).double().cpu().numpy()
+    else:
+        starts = _physics(scene, truth[:, 0])
+    return starts, actions, truth
+
+
+def _physics(scene: Scene, state: Tensor) -> np.ndarray:
+    """Full physics states ``[W, S]`` of states ``[W, N, C]``."""
+    model = scene.model
+    if scene.physics_size != 1 + model.nq + model.nv:
+        raise UnsupportedSceneError(
+            f"Scene {scene.name!r} has a state that bodies do not show: give trajectories with their physics."
+        )
+    position, velocity = (each.numpy() for each in JointCoordinates(scene)(state))
+    return np.concatenate((np.zeros((len(state), 1)), position, velocity), axis=1)
