@@ -53,7 +53,7 @@ def test_it_finds_gains_and_offsets(scenes, adaptation, predictor):
     offset = torch.tensor([0.0, 0.0, 0.0, 0.05, 0.0]).double()
     stream = simulated(scenes, gain, offset)
     found = adaptation.read(learned(adaptation, stream, steps=20))
-    torch.testing.assert_close(found.gain, gain.expand(4, 5), rtol=0, atol=0.02)
+    torch.testing.assert_close(found.gain, gain.expand(4, 5), rtol=0, atol=0.03)
     torch.testing.assert_close(found.offset, offset.expand(4, 5), rtol=0, atol=0.02)
     raw = adaptation.read(learned(adaptation, stream), guarded=False)
     off = torch.cat(((raw.gain - gain) / raw.gain_std, (raw.offset - offset) / raw.offset_std))

@@ -20,6 +20,7 @@ from torchrl_gn.maths.state_layout import StateLayout
 _STEP = 0.1  # of a finite difference, in standard deviations of a command
 _JUDGED = 1.0  # seconds over which the model with and without adaptation is judged
 _FREEDOM = 4.0  # degrees of freedom of the errors' distribution
+_DIVERGED = 1e3  # times the noise that an adapted model errs which is not finite
 _EARLY = 5  # fraction of trajectories, 1 / so much, after which the noise is calibrated
 
 
@@ -45,7 +46,8 @@ class CommandAdaptation(Float64Buffers):
 
     To first order a command :math:`u` that acts as :math:`g u + b` changes the next velocities by :math:`\sum_j
     \partial v / \partial u_j ((g_j - 1) u_j + b_j)`, with derivatives of the forward model. Gains and offsets follow
-    by Bayesian linear regression of its errors, recursively: one call of the model with ``A + 1`` commands a step.
+    by Bayesian linear regression of its errors, recursively (an extended Kalman filter): one call of the model with
+    ``A + 2`` commands a step.
     Prediction costs nothing more: the model reads other commands (:class:`AdaptedPredictor`). Beyond the paper.
 
     A belief is a value: :meth:`start` gives one, :meth:`update` the next, :meth:`read` gains and offsets with their
@@ -95,7 +97,10 @@ class CommandAdaptation(Float64Buffers):
         flat = action.flatten(0, -2).double()
         self.register_buffer("middle", flat.mean(0))
         self.register_buffer("unit", flat.std(0).clamp(min=1e-9))
-        error = self._error(state[:, :-1], action, state[:, 1:]).flatten(0, 1)
+        with torch.no_grad():
+            predicted = predictor.step(state[:, :-1], action)[0]
+        error = self._velocities(state[:, :-1], state[:, 1:]) - self._velocities(state[:, :-1], predicted)
+        error = error.flatten(0, 1)
         spread = error.square().mean(0).sqrt()
         self.register_buffer("weight", torch.where(spread > 1e-9 * spread.max(), 1 / spread, 0.0))
         count = action.shape[-1]
@@ -118,23 +123,28 @@ class CommandAdaptation(Float64Buffers):
 
     def _updated(self, belief: Belief, state: Tensor, action: Tensor, next_state: Tensor, keep: float) -> Belief:
         """Belief after a step, of which what was known before counts ``keep``."""
-        error, by_command = self._error(state, action, next_state), self._by_command(state, action)
+        theta = self._significant(belief)
+        predicted, by_command = self._predictions(state, action, self._acting(action, theta))
+        true = self._velocities(state, next_state)
+        errors = (true - predicted) * self.weight  # [2, *B, N, V] of the commands as given, and as they are said to act
         inputs = self._inputs(by_command, action)  # [*B, N V, P]
-        weighted = (error * self.weight).flatten(-2)
-        mean = self._mean(belief)
-        left = weighted - (inputs @ mean.unsqueeze(-1)).squeeze(-1)
+        without, adapted = errors.flatten(-2)
+        known = inputs.isfinite().flatten(-2).all(-1) & adapted.isfinite().all(-1)
+        # Where the adapted model diverges, that is judged, but nothing is learned.
+        adapted = torch.where(known.unsqueeze(-1), adapted, _DIVERGED)
+        inputs = torch.where(known[..., None, None], inputs, 0.0)
         count = (self.weight > 0).sum()
-        size = torch.stack([self.inflation * each.square().sum(-1) / count for each in (weighted, left)], -1)
+        size = torch.stack([self.inflation * each.square().sum(-1) / count for each in (without, adapted)], -1)
         # Errors have long tails, as where bodies hit the ground: those of a Student's t weigh less the larger they are.
         trusted = inputs.mT * ((_FREEDOM + 1) / (_FREEDOM + size[..., 1]))[..., None, None]
+        wanted = adapted.unsqueeze(-1) + inputs @ theta.unsqueeze(-1)  # linear about what is known (extended Kalman)
         after = Belief(
             keep * belief.precision + trusted @ inputs,
-            keep * belief.moment + (trusted @ weighted.unsqueeze(-1)).squeeze(-1),
+            keep * belief.moment + (trusted @ wanted).squeeze(-1),
             self._judged * belief.errors + (1 - self._judged) * size.log1p(),
         )
-        # What is not finite, a lost packet or a diverged prediction, teaches nothing.
-        good = next_state.isfinite().flatten(-2).all(-1) & inputs.isfinite().flatten(-2).all(-1)
-        good = good & weighted.isfinite().all(-1)
+        # What is not finite, as a lost packet, teaches nothing.
+        good = next_state.isfinite().flatten(-2).all(-1) & without.isfinite().all(-1)
         return Belief(
             *(
                 torch.where(good.reshape(*good.shape, *[1] * (new.ndim - good.ndim)), new, old)
@@ -149,14 +159,28 @@ class CommandAdaptation(Float64Buffers):
         ``guarded``: 1 and 0 where that is within two standard deviations, or where in the last second the model
         predicted no worse without; so an unchanged robot keeps its model.
         """
+        std = self._deviations(belief)
         theta = self._mean(belief)
-        std = (self._covariance(belief).diagonal(dim1=-2, dim2=-1) + self.floor.square()).sqrt()
         if guarded:
             without, adapted = belief.errors.unbind(-1)
-            theta = torch.where((adapted < without).unsqueeze(-1) & (theta.abs() > 2 * std), theta, 0.0)
+            theta = torch.where((adapted < without).unsqueeze(-1), self._significant(belief), 0.0)
         gain, shift = theta.chunk(2, -1)
         gain_std, shift_std = std.chunk(2, -1)
         return Commands(1 + gain, gain_std, self.unit * shift - gain * self.middle, self.unit * shift_std)
+
+    def _significant(self, belief: Belief) -> Tensor:
+        """:meth:`_mean` where that is more than two standard deviations off 0, else 0."""
+        theta = self._mean(belief)
+        return torch.where(theta.abs() > 2 * self._deviations(belief), theta, 0.0)
+
+    def _acting(self, action: Tensor, theta: Tensor) -> Tensor:
+        """Commands of the unchanged robot that act as these do, in float64."""
+        gain, shift = theta.chunk(2, -1)
+        return action.double() + gain * (action.double() - self.middle) + shift * self.unit
+
+    def _deviations(self, belief: Belief) -> Tensor:
+        """Standard deviations ``[*B, P]``."""
+        return (self._covariance(belief).diagonal(dim1=-2, dim2=-1) + self.floor.square()).sqrt()
 
     def _mean(self, belief: Belief) -> Tensor:
         """Gains less 1, and offsets in units, ``[*B, P]``."""
@@ -169,22 +193,19 @@ class CommandAdaptation(Float64Buffers):
         """Changes ``[*B, N, V]`` of the components that are rates of others, in float64."""
         return self.predictor.layout.delta(state, next_state)[..., self._rates].double()
 
-    def _error(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        """Error ``[*B, N, V]`` of a step's velocities."""
-        with torch.no_grad():
-            predicted = self.predictor.step(state, action)[0]
-        return self._velocities(state, next_state) - self._velocities(state, predicted)
+    def _predictions(self, state: Tensor, action: Tensor, acting: Tensor) -> tuple[Tensor, Tensor]:
+        """Changes of velocities ``[2, *B, N, V]`` under commands and under others, with derivatives by the others.
 
-    def _by_command(self, state: Tensor, action: Tensor) -> Tensor:
-        """Changes of the next velocities ``[*B, N, V, A]`` by a unit of each command."""
+        Those are ``[*B, N, V, A]`` by a unit of each command.
+        """
         count, batch = action.shape[-1], action.shape[:-1]
         # Towards the middle: models clip commands to their bounds.
-        step = torch.where(action.double() > self.middle, -_STEP, _STEP)  # [*B, A]
-        moved = action.double().unsqueeze(0) + torch.diag_embed(step * self.unit).movedim(-1, 0)
-        commands = torch.cat((action.unsqueeze(0).double(), moved)).to(action.dtype)
-        states = state.expand(count + 1, *batch, *state.shape[-2:])
+        step = torch.where(acting > self.middle, -_STEP, _STEP)  # [*B, A]
+        moved = acting.unsqueeze(0) + torch.diag_embed(step * self.unit).movedim(-1, 0)
+        commands = torch.cat((action.double().unsqueeze(0), acting.unsqueeze(0), moved)).to(action.dtype)
+        states = state.expand(count + 2, *batch, *state.shape[-2:])
         after = self._velocities(states, self.predictor.step(states, commands)[0])
-        return (after[1:] - after[:1]).movedim(0, -1) / step[..., None, None, :]
+        return after[:2], (after[2:] - after[1:2]).movedim(0, -1) / step[..., None, None, :]
 
     def _inputs(self, by_command: Tensor, action: Tensor) -> Tensor:
         """Inputs ``[*B, N V, P]`` of the regression, by the noise."""
