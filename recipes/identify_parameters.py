@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import mujoco
@@ -24,14 +24,14 @@ import torch
 from mujoco import rollout
 from omegaconf import DictConfig
 from tensordict import TensorDict
+from torch import Tensor
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, load_system, open_log, with_help
 from torchrl_gn.data import Simulator, collect_trajectories
-from torchrl_gn.identification import identify_parameters, parameter_names, with_factors
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import Scene, load_scene
-from torchrl_gn.training import RunFolder
+from torchrl_gn.training import RunFolder, identify_parameters, parameter_names, with_factors
 
 TIMESTEP, SECONDS = 0.002, 2.0
 ARMATURES = (0.5, 0.4, 0.3, 0.2, 0.1)
@@ -81,7 +81,7 @@ def simulate_arm(scene: Scene) -> TensorDict:
 
 def with_noise(scene: Scene, trajectories: TensorDict, noise: tuple[float, float], rng: np.random.Generator):
     """Trajectories as measured: noise of joint coordinates (m, rad) and rates."""
-    physics, model = trajectories["physics"].numpy().copy(), scene.model
+    physics, model = cast(Tensor, trajectories["physics"]).numpy().copy(), scene.model
     rates = slice(1 + model.nq, 1 + model.nq + model.nv)
     for row in physics.reshape(-1, physics.shape[-1]):
         position = row[1 : 1 + model.nq].copy()
@@ -189,7 +189,7 @@ def main(cfg: DictConfig) -> None:
         row = {"seconds": time.perf_counter() - start, "off": np.log(found.factor / factors), "std": found.log_std}
         if arm and has_sysid():
             start = time.perf_counter()
-            row["sysid"] = np.log(by_sysid(measured["action"][0].numpy(), noise, rng) / ARMATURES)
+            row["sysid"] = np.log(by_sysid(cast(Tensor, measured["action"])[0].numpy(), noise, rng) / ARMATURES)
             row["sysid_seconds"] = time.perf_counter() - start
         rows.append(row)
     metrics = summarize(rows)

@@ -11,8 +11,7 @@ from tensordict.nn import TensorDictModule
 
 import torchrl_gn as gn
 from torchrl_gn.dynamics import AdaptedPredictor, BoundEnsemble, CommandAdaptation
-from torchrl_gn.planners import StatePolicy, StateValue
-from torchrl_gn.policies import Guarded
+from torchrl_gn.planners import Guarded, StatePolicy, StateValue
 
 from ..sizes import SMALL
 from .conftest import close, task

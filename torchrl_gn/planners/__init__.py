@@ -3,6 +3,7 @@
 from torchrl_gn.planners.bounded_policy import BoundedPolicy as BoundedPolicy
 from torchrl_gn.planners.gradient_planner import GradientPlanner as GradientPlanner
 from torchrl_gn.planners.graph_state_policy import GraphStatePolicy as GraphStatePolicy
+from torchrl_gn.planners.guarded import Guarded as Guarded
 from torchrl_gn.planners.ilqg import ILQGPlanner as ILQGPlanner
 from torchrl_gn.planners.plan_ahead import PlanAhead as PlanAhead
 from torchrl_gn.planners.return_to_go import ReturnToGo as ReturnToGo

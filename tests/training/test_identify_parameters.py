@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data import Simulator, collect_trajectories
-from torchrl_gn.identification import identify_parameters, parameter_names, with_factors
 from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import identify_parameters, parameter_names, with_factors
 
 ARM = """<mujoco model="arm"><option integrator="implicitfast" timestep="0.005"/><worldbody>
   <body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.5" armature="0.05"/>

@@ -9,8 +9,7 @@ from tensordict.nn import TensorDictModule
 
 from torchrl_gn.dynamics import BoundEnsemble, Ensemble
 from torchrl_gn.envs import ModelEnv, SceneEnv
-from torchrl_gn.planners import GradientPlanner
-from torchrl_gn.policies import Guarded
+from torchrl_gn.planners import GradientPlanner, Guarded
 from torchrl_gn.rewards import make_reward
 
 
