@@ -12,13 +12,12 @@ recipes/config/adaptation.yaml. Results: docs/results/adaptation.md.
 
 from __future__ import annotations
 
-import copy
 import statistics
 import time
 from typing import Any
 
 import hydra
-import mujoco
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
@@ -31,7 +30,7 @@ from torchrl_gn.dynamics import AdaptedPredictor, CommandAdaptation, Commands, P
 from torchrl_gn.evaluation import evaluate_errors, plot_rewards
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import Scene
-from torchrl_gn.training import RunFolder, load_pretrained
+from torchrl_gn.training import RunFolder, load_pretrained, with_factors
 
 ERRORS = {"one step": "one_step_error", "20 steps": "rollout_error_20"}
 
@@ -43,12 +42,7 @@ def faulty(scene: Scene, fault: dict[str, Any]) -> tuple[Scene, Tensor, Tensor]:
     """
     gain, offset = torch.ones(scene.num_actions).double(), torch.zeros(scene.num_actions).double()
     if "body" in fault:
-        scene = copy.deepcopy(scene)
-        body = scene.model.body(fault["body"]).id
-        scene.model.body_mass[body] *= fault["mass"]
-        scene.model.body_inertia[body] *= fault["mass"]
-        mujoco.mj_setConst(scene.model, mujoco.MjData(scene.model))
-        return scene, gain, offset
+        return with_factors(scene, {"body_mass": [fault["body"]]}, np.array([fault["mass"]])), gain, offset
     if not (isinstance(which := fault.get("command"), int) and 0 <= which < scene.num_actions):
         raise ValueError(f"A fault has a command below {scene.num_actions}, or a body and its mass; got {fault}.")
     gain[which], offset[which] = fault.get("gain", 1.0), fault.get("offset", 0.0)

@@ -14,7 +14,6 @@ recipes/config/pessimism.yaml. Results: docs/results/pessimism.md.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
 
 import hydra
 import torch
@@ -54,9 +53,7 @@ def promised(imagined: ModelEnv, now: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Mean reward of a step of each plan, and its standard deviation over the members, ``[B]``."""
     left, members = now["plan", "actions"][:, 0], imagined.members  # of candidates the best
     actions = torch.cat((now["action"].unsqueeze(1), left[:, :-1]), dim=1)
-    starts = now.select("state")
-    many = cast(TensorDictBase, torch.cat(cast(Any, [starts] * members)))
-    rewards = imagined.by_member().imagine(many, actions.repeat(members, 1, 1))[1]
+    rewards = imagined.imagine_by_member(now.select("state"), actions).rewards
     means = rewards.mean((-2, -1)).reshape(members, -1)
     return means.mean(0), means.std(0) if members > 1 else torch.zeros_like(means[0])
 

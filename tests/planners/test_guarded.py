@@ -7,18 +7,10 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from torchrl_gn.dynamics import BoundEnsemble, Ensemble
+from torchrl_gn.dynamics import Ensemble
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.planners import GradientPlanner, Guarded
 from torchrl_gn.rewards import make_reward
-
-
-@pytest.fixture
-def ensemble(scenes, make_model) -> BoundEnsemble:
-    made = Ensemble([make_model(scenes["cheetah"], seed=seed) for seed in range(3)])
-    size = (1, len(made.models[0].layout.names))
-    made.calibration.set(torch.ones(size), torch.zeros(size), torch.full(size[1:], 0.01))
-    return made.bind(scenes["cheetah"])
 
 
 def constant(value: float) -> TensorDictModule:

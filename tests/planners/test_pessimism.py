@@ -9,23 +9,14 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from torchrl_gn.dynamics import BoundEnsemble, Ensemble, specialize
+from torchrl_gn.dynamics import Ensemble, specialize
 from torchrl_gn.dynamics.ensemble import lower_bound
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.rewards import make_reward
 
-COUNT, BATCH, HORIZON = 3, 2, 4
+BATCH, HORIZON = 2, 4
 OPTIONS = {"horizon": HORIZON, "candidates": 2, "samples": 4, "seed": 0}
-
-
-@pytest.fixture
-def ensemble(scenes, make_model) -> BoundEnsemble:
-    """Calibrated: its doubt is the members' spread, by 0.01 in every component."""
-    made = Ensemble([make_model(scenes["cheetah"], seed=seed) for seed in range(COUNT)])
-    size = (1, len(made.models[0].layout.names))
-    made.calibration.set(torch.ones(size), torch.zeros(size), torch.full(size[1:], 0.01))
-    return made.bind(scenes["cheetah"])
 
 
 @pytest.fixture

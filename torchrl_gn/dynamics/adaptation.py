@@ -123,7 +123,7 @@ class CommandAdaptation(Float64Buffers):
 
     def _updated(self, belief: Belief, state: Tensor, action: Tensor, next_state: Tensor, keep: float) -> Belief:
         """Belief after a step, of which what was known before counts ``keep``."""
-        theta = self._significant(belief)
+        theta = _significant(*self._estimate(belief))
         predicted, by_command = self._predictions(state, action, self._acting(action, theta))
         true = self._velocities(state, next_state)
         errors = (true - predicted) * self.weight  # [2, *B, N, V] of the commands as given, and as they are said to act
@@ -159,28 +159,23 @@ class CommandAdaptation(Float64Buffers):
         ``guarded``: 1 and 0 where that is within two standard deviations, or where in the last second the model
         predicted no worse without; so an unchanged robot keeps its model.
         """
-        std = self._deviations(belief)
-        theta = self._mean(belief)
+        theta, std = self._estimate(belief)
         if guarded:
             without, adapted = belief.errors.unbind(-1)
-            theta = torch.where((adapted < without).unsqueeze(-1), self._significant(belief), 0.0)
+            theta = torch.where((adapted < without).unsqueeze(-1), _significant(theta, std), 0.0)
         gain, shift = theta.chunk(2, -1)
         gain_std, shift_std = std.chunk(2, -1)
         return Commands(1 + gain, gain_std, self.unit * shift - gain * self.middle, self.unit * shift_std)
-
-    def _significant(self, belief: Belief) -> Tensor:
-        """:meth:`_mean` where that is more than two standard deviations off 0, else 0."""
-        theta = self._mean(belief)
-        return torch.where(theta.abs() > 2 * self._deviations(belief), theta, 0.0)
 
     def _acting(self, action: Tensor, theta: Tensor) -> Tensor:
         """Commands of the unchanged robot that act as these do, in float64."""
         gain, shift = theta.chunk(2, -1)
         return action.double() + gain * (action.double() - self.middle) + shift * self.unit
 
-    def _deviations(self, belief: Belief) -> Tensor:
-        """Standard deviations ``[*B, P]``."""
-        return (self._covariance(belief).diagonal(dim1=-2, dim2=-1) + self.floor.square()).sqrt()
+    def _estimate(self, belief: Belief) -> tuple[Tensor, Tensor]:
+        """:meth:`_mean` and its standard deviations ``[*B, P]``."""
+        std = (self._covariance(belief).diagonal(dim1=-2, dim2=-1) + self.floor.square()).sqrt()
+        return self._mean(belief), std
 
     def _mean(self, belief: Belief) -> Tensor:
         """Gains less 1, and offsets in units, ``[*B, P]``."""
@@ -279,6 +274,11 @@ class AdaptedPredictor(TensorDictModuleBase):
 
     def _acting(self, action: Tensor) -> Tensor:
         return self.gain.to(action.dtype) * action + self.offset.to(action.dtype)
+
+
+def _significant(theta: Tensor, std: Tensor) -> Tensor:
+    """Numbers that are more than two standard deviations off 0; 0 for the others."""
+    return torch.where(theta.abs() > 2 * std, theta, 0.0)
 
 
 def _rate_channels(layout: StateLayout) -> list[int]:

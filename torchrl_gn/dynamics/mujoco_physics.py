@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -20,6 +18,7 @@ from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.processor import usable_cores
 from torchrl_gn.scenes import KinematicTree, Scene, UnsupportedSceneError, load_scene, scene_from_description
 from torchrl_gn.scenes.messages import quiet_mujoco
+from torchrl_gn.scenes.scaled import scaled_scene
 
 _GROUPS = {
     "mass": ("body_mass", "body_inertia"),
@@ -220,15 +219,14 @@ def _scaled(scene: Scene, scale: Mapping[str, float]) -> Scene:
     """The scene with parts of its model multiplied."""
     if not scale:
         return scene
-    model = copy.copy(scene.model)
+    factors = []
     for name, factor in scale.items():
         for array in _GROUPS.get(name, (name,)):
-            values = getattr(model, array, None)
+            values = getattr(scene.model, array, None)
             if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
                 raise ValueError(f"scale={name!r} is not known; use one of {list(_GROUPS)} or an array of mjModel.")
-            values *= factor
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    return replace(scene, model=model)
+            factors.append((array, slice(None), factor))
+    return scaled_scene(scene, factors)
 
 
 def _matched(scene: Scene, tree: KinematicTree, joints: Sequence[str] | None) -> tuple[str, ...]:

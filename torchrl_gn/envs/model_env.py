@@ -106,7 +106,7 @@ class ModelEnv(ModelBasedEnvBase):
         self.ends = done
         self.terminal = terminal_of(terminal, self, self.scene)
         self.unstable_reward, self.spares_learners = finite_reward(unstable_reward), unstable_reward is None
-        self.trust = _checked_trust(trust, model)
+        self.trust = None if trust is None else checked_trust(trust, model)
         self.starts = StartSampler(self.scene, start_states, seed)
         self._state_shape = self.scene.num_nodes, self.scene.state_size
         self._simulator: Simulator | None = None
@@ -264,6 +264,18 @@ class ModelEnv(ModelBasedEnvBase):
             return None
         return model.prepared(model.parameters_in(tensordict), size=tensordict.numel() * horizon)
 
+    def imagine_by_member(
+        self, tensordict: TensorDictBase, actions: Tensor, prepared: PreparedStep | None = None
+    ) -> Imagined:
+        """:meth:`imagine_steps` of every member of an ensemble from a TensorDict ``[B]``.
+
+        ``[K B, ...]``, the first member's first; of another model just the same.
+        """
+        if (count := self.members) > 1:
+            tensordict = cast(TensorDictBase, torch.cat(cast(Any, [tensordict] * count)))
+            actions = actions.repeat(count, 1, 1)
+        return self.by_member().imagine_steps(tensordict, actions, prepared)
+
     def imagine_steps(
         self, tensordict: TensorDictBase, actions: Tensor, prepared: PreparedStep | None = None
     ) -> Imagined:
@@ -304,10 +316,8 @@ class ModelEnv(ModelBasedEnvBase):
         return {**super().__getstate__(), "_simulator": None}
 
 
-def _checked_trust(trust: float | None, model: object) -> float | None:
-    """The highest doubt; ValueError or RuntimeError if there is one that cannot be."""
-    if trust is None:
-        return None
+def checked_trust(trust: float, model: object) -> float:
+    """The highest doubt of a model; ValueError unless it can be one, RuntimeError if an ensemble is not calibrated."""
     if not hasattr(model, "doubt"):
         raise ValueError(f"trust={trust} needs a model that says its doubt, an ensemble, not {type(model).__name__}.")
     if not trust > 0:

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -208,11 +208,8 @@ class GradientPlanner(RecedingHorizonPlanner):
 
         ``prepared``: see :meth:`ModelEnv.prepared`.
         """
-        members, actions = self.imagined.members, self._actions(plan).flatten(0, 1)
-        if members > 1:
-            starts = cast(TensorDictBase, torch.cat(cast(Any, [starts] * members)))
-            actions = actions.repeat(members, 1, 1)
-        imagined = self.imagined.by_member().imagine_steps(starts, actions, prepared)
+        members = self.imagined.members
+        imagined = self.imagined.imagine_by_member(starts, self._actions(plan).flatten(0, 1), prepared)
         total = torch.where(imagined.diverged, -torch.inf, imagined.rewards.sum((-2, -1)))
         total = total.reshape(members, *plan.shape[:2])
         if self.action_cost:

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_gn.dynamics.ensemble import BoundEnsemble
+from torchrl_gn.envs.model_env import checked_trust
 
 
 class Guarded(TensorDictModuleBase):
@@ -40,10 +41,8 @@ class Guarded(TensorDictModuleBase):
                 raise TypeError(
                     f"{name} must be a TensorDict module that writes 'action', got {type(module).__name__}."
                 )
-        if not trust > 0:
-            raise ValueError(f"trust={trust} must be positive: 1 is the doubt that is usual in the calibration's data.")
-        ensemble.calibration.require_fitted()
-        self.policy, self.fallback, self.ensemble, self.trust = policy, fallback, ensemble, float(trust)
+        self.policy, self.fallback, self.ensemble = policy, fallback, ensemble
+        self.trust = checked_trust(trust, ensemble)
         self._past: list[NestedKey] = ["past_actions"] if getattr(ensemble.scene, "history", 0) else []
         reads = dict.fromkeys(("state", *self._past, *policy.in_keys, *fallback.in_keys))
         self.in_keys: list[NestedKey] = list(reads)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.scenes.scaled import scaled_scene
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
 _DIFFERENCE = 1e-6  # of logarithms and starts, for one-sided differences
@@ -63,7 +63,7 @@ def with_factors(scene: Scene, parameters: Mapping[str, Sequence[str] | None], f
 
     For simulation alone: what models read of the scene stays.
     """
-    return _changed(scene, _rows(scene.model, parameters)[1], np.log(factors))
+    return _changed(scene, _rows(scene.model, parameters)[1], factors)
 
 
 def identify_parameters(
@@ -113,7 +113,7 @@ def identify_parameters(
         if (left <= _ROUNDING * problem.moved).all():  # without noise there is nothing to weigh
             break
     error = float(np.sqrt(np.mean((left / problem.moved) ** 2)))
-    model = _changed(scene, rows, log).model
+    model = _changed(scene, rows, np.exp(log)).model
     value = np.array([getattr(model, array)[index].flat[0] for array, index in rows])
     return Identified(names, np.exp(log), problem.deviations(log), value, error, model)
 
@@ -140,7 +140,7 @@ class _Problem:
 
         Infinite where a simulation is unstable.
         """
-        variants, count = [_changed(self.scene, self.rows, log) for log in logs], len(self.starts)
+        variants, count = [_changed(self.scene, self.rows, np.exp(log)) for log in logs], len(self.starts)
         simulated = Simulator(variants, self.num_threads).rollout(
             starts.reshape(-1, starts.shape[-1]),
             np.tile(self.actions, (len(logs), 1, 1)),
@@ -280,14 +280,16 @@ def _rows(model: mujoco.MjModel, parameters: Mapping[str, Sequence[str] | None])
     return tuple(names), rows
 
 
-def _changed(scene: Scene, rows, log: np.ndarray) -> Scene:
+def _changed(scene: Scene, rows, factors: np.ndarray) -> Scene:
     """The scene with other numbers in its model, to simulate."""
-    model = copy.copy(scene.model)
-    for (array, where), factor in zip(rows, np.exp(log), strict=True):
-        for name in (array, "body_inertia") if array == "body_mass" else (array,):
-            getattr(model, name)[where] *= factor
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    return replace(scene, model=model)
+    return scaled_scene(
+        scene,
+        (
+            (name, where, factor)
+            for (array, where), factor in zip(rows, factors, strict=True)
+            for name in ((array, "body_inertia") if array == "body_mass" else (array,))
+        ),
+    )
 
 
 def _windows(
