@@ -1,11 +1,12 @@
 """Train an ensemble of forward models, calibrate it, and measure whether it knows how wrong it is.
 
-    python recipes/ensemble.py [system=swimmer6] [members=5] [steps=1000] [key=value ...]
+    python recipes/ensemble.py [system=swimmer6] [members=5] [steps=1000] [checkpoint=RUN] [key=value ...]
 
 Trains the members on the same random trajectories, each from weights and batches of its own; fits the size of their
 errors where they disagree to other trajectories; and counts on new ones how many errors lie within one and two of the
 stated standard deviations, in rollouts of 1, 10, 50 and 100 steps: under the same random control, and under control
-that changes three times as slowly. Beyond the paper.
+that changes three times as slowly. `checkpoint=` calibrates and tests an ensemble that is trained, on data of its
+system. Beyond the paper.
 
 Writes config.yaml, metrics.json, the checkpoint and a figure of a prediction with its band, prediction.png, to its run
 folder. All options: recipes/config/ensemble.yaml. Results: docs/results/how-sure.md.
@@ -25,7 +26,7 @@ from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import Ensemble, specialize
 from torchrl_gn.evaluation import calibrate, evaluate_coverage, plot_band
 from torchrl_gn.scenes import Scene
-from torchrl_gn.training import RunFolder, fit_ensemble, plain_config, save_checkpoint
+from torchrl_gn.training import RunFolder, fit_ensemble, load_pretrained, plain_config, save_checkpoint
 
 SLOWER = 3  # times as many control steps between the random controls of the other test data
 SPLITS = ("train", "calibration", "test", "other")
@@ -35,6 +36,8 @@ def make_data(cfg: DictConfig, scene: Scene) -> dict[str, TensorDict]:
     """Random trajectories of each split."""
     data = {}
     for index, split in enumerate(SPLITS):
+        if split == "train" and cfg.checkpoint is not None:
+            continue
         interval = cfg.data.knot_interval * (SLOWER if split == "other" else 1)
         count, options = cfg.data[split], {"split": index, "knot_interval": interval, "pace": cfg.data.pace}
         data[split] = collect_trajectories(scene, count, cfg.data.length, cfg.data.seed, **options)
@@ -51,20 +54,23 @@ def main(cfg: DictConfig) -> None:
     if max(horizons) > cfg.data.length:
         raise ValueError(f"horizons={horizons} must be up to data.length={cfg.data.length} steps.")
     scene = load_system(cfg, cfg.system)
-    ensemble = Ensemble.for_scene(scene, count=cfg.members, hidden=cfg.hidden)
+    if cfg.checkpoint is None:
+        ensemble = Ensemble.for_scene(scene, count=cfg.members, hidden=cfg.hidden)
+    else:
+        ensemble = load_pretrained(cfg.checkpoint).ensemble
     run = RunFolder(cfg.run_dir, "ensemble")
     tracker = open_log(cfg, run, label=f"ensemble-{scene.name}")
-    data = make_data(cfg, scene)
+    data, metrics = make_data(cfg, scene), {"steps": 0.0}
     bound, start = ensemble.bind(scene), time.process_time()
-    histories = fit_ensemble(bound, data["train"], steps=cfg.steps, minutes=cfg.minutes, seed=cfg.seed)
-    seconds = time.process_time() - start
+    if cfg.checkpoint is None:
+        histories = fit_ensemble(bound, data["train"], steps=cfg.steps, minutes=cfg.minutes, seed=cfg.seed)
+        metrics = {"training_seconds": time.process_time() - start, "steps": sum(each.steps[-1] for each in histories)}
     quick = specialize(bound)
     calibrate(quick, data["calibration"])
-    metrics: dict[str, float] = {"training_seconds": seconds, "steps": sum(each.steps[-1] for each in histories)}
     for split, name in (("test", "the same control"), ("other", f"control that changes {SLOWER} times as slowly")):
         found = evaluate_coverage(quick, data[split], horizons=horizons)
         metrics |= {f"{split}/{key}": value for key, value in found.to_metrics().items()}
-        print(f"{scene.name}, {cfg.members} members, {len(data[split])} rollouts, {name}:\n{found}")
+        print(f"{scene.name}, {len(quick.members)} members, {len(data[split])} rollouts, {name}:\n{found}")
     save_checkpoint(run.checkpoint, ensemble, scene=scene, config=plain_config(cfg))
     one = {name: data["test"][name][:1] for name in ("state", "action")}
     prediction = quick.predict(one["state"][:, 0], one["action"])

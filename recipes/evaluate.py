@@ -1,12 +1,12 @@
-"""Evaluate a trained forward model, on its own system or on another one.
+"""Evaluate a trained forward model or ensemble, on its own system or on another one.
 
     python recipes/evaluate.py checkpoint=runs/forward_model/<time> [system=swimmer8] [key=value ...]
     python recipes/evaluate.py checkpoint=swimmerN system=swimmer12
     python recipes/evaluate.py checkpoint=cheetah suite_task=cheetah/run
 
 Collects fresh test trajectories, or pieces of a suite task's episodes under uniformly random actions. Prints the error
-table (docs/evaluation.md defines the errors), and the joints' errors in metres and radians. Takes seconds. All options:
-recipes/config/evaluate.yaml.
+table (docs/evaluation.md defines the errors), and the joints' errors in metres and radians; of an ensemble also how
+many errors lie within its standard deviations. Takes seconds. All options: recipes/config/evaluate.yaml.
 
 Writes config.yaml, metrics.json, a figure and a video to its run folder.
 """
@@ -22,6 +22,7 @@ from tensordict import TensorDict
 from _common import clean_exit, finish_run, open_run, with_help
 from _common.progress import HORIZON, collecting
 from torchrl_gn.data import Simulator, collect_trajectories
+from torchrl_gn.dynamics import Ensemble
 from torchrl_gn.envs import load_suite_task
 from torchrl_gn.evaluation import joint_errors, report
 from torchrl_gn.scenes import Scene, UnsupportedSceneError, load_scene
@@ -65,7 +66,8 @@ def main(cfg: DictConfig) -> None:
         raise ValueError("Say what to evaluate: checkpoint=runs/forward_model/<time>, or a trained model's name.")
     checkpoint = load_pretrained(cfg.checkpoint)
     scene = load_scene(cfg.system, timestep=cfg.timestep) if cfg.system else checkpoint.scene()
-    model = checkpoint.model.bind(scene, strict=cfg.strict)
+    trained = checkpoint.ensemble if isinstance(checkpoint.trained, Ensemble) else checkpoint.model
+    model = trained.bind(scene, strict=cfg.strict)
     if cfg.length < HORIZON:
         raise ValueError(f"length={cfg.length} is too short: errors are measured over {HORIZON} steps.")
     torch.set_num_threads(cfg.threads)

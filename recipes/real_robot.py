@@ -7,8 +7,9 @@ rate, delays and noise, cuts it where it breaks, and trains a feed-forward and a
 Compares both on episodes never trained on (of few episodes: on the last part), after `burn_in` true steps, and with
 baselines. `physics=robot.xml`, or `physics=robot.py:function` of state and action, adds those physics and a residual
 model, which corrects them; parameters of the function that require gradients are fitted to the log first. Without a log
-it simulates one: the JACO arm, with lagging motors, play, and noisy, coarse encoders. Ctrl-C saves everything; the same
-`run_dir` goes on.
+it simulates one: the JACO arm, with lagging motors, play, and noisy, coarse encoders. `members=5` makes an ensemble of
+feed-forward models, calibrated on the validation part, and counts how many errors lie within its standard deviations.
+Ctrl-C saves everything; the same `run_dir` goes on.
 
 Writes config.yaml, metrics.json, a checkpoint of each model, and figures of joint angles (joints.png) and errors
 (errors.png) to its run folder. All options: recipes/config/real_robot.yaml. Results: docs/results/real-arm.md.
@@ -24,6 +25,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from _common import as_list, clean_exit, finish_run, open_log, with_help
 from _common.known_physics import load_physics
@@ -39,9 +41,10 @@ from torchrl_gn.data import (
     simulate_log,
     trajectory_buffer,
 )
-from torchrl_gn.dynamics import ForwardModel, Physics
-from torchrl_gn.evaluation import baseline_errors, evaluate_errors, plot_errors, plot_joints, summary
+from torchrl_gn.dynamics import Ensemble, ForwardModel, Physics, specialize
+from torchrl_gn.evaluation import baseline_errors, calibrate, evaluate_errors, plot_errors, plot_joints, summary
 from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import KinematicTree, load_scene
 from torchrl_gn.training import (
     Budget,
@@ -53,11 +56,14 @@ from torchrl_gn.training import (
     load_pretrained,
     make_optimizer,
     plain_config,
+    save_checkpoint,
 )
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
+ENSEMBLE = "feed-forward"  # the model whose kind an ensemble is of
+
 # Options that may differ when a run goes on.
-MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")
+MAY_CHANGE = ("members", "minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")
 
 
 def read(cfg: DictConfig) -> tuple[RobotLog, KinematicTree]:
@@ -149,27 +155,47 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tree: KinematicTree, data
 
 def train(
     cfg: DictConfig,
-    name: str,
+    kind: str,
     path: Path,
     resumed: Checkpoint | None,
     tree: KinematicTree,
     data: dict,
     tracker: Tracker,
     physics: Physics | None,
+    *,
+    name: str | None = None,
 ):
-    """Train one of the models, or go on with it; the model and its trainer."""
+    """Train a model of a kind, or go on with it; the model and its trainer."""
     if resumed:
         model = resumed.model
     else:
         torch.manual_seed(cfg.seed)
-        options = plain_config(cfg.models[name])
+        options = plain_config(cfg.models[kind])
         options["physics"] = physics if options.get("physics", False) else None
         model = build_model(tree, cfg.model, **options)
     trainer = make_trainer(cfg, model, tree, data)
     if not resumed:
         trainer.loss.fit_normalizers(trajectory_buffer(data["train"], batch_size=20_000, seed=cfg.seed).sample())
-    train_with_progress(trainer, path, resumed, tracker, scene=cast(Any, tree), config=plain_config(cfg), name=name)
+    train_with_progress(
+        trainer, path, resumed, tracker, scene=cast(Any, tree), config=plain_config(cfg), name=name or kind
+    )
     return model, trainer
+
+
+def train_members(
+    cfg: DictConfig, run: RunFolder, first: ForwardModel, tree: KinematicTree, data: dict, tracker: Tracker
+) -> Ensemble:
+    """The first feed-forward model and others of other seeds, each trained or gone on with in its own folder."""
+    members = [first]
+    for number in range(1, cfg.members):
+        own, name = cfg.copy(), f"member-{number}"
+        own.seed = cfg.seed + number
+        path = run.path / name / CHECKPOINT_FILE
+        resumed = load_pretrained(path) if path.exists() else None
+        if resumed:
+            run.refuse_changes(resumed.config, own, free=MAY_CHANGE)
+        members.append(train(own, ENSEMBLE, path, resumed, tree, data, tracker, None, name=name)[0])
+    return Ensemble(members)
 
 
 @with_help
@@ -178,6 +204,7 @@ def train(
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)
+    check_count("members", cfg.members, 1)
     horizons = rollout_horizons(cfg)
     log, tree = read(cfg)
     print(tree)
@@ -205,15 +232,26 @@ def main(cfg: DictConfig) -> None:
         tables["fitted physics"] = baseline_errors(tree, data["test"], physics.requires_grad_(False), **measured)[
             "physics"
         ]
-    metrics: dict[str, float] = {}
+    metrics, models = cast(dict[str, float], {}), {}
     for name, path in paths.items():
         model, trainer = train(cfg, name, path, resumed.get(name), tree, data, tracker, physics)
-        tables[name] = evaluate_errors(model.bind(cast(Any, tree)), data["test"], keep=1, **measured)
+        models[name] = model.bind(cast(Any, tree))
+        tables[name] = evaluate_errors(models[name], data["test"], keep=1, **measured)
         metrics |= {f"{name}/steps": trainer.step, f"{name}/training_seconds": trainer.seconds}
+    stds: dict[str, Tensor] = {}  # of the ensemble
+    if cfg.members > 1:
+        ensemble = train_members(cfg, run, models[ENSEMBLE].model, tree, data, tracker)
+        bound = specialize(ensemble.bind(cast(Any, tree)))
+        calibrate(bound, data["validation"])
+        tables["ensemble"] = evaluate_errors(bound, data["test"], keep=1, **measured)
+        state, action = (cast(Tensor, data["test"][name])[0, cfg.burn_in :] for name in ("state", "action"))
+        stds["ensemble"] = bound.predict(state[0], action[: max(horizons)]).std
+        paths["ensemble"] = run.path / "ensemble" / CHECKPOINT_FILE
+        save_checkpoint(paths["ensemble"], ensemble, scene=cast(Any, tree), config=plain_config(cfg))
     metrics |= {f"{name}/{key}": value for name, table in tables.items() for key, value in table.to_metrics().items()}
-    predictions = {name: tables[name].rollouts[0] for name in names}
+    predictions = {name: tables[name].rollouts[0] for name in paths}
     pictures = [
-        plot_joints(cast(Any, data["test"]["state"])[0], predictions, tree, run.path / "joints.png"),
+        plot_joints(cast(Any, data["test"]["state"])[0], predictions, tree, run.path / "joints.png", stds=stds),
         plot_errors(tables, run.path / "errors.png"),
     ]
     print(summary(tables))

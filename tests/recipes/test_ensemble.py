@@ -26,6 +26,16 @@ def test_coverage_is_measured_and_the_ensemble_kept(call, tmp_path):
         0 <= metrics[f"{split}/one_12/orientation"] <= 1 for split in ("test", "other")
     )
     assert (run / "prediction.png").is_file() and (run / "checkpoint" / "checkpoint.safetensors").is_file()
+    again = tmp_path / "again"
+    options = ("data.length=12", "horizons=[1,12]", f"run_dir={again}", f"checkpoint={run}")
+    assert call(*SMALL, *options, recipe="ensemble")[0] == 0  # which trains nothing
+    other = json.loads((again / "metrics.json").read_text())
+    assert other["steps"] == 0 and all(other[name] == value for name, value in metrics.items() if "/" in name)
+    options = (f"checkpoint={run}", "sequences=10", f"run_dir={tmp_path / 'evaluated'}")
+    code, output, errors = call(*options, recipe="evaluate")
+    assert code == 0 and "within 1 / 2 std" in output and "Joints, over 100 steps" in output, errors
+    evaluated = json.loads((tmp_path / "evaluated" / "metrics.json").read_text())
+    assert evaluated["coverage/one_20/orientation"] >= 0 and evaluated["rollout_error_20"] > 0
 
 
 def test_horizons_fit_the_trajectories(call, tmp_path):

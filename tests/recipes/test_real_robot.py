@@ -66,6 +66,26 @@ def test_a_double_pendulum_needs_options_alone(pendulum, call, tmp_path):
 
 
 @pytest.mark.slow
+def test_an_ensemble_says_how_sure_it_is_of_a_log(pendulum, call, tmp_path):
+    run, names = tmp_path / "run", "names={angle: q, velocity: dq, command: u}"
+    options = (f"log={pendulum}", names, "commands=[[0], []]", f"run_dir={run}", *SMALL)
+    assert call(*options, recipe="real_robot")[0] == 0
+    # A finished run grows to an ensemble.
+    code, output, errors = call(*options, "members=3", recipe="real_robot")
+    assert code == 0, errors
+    assert "within 1 / 2 std" in output and output.count("is finished") == 2
+    assert len(load_pretrained(run / "ensemble").ensemble.members) == 3
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert 0 <= metrics["ensemble/coverage/one_1/velocity"] <= 1 and metrics["ensemble/one_step_error"] > 0
+    seeds = [load_pretrained(run / name).config["seed"] for name in ("feed-forward", "member-1", "member-2")]
+    assert seeds == [0, 1, 2]
+    code, output, errors = call(*options, "members=3", "lr=0.5", recipe="real_robot")
+    assert code != 0 and "lr=0.5 (was None)" in output + errors
+    code, output, errors = call(*options, "members=0", recipe="real_robot")
+    assert code != 0 and "members" in output + errors
+
+
+@pytest.mark.slow
 def test_a_robot_without_motors_at_other_steps(pendulum, call, tmp_path):
     names = "names={angle: q, velocity: dq, command: '', u: ''}"
     run = tmp_path / "run"

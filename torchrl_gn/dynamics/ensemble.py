@@ -60,13 +60,15 @@ class Calibration(Float64Buffers):
         given = (each.double().to(self.factor.device) for each in (factor, floor, typical))
         self.factor, self.floor, self.typical = given
 
-    def forward(self, spread: Tensor, layout: StateLayout) -> Tensor:
-        """Standard deviations ``[*B, T, N, D]`` of the spread after steps 1 to T; RuntimeError before it is fitted.
+    def forward(self, spread: Tensor, layout: StateLayout, steps: Sequence[int] | None = None) -> Tensor:
+        """Standard deviations ``[*B, T, N, D]`` of the spread after steps 1 to T, or after numbers of ``steps``.
 
-        Of channels that cannot move they are meaningless.
+        Of channels that cannot move they are meaningless. RuntimeError before it is fitted.
         """
         self.require_fitted()
-        step = torch.arange(spread.shape[-3], device=spread.device).clamp(max=len(self.factor) - 1)
+        count, device = spread.shape[-3], spread.device
+        step = torch.arange(count, device=device) if steps is None else torch.tensor(steps, device=device) - 1
+        step = step.clamp(max=len(self.factor) - 1)
         parts = []
         for index, where in enumerate(layout.delta_slices.values()):
             factor, floor = (each[step, index].view(-1, 1, 1) for each in (self.factor, self.floor))

@@ -11,11 +11,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
-from torchrl_gn.evaluation.errors import fixed_components
+from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.scenes import Scene
 
 COVERAGE_HORIZONS = (1, 10, 50, 100)  # steps after which coverage is measured by default
+_AT_ONCE = 100  # trajectories that are predicted at once
 _CANDIDATES = 21  # factors that are tried
 _STATES = 5_000  # about so many, whose next step is looked at
+_FLOORS = tuple(2.0**power for power in range(-2, 8))  # floors that are tried, in medians of the spread
+_FREEDOM = 4.0  # degrees of freedom of the errors' distribution
 _ONE, _TWO = 0.6827, 0.9545  # shares of a normal distribution within one and two standard deviations
 
 
@@ -23,10 +27,10 @@ _ONE, _TWO = 0.6827, 0.9545  # shares of a normal distribution within one and tw
 def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
     """Fit an ensemble's standard deviations, in place, to rollouts from the trajectories' first states.
 
-    For every component and step, the floor is the median spread of the members, so that where they agree by chance
-    errors do not count as nothing; the factor is such that one and two standard deviations hold the shares of a normal
-    distribution as nearly as one number allows (scaling; Kuleshov et al. 2018 fit a curve). An ensemble specialised
-    before shares it.
+    For every component and step, the factor is such that one and two standard deviations hold the shares of a normal
+    distribution as nearly as one number allows (scaling; Kuleshov et al. 2018 fit a curve). The floor is the one of
+    greatest likelihood: where members agree by chance errors do not count as nothing, and the noise of a robot's log
+    is part of it. An ensemble specialised before shares both.
 
     Args:
         ensemble: bound to the scene, or specialised.
@@ -36,8 +40,9 @@ def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
     Raises:
         ValueError: if all rollouts diverge. Where some do, the standard deviation is infinite anyway.
     """
-    error, spread, movable = _errors(ensemble, trajectories)
-    layout, steps = ensemble.layout, error.shape[1]
+    steps = trajectories["action"].shape[1]
+    error, spread, movable = _errors(ensemble, trajectories, range(1, steps + 1))
+    layout = ensemble.layout
     factor, floor = (torch.zeros(steps, len(layout.names), dtype=torch.float64) for _ in range(2))
     for index, where in enumerate(layout.delta_slices.values()):
         moves = movable[:, where]
@@ -46,10 +51,7 @@ def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
             finite = between.isfinite()
             if not finite.any():
                 raise ValueError(f"All rollouts diverge by step {step + 1}: train the members for longer.")
-            floor[step, index] = between[finite].median()
-            size = (between.square() + floor[step, index].square()).sqrt()
-            ratio = torch.where(size > 0, wrong / size, 0.0)[finite]
-            factor[step, index] = _factor(ratio)
+            factor[step, index], floor[step, index] = _factor_and_floor(wrong[finite], between[finite])
     ensemble.calibration.set(factor, floor, torch.zeros(len(layout.names)))
     names, fixed = layout.names, fixed_components(ensemble.scene, layout)
     typical = _one_step(ensemble, trajectories)[0].mean(0).sqrt()
@@ -106,19 +108,19 @@ def evaluate_coverage(
         RuntimeError: if the ensemble is not calibrated.
         ValueError: if a horizon is longer than the trajectories.
     """
-    error, spread, movable = _errors(ensemble, trajectories)
-    layout, horizons = ensemble.layout, tuple(sorted({int(each) for each in horizons}))
-    if not horizons or horizons[0] < 1 or horizons[-1] > error.shape[1]:
-        raise ValueError(f"horizons={list(horizons)} must be from 1 to the trajectories' {error.shape[1]} steps.")
-    std = ensemble.calibration(spread, layout)
+    layout, steps = ensemble.layout, trajectories["action"].shape[1]
+    horizons = tuple(sorted({int(each) for each in horizons}))
+    if not horizons or horizons[0] < 1 or horizons[-1] > steps:
+        raise ValueError(f"horizons={list(horizons)} must be from 1 to the trajectories' {steps} steps.")
+    error, spread, movable = _errors(ensemble, trajectories, horizons)
+    std = ensemble.calibration(spread, layout, horizons)
     fixed = fixed_components(ensemble.scene, layout)
     names = tuple(name for name in layout.names if name not in fixed)
-    rows = torch.tensor(horizons) - 1
     found = torch.zeros(4, len(horizons), len(names), dtype=torch.float64)
     for column, name in enumerate(names):
         where = layout.delta_slices[name]
         moves = movable[:, where]
-        wrong, stated = (each[:, rows][..., where][..., moves] for each in (error, std))  # [M, H, channels]
+        wrong, stated = (each[..., where][..., moves] for each in (error, std))  # [M, H, channels]
         # A diverged rollout states that its error may be anything: nothing is gained by it.
         known = stated.isfinite()
         found[0, :, column] = (known & (wrong <= stated)).double().mean((0, 2))
@@ -127,7 +129,7 @@ def evaluate_coverage(
         found[2, :, column] = sizes[0] / sizes[1]
         whole = [each.square().mean(-1) for each in (stated, wrong)]  # [M, H]
         found[3, :, column] = torch.stack(
-            [_rank_correlation(*(each[:, row] for each in whole)) for row in range(len(rows))]
+            [_rank_correlation(*(each[:, row] for each in whole)) for row in range(len(horizons))]
         )
     doubt, true = map(ensemble.calibration.by_typical, _one_step(ensemble, trajectories))
     one, two, sharpness, rank = found
@@ -135,12 +137,31 @@ def evaluate_coverage(
     return Coverage(names, horizons, one, two, sharpness, rank, usual, doubt_rank)
 
 
-def _errors(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-    """Size of the mean's error and the members' spread ``[M, T, N, 12]``, and which channels ``[N, 12]`` count."""
-    state, action = trajectories["state"], trajectories["action"]
-    mean, spread = mean_and_spread(ensemble.rollout(state[:, 0], action), ensemble.layout)
-    error = ensemble.layout.delta(mean, state).abs()
-    return error[:, 1:].double(), spread[:, 1:].double(), ensemble.counted
+def fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
+    """Components of a scene's states that errors leave out: those that cannot move, and those with known laws."""
+    movable = scene.movable[scene.predicted]
+    fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
+    if not isinstance(scene, Scene):
+        return fixed
+    return fixed | {"past_control", "unwrapped_angle"} | ({"activation"} if scene.activations.known.all() else set())
+
+
+def _errors(
+    ensemble: BoundEnsemble, trajectories: TensorDictBase, horizons: Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Size of the mean's error and the members' spread ``[M, H, N, 12]``, and which channels ``[N, 12]`` count."""
+    device, rows, found = ensemble.counted.device, list(horizons), []
+    for first in range(0, len(trajectories), _AT_ONCE):
+        state, action = (
+            cast(Tensor, trajectories[name])[first : first + _AT_ONCE].to(device) for name in ("state", "action")
+        )
+        mean, spread = mean_and_spread(
+            ensemble.rollout(state[:, 0], action[:, : max(rows)])[..., rows, :, :], ensemble.layout
+        )
+        error = ensemble.layout.delta(mean, state[:, rows]).abs()
+        found.append((error.double(), spread.double()))
+    error, spread = map(torch.cat, zip(*found, strict=True))
+    return error, spread, ensemble.counted
 
 
 def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -148,13 +169,27 @@ def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Te
     state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
     before, after, given = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1), action.flatten(0, 1)
     some = slice(None, None, max(1, len(before) // _STATES))
-    before, after, given = before[some], after[some], given[some]
+    before, after, given = (each[some].to(ensemble.counted.device) for each in (before, after, given))
     mean, spread = mean_and_spread(ensemble.step(before, given), ensemble.layout)
     std = ensemble.calibration(spread.unsqueeze(-3), ensemble.layout).squeeze(-3)
     error = ensemble.layout.delta(mean, after)
     known = std.isfinite().flatten(1).all(1)
     stated, wrong = (mean_squares(each[known].double(), ensemble.counted, ensemble.layout) for each in (std, error))
     return stated, wrong
+
+
+def _factor_and_floor(wrong: Tensor, spread: Tensor) -> Tensor:
+    """Factor and floor ``[2]`` under which the errors are likeliest, of floors that are tried."""
+    fits, losses = [], []
+    for floor in spread.median() * spread.new_tensor(_FLOORS):
+        size = (spread.square() + floor.square()).sqrt()
+        factor = _factor(torch.where(size > 0, wrong / size, 0.0))
+        std = torch.where(size > 0, factor * size, 1.0).clamp(min=torch.finfo(size.dtype).tiny)
+        # A Student's t: a few large errors do not decide.
+        tails = (_FREEDOM + 1) / 2 * ((wrong / std).square() / _FREEDOM).log1p()
+        losses.append((std.log() + tails).mean())
+        fits.append(torch.stack((factor, floor)))
+    return fits[int(torch.stack(losses).argmin())]
 
 
 def _factor(ratios: Tensor) -> Tensor:

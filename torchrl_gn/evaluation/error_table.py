@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from torchrl_gn.evaluation.calibration import Coverage
+
 
 @dataclass(frozen=True)
 class PredictionError:
@@ -32,6 +34,7 @@ class ErrorTable:
 
     errors: dict[str, PredictionError]
     rollouts: Tensor  # [keep, H + 1, N, 13] first predicted sequences, NaN from where one diverged
+    coverage: Coverage | None = None  # of a calibrated ensemble's standard deviations
 
     def __getitem__(self, name: str) -> PredictionError:
         return self.errors[name]
@@ -40,7 +43,8 @@ class ErrorTable:
         """Numbers by name for a logger or a JSON file.
 
         For every error ``E``: ``E`` (total), ``E/<component>`` or, if left out, ``E/left_out/<component>`` = 1,
-        ``E/baseline/<component>`` (mean square of the persistence baseline), and ``E/diverged`` (sequences).
+        ``E/baseline/<component>`` (mean square of the persistence baseline), and ``E/diverged`` (sequences). Of a
+        calibrated ensemble also the numbers of :class:`~torchrl_gn.evaluation.Coverage`, from ``coverage/`` on.
         """
         metrics: dict[str, float] = {}
         for name, error in self.errors.items():
@@ -49,7 +53,8 @@ class ErrorTable:
             metrics |= {f"{name}/baseline/{component}": value for component, value in error.baselines.items()}
             metrics |= {f"{name}/left_out/{component}": 1.0 for component in error.left_out}
             metrics[f"{name}/diverged"] = float(error.diverged)
-        return metrics
+        known = {} if self.coverage is None else self.coverage.to_metrics()
+        return metrics | {f"coverage/{name}": value for name, value in known.items()}
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table's cells as text: a row of titles, the total, every component, the baseline."""
@@ -61,8 +66,9 @@ class ErrorTable:
         return [*rows, ("persistence baseline", *[_number(1.0)] * len(errors))]
 
     def to_table(self) -> str:
-        """Errors relative to the persistence baseline as lines of text, one column per error."""
-        return "\n".join([*aligned(self.rows()), *self._divergences()])
+        """Errors relative to the persistence baseline as lines of text, one column per error, and the coverage."""
+        covered = [] if self.coverage is None else ["", str(self.coverage)]
+        return "\n".join([*aligned(self.rows()), *self._divergences(), *covered])
 
     __str__ = to_table
 

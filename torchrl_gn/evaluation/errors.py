@@ -9,12 +9,13 @@ from typing import cast
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.dynamics import as_predictor
+from torchrl_gn.dynamics import BoundEnsemble, as_predictor
 from torchrl_gn.dynamics.predictor import require_bound
+from torchrl_gn.evaluation.calibration import evaluate_coverage, fixed_components
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
 from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout
 from torchrl_gn.finite import require_finite
@@ -62,7 +63,8 @@ def evaluate_errors(
 
     ``one_step_error`` is over every step, ``rollout_error_<H>`` over steps 1 to ``H`` of rollouts from state 0, each
     relative to its start state unchanged. A component is a ratio of means over predicted nodes, steps and sequences,
-    left out if it never moves; the total is their mean, infinite if a prediction diverges.
+    left out if it never moves; the total is their mean, infinite if a prediction diverges. Of an ensemble the mean is
+    judged; if it is calibrated, the table has the coverage of its standard deviations over the horizons too.
 
     Args:
         model: reads state and action at its first two ``in_keys``, writes the next state at its first ``out_keys``.
@@ -108,16 +110,11 @@ def evaluate_errors(
     errors = [single.error("one_step_error", 1, len(states), steps, fixed)] if one_step else []
     errors += [rollouts.error(f"rollout_error_{h}", h, len(states), h, fixed) for h in horizons]
     table = {error.name: error for error in errors}
-    return ErrorTable(table, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])))
-
-
-def fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
-    """Components of a scene's states that errors leave out: those that cannot move, and those with known laws."""
-    movable = scene.movable[scene.predicted]
-    fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
-    if not isinstance(scene, Scene):
-        return fixed
-    return fixed | {"past_control", "unwrapped_angle"} | ({"activation"} if scene.activations.known.all() else set())
+    coverage = None
+    if isinstance(model, BoundEnsemble) and model.calibration.fitted and horizons:
+        from_start = {"state": states[:, burn_in:], "action": actions[:, burn_in:]}
+        coverage = evaluate_coverage(model, TensorDict(from_start, [len(states)]), horizons=(1, *horizons))
+    return ErrorTable(table, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])), coverage)
 
 
 class ErrorSums:

@@ -13,8 +13,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.evaluation.calibration import fixed_components
 from torchrl_gn.evaluation.error_table import ErrorTable
-from torchrl_gn.evaluation.errors import HORIZONS, ErrorSums, fixed_components
+from torchrl_gn.evaluation.errors import HORIZONS, ErrorSums
 from torchrl_gn.scenes import Scene
 
 

@@ -10,9 +10,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.evaluation.error_table import aligned
+from torchrl_gn.evaluation.rollout import rollout
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes import Scene
 
@@ -49,14 +51,14 @@ class JointErrors(NamedTuple):
 
 
 @torch.no_grad()
-def joint_errors(model: Predictor, trajectories: TensorDictBase) -> JointErrors:
+def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase) -> JointErrors:
     """Errors of MuJoCo's coordinates and velocities over all steps of rollouts from state 0.
 
     Angles differ by at most half a turn. The coordinates of a ball, and the last three of a free joint, are those of
     the rotation vector from the true to the predicted orientation.
 
     Args:
-        model: a bound or specialised model.
+        model: a bound or specialised model, or ensemble of them.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]`` and ``action`` ``[M, T, A]``.
 
     Raises:
@@ -64,7 +66,9 @@ def joint_errors(model: Predictor, trajectories: TensorDictBase) -> JointErrors:
     """
     scene, coordinates = model.scene, JointCoordinates(model.scene)
     state, action = trajectories.get("state"), trajectories.get("action")
-    predicted = model.rollout(state[:, 0], action)[0][:, 1:].cpu()
+    whole = isinstance(model, BoundEnsemble)
+    predicted = rollout(model, state[:, 0], action) if whole else model.rollout(state[:, 0], action)[0]
+    predicted = predicted[:, 1:].cpu()
     finite = predicted.isfinite().all()
     (position, velocity), (place, rate) = coordinates(predicted), coordinates(state[:, 1:].cpu())
     names, units, parts = _degrees_of_freedom(scene)

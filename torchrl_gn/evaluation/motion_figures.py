@@ -155,6 +155,7 @@ def plot_joints(
     path: str | os.PathLike,
     *,
     joints: Sequence[int] | None = None,
+    stds: Mapping[str, Tensor] | None = None,
 ) -> Path:
     """Predicted against measured joint angles and velocities (paper, figure "Real and predicted test trajectories").
 
@@ -162,7 +163,9 @@ def plot_joints(
         truth: ``[T + 1, N, 3 + extras]`` states of a robot of joints.
         predictions: states of the last ``H + 1`` steps by the model's name.
         joints: joints to show. Default: the first four.
+        stds: standard deviations ``[H + 1, N, 2 + extras]`` of some of the predictions, drawn as bands of one and two.
     """
+    stds = stds or {}
     joints = list(range(min(4, scene.num_joints))) if joints is None else list(joints)
 
     def angles(states: Tensor) -> np.ndarray:
@@ -175,13 +178,17 @@ def plot_joints(
     grid = figure.subplots(2, len(joints), squeeze=False, sharex=True)
     colors = (PREDICTION, *AXES)
     for column, joint in enumerate(joints):
-        for axes, read in zip(grid[:, column], (angles, velocities), strict=True):
+        for channel, (axes, read) in enumerate(zip(grid[:, column], (angles, velocities), strict=True)):
             true = read(truth[:, joint + 1])
             axes.plot(np.arange(len(true)) * scene.timestep, true, **_MEASURED)
             for number, (name, states) in enumerate(predictions.items()):
                 values, first = read(states[:, joint + 1]), len(truth) - len(states)
                 time = (first + np.arange(len(values))) * scene.timestep
-                axes.plot(time, values, color=colors[number % len(colors)], linewidth=1.3, label=name)
+                color = colors[number % len(colors)]
+                axes.plot(time, values, color=color, linewidth=1.3, label=name)
+                for width, alpha in ((2, 0.12), (1, 0.2)) if name in stds else ():
+                    reach = width * stds[name][:, joint + 1, channel].double().cpu().numpy()
+                    axes.fill_between(time, values - reach, values + reach, color=color, alpha=alpha, linewidth=0)
                 axes.axvline(first * scene.timestep, color=MUTED, linewidth=0.8)
             clean(axes)
         grid[0, column].set_title(scene.joint_names[joint], fontsize=10)

@@ -13,11 +13,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import ForwardModel, Predictor
+from torchrl_gn.dynamics import BoundEnsemble, ForwardModel, Predictor
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.evaluation.figures import plot_errors
-from torchrl_gn.evaluation.motion_figures import plot_body_trajectory
+from torchrl_gn.evaluation.motion_figures import plot_band, plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.scenes import Scene, sample_variants
@@ -26,7 +26,7 @@ _PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # on squared weights, as share
 
 
 def report(
-    model: Predictor,
+    model: Predictor | BoundEnsemble,
     trajectories: TensorDictBase,
     folder: str | os.PathLike,
     *,
@@ -35,15 +35,22 @@ def report(
 ) -> tuple[ErrorTable, list[Path]]:
     """Evaluate a model on trajectories ``[M]`` of its scene, and draw the first, which may be of a variant ``scene``.
 
-    Returns the error table, and the written files: ``prediction.png`` (one body), ``errors.png`` and ``rollout.gif``.
+    Returns the error table, and the written files: ``prediction.png`` (one body; of a calibrated ensemble with its
+    standard deviations), ``errors.png`` and ``rollout.gif``.
     """
     folder, scene = Path(folder), scene or model.scene
     table = evaluate_errors(model, trajectories, horizons=horizons, keep=1)
     prediction = table.rollouts[0]
     prediction = prediction[: int(prediction.isfinite().flatten(1).all(1).long().cumprod(0).sum())]
     truth = trajectories["state"][0, : len(prediction)]
+    if isinstance(model, BoundEnsemble) and model.calibration.fitted:
+        state, action = (cast(Tensor, trajectories[name])[0].to(model.counted.device) for name in ("state", "action"))
+        std = model.predict(state[0], action[: len(truth) - 1]).std.cpu()
+        drawn = plot_band(truth, prediction, std, scene, folder / "prediction.png")
+    else:
+        drawn = plot_body_trajectory(truth, prediction, scene, folder / "prediction.png")
     files = [
-        plot_body_trajectory(truth, prediction, scene, folder / "prediction.png"),
+        drawn,
         plot_errors({scene.name: table}, folder / "errors.png"),
         rollout_video(scene, truth, prediction, folder / "rollout.gif", speed=min(1.0, scene.timestep / 0.01)),
     ]

@@ -9,7 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.dynamics import as_predictor
+from torchrl_gn.dynamics import BoundEnsemble, as_predictor
+from torchrl_gn.dynamics.ensemble import mean_and_spread
 from torchrl_gn.finite import require_finite
 
 
@@ -18,6 +19,8 @@ def rollout(
 ) -> Tensor:
     """States ``[*B, T + 1, N, 13]`` that a model predicts from a start state, which comes first; differentiable.
 
+    Of an ensemble, the mean of its members' rollouts.
+
     Args:
         model: reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
         state: ``[*B, N, 13]``.
@@ -25,6 +28,8 @@ def rollout(
         parameters: physical parameters of each rollout ``[*B]``, or without batch. Default: the scene's.
     """
     _check(state, actions, parameters)
+    if isinstance(model, BoundEnsemble):
+        return mean_and_spread(model.rollout(state, actions), model.layout)[0]
     return as_predictor(model).rollout(state, actions, parameters)[0]  # pyright: ignore[reportArgumentType]
 
 
@@ -54,7 +59,8 @@ def guarded_rollout(
     """A :func:`rollout` that stops what diverges. Not differentiable.
 
     A prediction is bad if it is not finite or, of a :class:`~torchrl_gn.dynamics.Predictor`, outside ``limit`` times
-    the range of its training (:meth:`~torchrl_gn.dynamics.Predictor.in_range`).
+    the range of its training (:meth:`~torchrl_gn.dynamics.Predictor.in_range`). Of an ensemble it is the mean of its
+    members' rollouts, bad where any of them is.
 
     Args:
         hidden_state: ``[*B]`` hidden state of a recurrent model before the start.
@@ -63,6 +69,12 @@ def guarded_rollout(
     _check(state, actions, parameters)
     if not (limit > 0 and every >= 1):
         raise ValueError(f"limit must be positive and every at least 1, got limit={limit} and every={every}.")
+    if isinstance(model, BoundEnsemble):
+        options = {"limit": limit, "every": every}
+        each = [guarded_rollout(member, state, actions, parameters, **options) for member in model.members]
+        mean, _ = mean_and_spread(torch.stack([member.states for member in each]), model.layout)
+        good = torch.stack([member.good_steps for member in each]).amin(0)
+        return GuardedRollout(_held(mean, good), good)
     predictor = as_predictor(model)
     every = getattr(predictor, "check_every", every)
     batch, steps = state.shape[:-2], actions.shape[-2]
@@ -93,10 +105,14 @@ def guarded_rollout(
             rows, current, actions = rows[going], current[going], actions[going]
             parameters = parameters[going] if parameters is not None and parameters.ndim else parameters
             hidden_state = None if hidden_state is None else hidden_state[going]
-    if bool((good < steps).any()):
-        time = torch.arange(steps + 1, device=state.device)
-        states = states[torch.arange(size, device=state.device)[:, None], torch.minimum(time, good[:, None])]
-    return GuardedRollout(states.view(*batch, *states.shape[1:]), good.view(batch))
+    return GuardedRollout(_held(states, good).view(*batch, *states.shape[1:]), good.view(batch))
+
+
+def _held(states: Tensor, good: Tensor) -> Tensor:
+    """States ``[*B, T + 1, N, 13]`` that stay as they are after a number of good steps ``[*B]``."""
+    time = torch.arange(states.shape[-3], device=states.device)
+    at = torch.minimum(time, good.unsqueeze(-1))[..., None, None]
+    return states.gather(-3, at.expand_as(states)) if bool((good < len(time) - 1).any()) else states
 
 
 def _check(state: Tensor, actions: Tensor, parameters: TensorDictBase | None) -> None:
