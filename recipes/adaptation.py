@@ -29,8 +29,8 @@ from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import AdaptedPredictor, CommandAdaptation, Commands, Predictor, specialize
 from torchrl_gn.evaluation import evaluate_errors, plot_rewards
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.scenes import Scene
-from torchrl_gn.training import RunFolder, load_pretrained, with_factors
+from torchrl_gn.scenes import Scene, with_factors
+from torchrl_gn.training import RunFolder, load_pretrained
 
 ERRORS = {"one step": "one_step_error", "20 steps": "rollout_error_20"}
 

@@ -30,8 +30,8 @@ from tqdm import tqdm
 from _common import as_list, clean_exit, finish_run, load_system, open_log, with_help
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.planners.plan import check_count
-from torchrl_gn.scenes import Scene, load_scene
-from torchrl_gn.training import RunFolder, identify_parameters, parameter_names, with_factors
+from torchrl_gn.scenes import Scene, load_scene, with_factors
+from torchrl_gn.training import RunFolder, identify_parameters, parameter_names
 
 TIMESTEP, SECONDS = 0.002, 2.0
 ARMATURES = (0.5, 0.4, 0.3, 0.2, 0.1)

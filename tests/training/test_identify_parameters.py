@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data import Simulator, collect_trajectories
-from torchrl_gn.scenes import load_scene
-from torchrl_gn.training import identify_parameters, parameter_names, with_factors
+from torchrl_gn.scenes import load_scene, with_factors
+from torchrl_gn.training import identify_parameters, parameter_names
 
 ARM = """<mujoco model="arm"><option integrator="implicitfast" timestep="0.005"/><worldbody>
   <body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.5" armature="0.05"/>
@@ -89,7 +89,7 @@ def test_what_does_not_fit_is_named(arm, played):
         ({"nv": None}, "'nv' is no array of mjModel"),
         ({"dof_armature": ["wrist"]}, r"dof_armature: the model has no 'wrist', only \['shoulder', 'elbow'\]"),
         ({"dof_frictionloss": ["elbow"]}, "dof_frictionloss of 'elbow' is 0"),
-        ({"dof_frictionloss": None}, "There is no number to identify"),
+        ({"dof_frictionloss": None}, "There is no number to change"),
     ):
         with pytest.raises(ValueError, match=what):
             identify_parameters(arm, played, parameters)

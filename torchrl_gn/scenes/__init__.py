@@ -15,6 +15,7 @@ from torchrl_gn.scenes.load import scene_from_description as scene_from_descript
 from torchrl_gn.scenes.observation_graph import ObservationGraph as ObservationGraph
 from torchrl_gn.scenes.physical_parameters import ParameterNames as ParameterNames
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters as PhysicalParameters
+from torchrl_gn.scenes.scaled import with_factors as with_factors
 from torchrl_gn.scenes.scene import Attachment as Attachment
 from torchrl_gn.scenes.scene import Scene as Scene
 from torchrl_gn.scenes.scene import SceneChangedWarning as SceneChangedWarning

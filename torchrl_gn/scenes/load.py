@@ -17,6 +17,7 @@ from torchrl_gn.scenes.control_bounds import ActionBounds, plain_bounds
 from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.mjcf_text import inlined, model_assets, read_text, reads_files_early
+from torchrl_gn.scenes.scaled import variant_of
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
 from torchrl_gn.scenes.stored_mjcf import checked, is_among, model_files, packed, require_stored, unpacked
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
@@ -154,6 +155,10 @@ def _rebuilt(description: dict) -> Scene:
     name, timestep, settle_steps = description["name"], description["timestep"], description["settle_steps"]
     if not isinstance(name, str) or not 0 <= settle_steps <= _MOST_SETTLE_STEPS:
         raise SceneError(f"A stored scene has name={name!r} and settle_steps={settle_steps!r}, which cannot be.")
+    if "factors" in description:
+        unchanged = {key: value for key, value in description.items() if key != "factors"}
+        factors = [(str(array), [int(row) for row in rows], float(by)) for array, rows, by in description["factors"]]
+        return variant_of(_rebuilt(unchanged), factors)
     if system and "parameters" in description:
         return make_variant(system.name, description["parameters"], timestep=timestep, name=name)
     keys = ("system", "mjcf", "assets", "action_bounds", "wide_starts", "mocap_actions", "motors")

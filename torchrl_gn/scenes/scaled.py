@@ -1,15 +1,36 @@
-"""A scene with other numbers in its MuJoCo model, to simulate."""
+"""Scenes with other numbers in their MuJoCo model: heavier bodies, other gears or dampings."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import mujoco
+import numpy as np
 
+from torchrl_gn.scenes.contact_points import find_contact_points
 from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.static_features import static_graph
+from torchrl_gn.scenes.topology import find_joint_anchors, topology
+from torchrl_gn.scenes.transmissions import find_transmissions
+
+_KINDS = {
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
+    "dof": mujoco.mjtObj.mjOBJ_JOINT,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
+}
+
+Chosen = Mapping[str, Sequence[str] | None]
+"""Names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, None for all, as in
+``{"body_mass": ["hand"], "dof_damping": None}``; a mass stands for its inertia too."""
+
+Factor = tuple[str, Sequence[int], float]
+"""An array of ``mjModel``, rows of it, and what they are multiplied by."""
 
 
 def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Scene:
@@ -22,3 +43,87 @@ def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Sce
         getattr(model, array)[rows] *= factor
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return replace(scene, model=model)
+
+
+def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np.ndarray) -> Scene:
+    """A variant of the scene: numbers of its MuJoCo model, in their order, multiplied by ``factors`` ``[P]``.
+
+    Simulated and read by models with them, as variants of the paper's systems are; stored in checkpoints.
+
+    Raises:
+        ValueError: if a name is unknown, a number is 0, or factors do not fit or are not positive.
+    """
+    rows, given = find_numbers(scene.model, parameters)[1], np.asarray(factors, dtype=np.float64)
+    if given.shape != (len(rows),):
+        raise ValueError(f"There are {len(rows)} numbers, so factors must be [{len(rows)}], got {list(given.shape)}.")
+    return variant_of(scene, [(*row, factor) for row, factor in zip(rows, given.tolist(), strict=True)])
+
+
+def variant_of(scene: Scene, factors: Sequence[Factor]) -> Scene:
+    """A variant of the scene: rows of arrays of its ``mjModel`` multiplied; ValueError if they cannot be."""
+    for array, rows, factor in factors:
+        count = len(_numbers(scene.model, array))
+        if not all(0 <= row < count for row in rows) or not 0 < factor < np.inf:
+            raise ValueError(f"{array} has {count} rows, not {list(rows)}, or the factor {factor} is not above 0.")
+    changed = scaled_scene(scene, with_inertia(factors))
+    model, data = changed.model, mujoco.MjData(changed.model)
+    graph = topology(model)
+    mujoco.mj_kinematics(model, data)
+    origin = scene.origin
+    if origin:  # a scene without one has no description anyway
+        own = [[array, list(rows), factor] for array, rows, factor in factors]
+        origin = {**origin, "factors": [*origin.get("factors", []), *own]}
+    return replace(
+        changed,
+        static=static_graph(model, graph, find_transmissions(model, graph), scene.timestep),
+        joint_anchors=find_joint_anchors(model, data, graph),
+        contact_points=find_contact_points(model, data, graph),
+        origin=origin,
+    )
+
+
+def with_inertia(factors: Iterable[Factor]) -> Iterator[Factor]:
+    """The factors, of a body's mass for its inertia too."""
+    for array, rows, factor in factors:
+        yield array, rows, factor
+        if array == "body_mass":
+            yield "body_inertia", rows, factor
+
+
+def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, ...], list[tuple[str, list[int]]]]:
+    """Names of the numbers chosen, ``"dof_armature elbow"``, and the array and the rows of each.
+
+    ValueError if one is unknown or 0.
+    """
+    names, rows = [], []
+    for array, chosen in parameters.items():
+        _numbers(model, array)
+        kind = _KINDS[array.split("_")[0]]
+        count = {"body": model.nbody, "jnt": model.njnt, "dof": model.njnt, "geom": model.ngeom}.get(
+            array.split("_")[0], model.nu if kind == mujoco.mjtObj.mjOBJ_ACTUATOR else model.ntendon
+        )
+        given = [mujoco.mj_id2name(model, kind, index) or f"#{index}" for index in range(count)]
+        if chosen is not None and (unknown := [name for name in chosen if name not in given]):
+            raise ValueError(f"{array}: the model has no {unknown[0]!r}, only {given}.")
+        for name in given if chosen is None else chosen:
+            index = given.index(name)
+            where = [index]
+            if array.startswith("dof_"):
+                where = np.flatnonzero(model.dof_jntid == index).tolist()
+            if not (getattr(model, array)[where] != 0).any():
+                if chosen is None:
+                    continue
+                raise ValueError(f"{array} of {name!r} is 0, which no factor changes: give the scene a number first.")
+            names.append(f"{array} {name}")
+            rows.append((array, where))
+    if not names:
+        raise ValueError("There is no number to change: all that parameters= names are 0.")
+    return tuple(names), rows
+
+
+def _numbers(model: mujoco.MjModel, array: str) -> np.ndarray:
+    """An array of a model's numbers; ValueError if there is none of that name."""
+    values = getattr(model, array, None) if str(array).split("_")[0] in _KINDS else None
+    if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
+        raise ValueError(f"{array!r} is no array of mjModel with numbers of {list(_KINDS)}.")
+    return values

@@ -18,7 +18,6 @@ from torchrl_gn.training.fit_value import fit_value as fit_value
 from torchrl_gn.training.identify_parameters import Identified as Identified
 from torchrl_gn.training.identify_parameters import identify_parameters as identify_parameters
 from torchrl_gn.training.identify_parameters import parameter_names as parameter_names
-from torchrl_gn.training.identify_parameters import with_factors as with_factors
 from torchrl_gn.training.off_policy import OffPolicyTrainer as OffPolicyTrainer
 from torchrl_gn.training.off_policy import mean_return as mean_return
 from torchrl_gn.training.optimizers import ScheduledOptimizer as ScheduledOptimizer

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
-from torchrl_gn.scenes.scaled import scaled_scene
+from torchrl_gn.scenes.scaled import Chosen, find_numbers, scaled_scene, with_inertia
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
 _DIFFERENCE = 1e-6  # of logarithms and starts, for one-sided differences
@@ -22,14 +22,6 @@ _LARGEST = 1.0  # change of a logarithm in one iteration
 _CONVERGED = 1e-9  # largest change of a logarithm
 _REWEIGHED = 3  # times that residuals are weighed anew
 _ROUNDING = 1e-9  # of the motion
-_KINDS = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
-    "dof": mujoco.mjtObj.mjOBJ_JOINT,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
-}
 
 
 @dataclass(frozen=True)
@@ -53,23 +45,15 @@ class Identified:
         return "\n".join(f"{name:40}{value:12.5g}   {a:.5g} to {b:.5g}" for name, value, a, b in rows)
 
 
-def parameter_names(scene: Scene, parameters: Mapping[str, Sequence[str] | None]) -> tuple[str, ...]:
+def parameter_names(scene: Scene, parameters: Chosen) -> tuple[str, ...]:
     """Names of the numbers that ``parameters`` of :func:`identify_parameters` chooses, ``"dof_armature elbow"``."""
-    return _rows(scene.model, parameters)[0]
-
-
-def with_factors(scene: Scene, parameters: Mapping[str, Sequence[str] | None], factors: np.ndarray) -> Scene:
-    """The scene with these numbers of its MuJoCo model multiplied by ``factors`` ``[P]``, to simulate.
-
-    For simulation alone: what models read of the scene stays.
-    """
-    return _changed(scene, _rows(scene.model, parameters)[1], factors)
+    return find_numbers(scene.model, parameters)[0]
 
 
 def identify_parameters(
     scene: Scene,
     trajectories: TensorDictBase,
-    parameters: Mapping[str, Sequence[str] | None],
+    parameters: Chosen,
     *,
     window: int = 50,
     max_windows: int = 100,
@@ -101,7 +85,7 @@ def identify_parameters(
         ValueError: if an array, name or window does not fit, or a number is 0.
         FloatingPointError: if simulations become unstable from the start on.
     """
-    names, rows = _rows(scene.model, parameters)
+    names, rows = find_numbers(scene.model, parameters)
     starts, actions, truth = _windows(scene, trajectories, window, max_windows, np.random.default_rng(seed))
     problem = _Problem(scene, rows, starts, actions, truth, num_threads)
     log, left = np.zeros(len(names)), problem.moved
@@ -250,46 +234,9 @@ def _without(by_start: np.ndarray, values: np.ndarray) -> np.ndarray:
     return values - basis @ (basis.transpose(0, 2, 1) @ values)
 
 
-def _rows(model: mujoco.MjModel, parameters: Mapping[str, Sequence[str] | None]):
-    """Names of the parameters, and the array and the rows of each."""
-    names, rows = [], []
-    for array, chosen in parameters.items():
-        kind = _KINDS.get(array.split("_")[0])
-        values = getattr(model, array, None)
-        if kind is None or not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
-            raise ValueError(f"{array!r} is no array of mjModel with numbers of {list(_KINDS)}.")
-        count = {"body": model.nbody, "jnt": model.njnt, "dof": model.njnt, "geom": model.ngeom}.get(
-            array.split("_")[0], model.nu if kind == mujoco.mjtObj.mjOBJ_ACTUATOR else model.ntendon
-        )
-        given = [mujoco.mj_id2name(model, kind, index) or f"#{index}" for index in range(count)]
-        if chosen is not None and (unknown := [name for name in chosen if name not in given]):
-            raise ValueError(f"{array}: the model has no {unknown[0]!r}, only {given}.")
-        for name in given if chosen is None else chosen:
-            index = given.index(name)
-            where = [index]
-            if array.startswith("dof_"):
-                where = np.flatnonzero(model.dof_jntid == index).tolist()
-            if not (values[where] != 0).any():
-                if chosen is None:
-                    continue
-                raise ValueError(f"{array} of {name!r} is 0, which no factor changes: give the scene a number first.")
-            names.append(f"{array} {name}")
-            rows.append((array, where))
-    if not names:
-        raise ValueError("There is no number to identify: all that parameters= names are 0.")
-    return tuple(names), rows
-
-
-def _changed(scene: Scene, rows, factors: np.ndarray) -> Scene:
+def _changed(scene: Scene, rows: Sequence[tuple[str, list[int]]], factors: np.ndarray) -> Scene:
     """The scene with other numbers in its model, to simulate."""
-    return scaled_scene(
-        scene,
-        (
-            (name, where, factor)
-            for (array, where), factor in zip(rows, factors, strict=True)
-            for name in ((array, "body_inertia") if array == "body_mass" else (array,))
-        ),
-    )
+    return scaled_scene(scene, with_inertia((*row, factor) for row, factor in zip(rows, factors, strict=True)))
 
 
 def _windows(

@@ -1,0 +1,87 @@
+"""Variants of any scene: numbers of its MuJoCo model multiplied, which simulations and models see."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_gn.data import Simulator, collect_trajectories
+from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.scenes import PhysicalParameters, load_scene, scene_from_description, with_factors
+
+from ..sizes import SMALL
+
+ARM = """<mujoco><worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" damping=".3"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03"/><body name="lower" pos="0 0 -.4">
+  <joint name="elbow" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"/>
+  </body></body></worldbody><actuator><motor joint="shoulder" gear="2" ctrlrange="-1 1"/></actuator></mujoco>"""
+FORGED = (["body_mass", [99], 2.0], ["body_mass", [1], math.inf], ["names", [0], 2.0], ["body_mass", [1], -1.0])
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_scene(ARM, name="arm")
+
+
+def masses(scene) -> np.ndarray:
+    return scene.static.nodes[:, scene.static.node_names.index("mass")]
+
+
+def test_models_and_simulations_read_the_new_numbers(arm):
+    heavy = with_factors(arm, {"body_mass": ["lower"], "dof_damping": ["shoulder"]}, [3.0, 0.5])
+    np.testing.assert_allclose(heavy.model.body_mass, arm.model.body_mass * [1, 1, 3])
+    np.testing.assert_allclose(masses(heavy), masses(arm) * [1, 1, 3])
+    np.testing.assert_allclose(heavy.model.body_inertia[2], 3 * arm.model.body_inertia[2])
+    names, before, after = PhysicalParameters._fields, PhysicalParameters.of(arm), PhysicalParameters.of(heavy)
+    changed = {name for name, a, b in zip(names, before, after, strict=True) if not torch.equal(a, b)}
+    assert changed == {"nodes", "edges"}  # mass and damping
+    start, actions = np.zeros((1, arm.physics_size)), np.ones((1, 5, 1))
+    ends = [Simulator(each).rollout(start, actions)["state"][0, -1] for each in (arm, heavy)]
+    assert (ends[0] - ends[1]).abs().max() > 1e-3
+    twice = with_factors(heavy, {"body_mass": ["lower"]}, [2.0])
+    assert twice.model.body_mass[2] == pytest.approx(6 * arm.model.body_mass[2])
+
+
+def test_descriptions_hold_the_factors(arm, recwarn):
+    heavy = with_factors(with_factors(arm, {"body_mass": None}, [2.0, 3.0]), {"actuator_gear": None}, [0.5])
+    again = scene_from_description(json.loads(json.dumps(heavy.description())))
+    assert again.fingerprint() == heavy.fingerprint() != arm.fingerprint()
+    np.testing.assert_array_equal(again.static.nodes, heavy.static.nodes)
+    slippery = with_factors(load_scene("cheetah"), {"geom_friction": ["ground"]}, [0.5])
+    assert scene_from_description(slippery.description()).fingerprint() == slippery.fingerprint()
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("factor", FORGED)
+def test_forged_descriptions_are_refused(arm, factor):
+    with pytest.raises(ValueError, match="body_mass has 3 rows|is no array of mjModel"):
+        scene_from_description({**arm.description(), "factors": [factor]})
+
+
+@pytest.mark.parametrize(
+    ("numbers", "factors", "message"),
+    [
+        ({"body_mass": ["hand"]}, [2.0], "the model has no 'hand'"),
+        ({"body_weight": None}, [2.0], "'body_weight' is no array"),
+        ({"body_mass": None}, [2.0], r"There are 2 numbers, so factors must be \[2\], got \[1\]"),
+        ({"body_mass": ["lower"]}, [0.0], "is not above 0"),
+        ({"body_mass": ["lower"]}, [math.nan], "is not above 0"),
+        ({"dof_frictionloss": ["elbow"]}, [2.0], "is 0, which no factor changes"),
+    ],
+)
+def test_what_does_not_fit_is_refused(arm, numbers, factors, message):
+    with pytest.raises(ValueError, match=message):
+        with_factors(arm, numbers, factors)
+
+
+def test_trajectories_bring_the_variants_parameters(arm):
+    variants = [with_factors(arm, {"body_mass": ["lower"]}, [factor]) for factor in (0.5, 1.0, 3.0)]
+    data = collect_trajectories(variants, 6, 5, seed=0)
+    bound = ForwardModel.for_scene(arm, parameters="scene", **SMALL).bind(arm, parameters_key="parameters")
+    given = torch.stack([bound.parameters_of(each) for each in variants])
+    for name, value in given.items():
+        torch.testing.assert_close(data["parameters"][:3][name], value)
