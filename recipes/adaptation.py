@@ -1,10 +1,12 @@
-"""A motor dies, weakens or slips while a robot acts: how fast its forward model follows.
+"""A motor dies, weakens or slips, or a load is picked up, while a robot acts: how fast its forward model follows.
 
     python recipes/adaptation.py [system=cheetah] [checkpoint=PATH] [key=value ...]
+    python recipes/adaptation.py system=arm.xml "load={body: hand, masses: [0.5, 4]}" "faults=[{body: hand, mass: 2}]"
 
-Simulates robots whose commands act as `gain * command + offset` from some moment on, one fault after the other. Every
-control step teaches CommandAdaptation. Prints the errors of the model before the fault and after it, without adaptation
-and after 0.5, 2 and 10 seconds of it. Beyond the paper.
+Simulates robots whose commands act as `gain * command + offset` from some moment on, or with a heavier body, one fault
+after the other. Every control step teaches Adaptation. Prints the errors of the model before the fault and after it,
+without adaptation and after 0.5, 2 and 10 seconds of it. With `load=` the model reads physical parameters, and the mass
+of that body is learned too; without a checkpoint it is trained first, on variants of the scene. Beyond the paper.
 
 Writes config.yaml, metrics.json and a figure of the gains over time (gains.png) to its run folder. All options:
 recipes/config/adaptation.yaml. Results: docs/results/adaptation.md.
@@ -12,6 +14,7 @@ recipes/config/adaptation.yaml. Results: docs/results/adaptation.md.
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from typing import Any
@@ -26,13 +29,28 @@ from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, load_system, open_log, with_help
 from torchrl_gn.data import Simulator, collect_trajectories
-from torchrl_gn.dynamics import AdaptedPredictor, CommandAdaptation, Commands, Predictor, specialize
+from torchrl_gn.dynamics import Adaptation, AdaptedPredictor, ForwardModel, Predictor, RobotChange, specialize
 from torchrl_gn.evaluation import evaluate_errors, plot_rewards
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import Scene, with_factors
-from torchrl_gn.training import RunFolder, load_pretrained
+from torchrl_gn.training import RunFolder, fit, load_pretrained, plain_config, save_checkpoint
 
 ERRORS = {"one step": "one_step_error", "20 steps": "rollout_error_20"}
+
+
+def learn(cfg: DictConfig, scene: Scene) -> ForwardModel:
+    """A model that reads physical parameters, trained on variants whose body has other masses."""
+    low, high = (math.log(each) for each in as_list(cfg.load.masses))
+    factors = np.exp(np.random.default_rng(cfg.seed).uniform(low, high, cfg.variants))
+    variants = [with_factors(scene, {"body_mass": [cfg.load.body]}, [factor]) for factor in factors]
+    train, validation = (
+        collect_trajectories(variants, count, cfg.length, seed=cfg.seed, split=split)
+        for split, count in enumerate((cfg.train, max(1, cfg.train // 20)))
+    )
+    torch.manual_seed(cfg.seed)
+    model = ForwardModel.for_scene(scene, hidden=cfg.hidden)
+    fit(model.bind(scene, parameters_key="parameters"), train, minutes=cfg.minutes, validation=validation)
+    return model
 
 
 def faulty(scene: Scene, fault: dict[str, Any]) -> tuple[Scene, Tensor, Tensor]:
@@ -42,7 +60,7 @@ def faulty(scene: Scene, fault: dict[str, Any]) -> tuple[Scene, Tensor, Tensor]:
     """
     gain, offset = torch.ones(scene.num_actions).double(), torch.zeros(scene.num_actions).double()
     if "body" in fault:
-        return with_factors(scene, {"body_mass": [fault["body"]]}, np.array([fault["mass"]])), gain, offset
+        return with_factors(scene, {"body_mass": [fault["body"]]}, [fault["mass"]]), gain, offset
     if not (isinstance(which := fault.get("command"), int) and 0 <= which < scene.num_actions):
         raise ValueError(f"A fault has a command below {scene.num_actions}, or a body and its mass; got {fault}.")
     gain[which], offset[which] = fault.get("gain", 1.0), fault.get("offset", 0.0)
@@ -58,26 +76,29 @@ def simulate(scene: Scene, fault: dict[str, Any], count: int, steps: int, seed: 
     return found[simulated["stable"]]
 
 
-def errors(model: Predictor | AdaptedPredictor, trajectories: TensorDict) -> dict[str, float]:
+def errors(model: AdaptedPredictor, trajectories: TensorDict) -> dict[str, float]:
     """Errors relative to standing still."""
     table = evaluate_errors(model, trajectories, horizons=(20,))
     return {name: table.errors[key].total for name, key in ERRORS.items()}
 
 
-def adapt(
-    adaptation: CommandAdaptation, stream: TensorDict, at: list[int]
-) -> tuple[dict[int, Commands], Tensor, float]:
-    """Commands ``[M, A]`` after some of the steps, gains ``[T, M, A]`` over time, and milliseconds of an update."""
-    belief, read, gains, start = adaptation.start(len(stream)), {}, [], time.process_time()
+def adapt(adaptation: Adaptation, stream: TensorDict, at: list[int]) -> tuple[dict[int, RobotChange], Tensor, float]:
+    """The change of robots ``[M]`` after some of the steps, gains and amounts ``[T, M, A + K]``, and milliseconds."""
+    belief, read, lines, start = adaptation.start(len(stream)), {}, [], time.process_time()
     for step in tqdm(range(stream["action"].shape[1]), desc="adapting", unit="step", leave=False):
         belief = adaptation.update(
             belief, stream["state"][:, step], stream["action"][:, step], stream["state"][:, step + 1]
         )
-        commands = adaptation.read(belief)
-        gains.append(commands.gain)
+        change = adaptation.read(belief)
+        lines.append(torch.cat((change.gain, change.amount), -1))
         if step + 1 in at:
-            read[step + 1] = commands
-    return read, torch.stack(gains), 1e3 * (time.process_time() - start) / len(gains)
+            read[step + 1] = change
+    return read, torch.stack(lines), 1e3 * (time.process_time() - start) / len(lines)
+
+
+def adapted(predictor: Predictor, change: RobotChange, robot: int, variants: list[Scene]) -> AdaptedPredictor:
+    """The predictor of one of the robots."""
+    return AdaptedPredictor(predictor, RobotChange(*(part[robot] for part in change)), variants=variants)
 
 
 @with_help
@@ -89,13 +110,20 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     scene, seconds = load_system(cfg, cfg.system), [float(each) for each in as_list(cfg.seconds)]
     at = [max(1, round(each / scene.timestep)) for each in seconds]
+    variants = [] if cfg.load is None else [with_factors(scene, {"body_mass": [cfg.load.body]}, [2.0])]
     run = RunFolder(cfg.run_dir, "adaptation")
     tracker = open_log(cfg, run, label=f"adaptation-{scene.name}")
-    predictor = specialize(load_pretrained(cfg.checkpoint or cfg.system).model.bind(scene))
+    if trains := bool(variants) and cfg.checkpoint is None:
+        model = learn(cfg, scene)
+        save_checkpoint(run.checkpoint, model, scene=scene, config=plain_config(cfg))
+    else:
+        model = load_pretrained(cfg.checkpoint or cfg.system).model
+    predictor = specialize(model.bind(scene, parameters_key="parameters" if variants else None))
     # As long as what is remembered: a robot that fell an hour ago errs otherwise than one that has just begun.
     unchanged = collect_trajectories(scene, cfg.calibration, max(at), seed=cfg.seed)
-    adaptation = CommandAdaptation(predictor, unchanged, memory=cfg.memory)
-    before = errors(predictor, collect_trajectories(scene, cfg.test, cfg.length, seed=cfg.seed + 1))
+    adaptation = Adaptation(predictor, unchanged, variants=variants, memory=cfg.memory)
+    still = AdaptedPredictor(predictor, variants=variants)
+    before = errors(still, collect_trajectories(scene, cfg.test, cfg.length, seed=cfg.seed + 1))
     metrics = {f"unchanged/{name}": value for name, value in before.items()}
     print(f"{scene.name}, {cfg.robots} robots; errors relative to standing still, of one step / over 20 steps")
     print(f"{'fault':30}{'before it':>22}{'without':>22}" + "".join(f"{f'{each:g} s':>22}" for each in seconds))
@@ -104,25 +132,25 @@ def main(cfg: DictConfig) -> None:
         label = ", ".join(f"{key} {value}" for key, value in fault.items())
         stream = simulate(scene, fault, cfg.robots, max(at), cfg.seed + 2 + number)
         test = simulate(scene, fault, cfg.test, cfg.length, cfg.seed + 1)
-        commands, gains, milliseconds = adapt(adaptation, stream, at)
-        columns = {"without": errors(predictor, test)}
+        changes, learned, milliseconds = adapt(adaptation, stream, at)
+        columns = {"without": errors(still, test)}
         for step, second in zip(at, seconds, strict=True):
-            each = [
-                errors(AdaptedPredictor(predictor, Commands(*(part[robot] for part in commands[step]))), test)
-                for robot in range(len(stream))
-            ]
+            each = [errors(adapted(predictor, changes[step], robot, variants), test) for robot in range(len(stream))]
             columns[f"{second:g} s"] = {name: statistics.fmean(of[name] for of in each) for name in ERRORS}
         metrics |= {f"{label}/{at}/{name}": value for at, of in columns.items() for name, value in of.items()}
         metrics[f"{label}/milliseconds"] = milliseconds
         cells = [" / ".join(f"{value:.3g}" for value in of.values()) for of in (before, *columns.values())]
         tqdm.write(f"{label:30}" + "".join(f"{cell:>22}" for cell in cells))
         if "command" in fault:
-            lines[label] = gains[:, :, fault["command"]].mT
+            lines[label] = learned[:, :, fault["command"]].mT
+        elif variants and fault["body"] == cfg.load.body:
+            lines[label] = learned[:, :, -1].mT
     files = []
     if lines:
         files.append(run.file("gains.png"))
-        plot_rewards(lines, files[0], timestep=scene.timestep, ylabel="gain of the command")
-    finish_run(cfg, run, tracker, metrics, files=files, step=max(at))
+        plot_rewards(lines, files[0], timestep=scene.timestep, ylabel="gain of the command, or amount of the load")
+    kept = [run.checkpoint] if trains else []
+    finish_run(cfg, run, tracker, metrics, files=files, checkpoints=kept, step=max(at))
 
 
 if __name__ == "__main__":

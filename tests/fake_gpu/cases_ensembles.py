@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 import torchrl_gn as gn
-from torchrl_gn.dynamics import AdaptedPredictor, BoundEnsemble, CommandAdaptation
+from torchrl_gn.dynamics import Adaptation, AdaptedPredictor, BoundEnsemble
 from torchrl_gn.planners import Guarded, StatePolicy, StateValue
 
 from ..sizes import SMALL
@@ -92,7 +92,7 @@ def test_adaptation(gpu, data, both):
     found = []
     for ensemble, device in zip(both, ("cpu", gpu), strict=True):
         predictor, given = ensemble.members[0], data["cheetah"].to(device)
-        adaptation, belief = CommandAdaptation(predictor, given), None
+        adaptation, belief = Adaptation(predictor, given), None
         belief = adaptation.start(4)
         for step in range(5):
             belief = adaptation.update(

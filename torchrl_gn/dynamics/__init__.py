@@ -1,9 +1,9 @@
 """Forward models: weights, predictors of one scene, and what executes their steps."""
 
+from torchrl_gn.dynamics.adaptation import Adaptation as Adaptation
 from torchrl_gn.dynamics.adaptation import AdaptedPredictor as AdaptedPredictor
 from torchrl_gn.dynamics.adaptation import Belief as Belief
-from torchrl_gn.dynamics.adaptation import CommandAdaptation as CommandAdaptation
-from torchrl_gn.dynamics.adaptation import Commands as Commands
+from torchrl_gn.dynamics.adaptation import RobotChange as RobotChange
 from torchrl_gn.dynamics.as_predictor import as_predictor as as_predictor
 from torchrl_gn.dynamics.bound import BoundPredictor as BoundPredictor
 from torchrl_gn.dynamics.bound import UnseenParameterWarning as UnseenParameterWarning

@@ -1,13 +1,14 @@
-"""Adaptation while a robot acts: what its commands do now, by recursive Bayes through its forward model."""
+"""Adaptation while a robot acts: what changed in it, by recursive Bayes through its forward model."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -16,61 +17,117 @@ from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.scenes import Scene
 
-_STEP = 0.1  # of a finite difference, in standard deviations of a command
+_STEP = 0.1  # of a finite difference, in standard deviations of a command, or in amounts
 _JUDGED = 1.0  # seconds over which the model with and without adaptation is judged
 _FREEDOM = 4.0  # degrees of freedom of the errors' distribution
 _DIVERGED = 1e3  # times the noise that an adapted model errs which is not finite
+_SMALL, _SMALL_SQUARE = 0.9, 2.706  # share of squares of normal numbers that are below that
+_SURE = 3.0  # standard deviations off that count as a change: of dozens of numbers one is off by two
 _EARLY = 5  # fraction of trajectories, 1 / so much, after which the noise is calibrated
 
 
-class Commands(NamedTuple):
-    """What a robot makes of its commands: as the model's of ``gain * command + offset``."""
+class RobotChange(NamedTuple):
+    """What a robot is now, beside what it was.
+
+    Its commands act as the unchanged robot's of ``gain * command + offset``; its physical parameters lie between those
+    of its scene and of its variants.
+    """
 
     gain: Tensor  # [*B, A]; 1 of an unchanged robot, 0 of a dead motor
     gain_std: Tensor  # [*B, A] standard deviation
     offset: Tensor  # [*B, A], in the command's unit
     offset_std: Tensor  # [*B, A]
+    amount: Tensor  # [*B, K] of each variant: 0 of an unchanged robot, 1 of the variant
+    amount_std: Tensor  # [*B, K]
 
 
 class Belief(NamedTuple):
-    """Belief about a robot's commands, a value; made and read by :class:`CommandAdaptation`."""
+    """Belief about a robot's change, a value; made and read by :class:`Adaptation`."""
 
-    precision: Tensor  # [*B, P, P] what steps told of gains and offsets, without the prior
+    precision: Tensor  # [*B, P, P] what steps told of gains, offsets and amounts, without the prior
     moment: Tensor  # [*B, P]
     errors: Tensor  # [*B, 2] recent log(1 + squared error by the noise) of one step, without and with adaptation
 
 
-class CommandAdaptation(Float64Buffers):
-    r"""Learn from every step what a robot's commands do: a dead or weak motor, another gear, a shifted zero.
-
-    To first order a command :math:`u` that acts as :math:`g u + b` changes the next velocities by :math:`\sum_j
-    \partial v / \partial u_j ((g_j - 1) u_j + b_j)`, with derivatives of the forward model. Gains and offsets follow
-    by Bayesian linear regression of its errors, recursively (an extended Kalman filter): one call of the model with
-    ``A + 2`` commands a step.
-    Prediction costs nothing more: the model reads other commands (:class:`AdaptedPredictor`). Beyond the paper.
-
-    A belief is a value: :meth:`start` gives one, :meth:`update` the next, :meth:`read` gains and offsets with their
-    standard deviations. Batches ``[*B]`` are robots of their own.
+class VariantMixture(Float64Buffers):
+    """Physical parameters of a scene with some of what makes its variants differ: a load half as heavy, say.
 
     Args:
-        predictor: of one scene, specialised to be quick; neither recurrent nor with parameters of each sample.
+        predictor: that reads each sample's parameters (``bind(scene, parameters_key="parameters")``).
+        variants: ``K`` scenes, as of :func:`~torchrl_gn.scenes.with_factors`; none: parameters stay the scene's.
+
+    Raises:
+        ValueError: if the predictor reads no parameters of samples, or none in which a variant differs.
+    """
+
+    def __init__(self, predictor: Predictor, variants: Sequence[Scene]) -> None:
+        super().__init__()
+        self.count = len(variants)
+        if variants and predictor.parameters_key is None:
+            raise ValueError("Variants need a model that reads parameters: bind(scene, parameters_key='parameters').")
+        self.names: list[str] = []
+        if not variants:
+            return
+        own = predictor.own_parameters()
+        apart = [
+            {name: value - own[name] for name, value in predictor.parameters_of(each).items()} for each in variants
+        ]
+        for number, each in enumerate(apart):
+            if not any(bool((off != 0).any()) for off in each.values()):
+                raise ValueError(f"The model reads no physical parameter in which variant {number} differs.")
+        self.names = [str(name) for name in own.keys() if any(bool((each[name] != 0).any()) for each in apart)]
+        for name in self.names:
+            self.register_buffer(f"own_{name}", own[name].double())
+            self.register_buffer(f"apart_{name}", torch.stack([each[name] for each in apart], -1).double())
+
+    def forward(self, amount: Tensor) -> TensorDict | None:
+        """Entry ``[*B]`` for the predictor, of amounts ``[*B, K]``; None without variants."""
+        if not self.count:
+            return None
+        entries = {}
+        for name in self.names:
+            own, apart = getattr(self, f"own_{name}"), getattr(self, f"apart_{name}")
+            shaped = amount.double().reshape(*amount.shape[:-1], *[1] * own.ndim, self.count)
+            entries[name] = own + (apart * shaped).sum(-1)
+        return TensorDict(entries, amount.shape[:-1])
+
+
+class Adaptation(Float64Buffers):
+    r"""Learn from every step what changed in a robot: a dead or weak motor, a shifted zero, a load in its hand.
+
+    To first order a command :math:`u` that acts as :math:`g u + b`, and amounts :math:`a` of variants, change the next
+    velocities by :math:`\sum_j \partial v / \partial u_j ((g_j - 1) u_j + b_j) + \sum_k \partial v / \partial a_k
+    a_k`, with derivatives of the forward model. Gains, offsets and amounts follow by Bayesian linear regression of its
+    errors, recursively (an extended Kalman filter): one call of the model with ``A + K + 2`` samples a step. Prediction
+    costs nothing more: the model reads other commands and parameters (:class:`AdaptedPredictor`). Beyond the paper.
+
+    A belief is a value: :meth:`start` gives one, :meth:`update` the next, :meth:`read` the change with its standard
+    deviations. Batches ``[*B]`` are robots of their own.
+
+    Args:
+        predictor: of one scene, specialised to be quick; not recurrent.
         trajectories: ``[M]`` of the unchanged robot, some 20 or more, with which the predictor was not trained: their
             errors are the noise. Best as long as the memory, in situations that the robot comes into.
+        variants: ``K`` scenes of which the robot may become some, as one with a load; for a predictor that reads each
+            sample's parameters and was trained on such variants.
         memory: seconds after which a step counts for a third.
         gain_std: standard deviation of gains before anything is seen.
         offset_std: of offsets, in standard deviations of the trajectories' commands.
+        amount_std: of amounts.
 
     Raises:
-        ValueError: if the predictor has a hidden state, parameters of each sample or no action, or an option is not
-            positive.
+        ValueError: if the predictor has a hidden state or no action, reads parameters without variants or variants
+            without parameters, or an option is not positive.
     """
 
     middle: Tensor  # [A] of the trajectories' commands
     unit: Tensor  # [A] their standard deviation
     weight: Tensor  # [N, V] inverse standard deviation of the errors of one step; 0 of channels that do not move
-    prior: Tensor  # [P] precision of gains and offsets before anything is seen
-    inflation: Tensor  # [] of the variance, as a step's errors are not independent
+    prior: Tensor  # [P] precision of gains, offsets and amounts before anything is seen
+    inflation: Tensor  # [] of the errors' variance, as a step's errors are not independent
+    stretch: Tensor  # [P] of each number's variance beyond that
     floor: Tensor  # [P] standard deviation that remains, of the unchanged robot after whole trajectories
 
     def __init__(
@@ -78,17 +135,25 @@ class CommandAdaptation(Float64Buffers):
         predictor: Predictor,
         trajectories: TensorDictBase,
         *,
+        variants: Sequence[Scene] = (),
         memory: float = 10.0,
         gain_std: float = 0.5,
         offset_std: float = 0.1,
+        amount_std: float = 1.0,
     ) -> None:
         super().__init__()
-        if predictor.recurrent or predictor.parameters_key is not None:
-            raise ValueError("Adaptation needs a model without hidden state and without parameters of each sample.")
+        if predictor.recurrent:
+            raise ValueError("Adaptation needs a model without hidden state.")
+        if predictor.parameters_key is not None and not variants:
+            raise ValueError("The model reads parameters of each sample: give variants, or bind it without that key.")
         if not predictor.scene.num_actions:
             raise ValueError(f"Scene {predictor.scene.name!r} has no commands to adapt.")
-        if not (min(memory, gain_std, offset_std) > 0):
-            raise ValueError(f"memory={memory}, gain_std={gain_std} and offset_std={offset_std} must be positive.")
+        if not (min(memory, gain_std, offset_std, amount_std) > 0):
+            raise ValueError(
+                f"memory={memory}, gain_std={gain_std}, offset_std={offset_std} and amount_std={amount_std} must be"
+                " positive."
+            )
+        self.mixture = VariantMixture(predictor, variants)
         self.predictor, self.scene = predictor, predictor.scene
         self._rates = _rate_channels(predictor.layout)
         self.keep = math.exp(-self.scene.timestep / memory)
@@ -104,9 +169,10 @@ class CommandAdaptation(Float64Buffers):
         spread = error.square().mean(0).sqrt()
         self.register_buffer("weight", torch.where(spread > 1e-9 * spread.max(), 1 / spread, 0.0))
         count = action.shape[-1]
-        prior = flat.new_tensor([gain_std] * count + [offset_std] * count)
+        prior = flat.new_tensor([gain_std] * count + [offset_std] * count + [amount_std] * len(variants))
         self.register_buffer("prior", prior**-2)
-        self.register_buffer("floor", self.prior.new_zeros(2 * count))
+        self.register_buffer("floor", torch.zeros_like(prior))
+        self.register_buffer("stretch", torch.ones_like(prior))
         self.register_buffer("inflation", self.prior.new_ones(()))
         self._calibrate(state, action)
 
@@ -124,10 +190,9 @@ class CommandAdaptation(Float64Buffers):
     def _updated(self, belief: Belief, state: Tensor, action: Tensor, next_state: Tensor, keep: float) -> Belief:
         """Belief after a step, of which what was known before counts ``keep``."""
         theta = _significant(*self._estimate(belief))
-        predicted, by_command = self._predictions(state, action, self._acting(action, theta))
+        predicted, inputs = self._predictions(state, action, theta)
         true = self._velocities(state, next_state)
-        errors = (true - predicted) * self.weight  # [2, *B, N, V] of the commands as given, and as they are said to act
-        inputs = self._inputs(by_command, action)  # [*B, N V, P]
+        errors = (true - predicted) * self.weight  # [2, *B, N, V] of the robot as it was, and as it is said to be
         without, adapted = errors.flatten(-2)
         known = inputs.isfinite().flatten(-2).all(-1) & adapted.isfinite().all(-1)
         # Where the adapted model diverges, that is judged, but nothing is learned.
@@ -153,32 +218,34 @@ class CommandAdaptation(Float64Buffers):
         )
 
     @torch.no_grad()
-    def read(self, belief: Belief, *, guarded: bool = True) -> Commands:
-        """Gains and offsets with their standard deviations.
+    def read(self, belief: Belief, *, guarded: bool = True) -> RobotChange:
+        """What changed, with standard deviations.
 
-        ``guarded``: 1 and 0 where that is within two standard deviations, or where in the last second the model
+        ``guarded``: nothing where that is within three standard deviations, or where in the last second the model
         predicted no worse without; so an unchanged robot keeps its model.
         """
         theta, std = self._estimate(belief)
         if guarded:
             without, adapted = belief.errors.unbind(-1)
             theta = torch.where((adapted < without).unsqueeze(-1), _significant(theta, std), 0.0)
-        gain, shift = theta.chunk(2, -1)
-        gain_std, shift_std = std.chunk(2, -1)
-        return Commands(1 + gain, gain_std, self.unit * shift - gain * self.middle, self.unit * shift_std)
+        gain, shift, amount = self._parts(theta)
+        gain_std, shift_std, amount_std = self._parts(std)
+        offset = self.unit * shift - gain * self.middle
+        return RobotChange(1 + gain, gain_std, offset, self.unit * shift_std, amount, amount_std)
 
-    def _acting(self, action: Tensor, theta: Tensor) -> Tensor:
-        """Commands of the unchanged robot that act as these do, in float64."""
-        gain, shift = theta.chunk(2, -1)
-        return action.double() + gain * (action.double() - self.middle) + shift * self.unit
+    def _parts(self, theta: Tensor) -> Sequence[Tensor]:
+        """Gains less 1 ``[*B, A]``, offsets in units ``[*B, A]`` and amounts ``[*B, K]``."""
+        count = len(self.unit)
+        return theta.split((count, count, theta.shape[-1] - 2 * count), -1)
 
     def _estimate(self, belief: Belief) -> tuple[Tensor, Tensor]:
         """:meth:`_mean` and its standard deviations ``[*B, P]``."""
-        std = (self._covariance(belief).diagonal(dim1=-2, dim2=-1) + self.floor.square()).sqrt()
+        variance = self.stretch * self._covariance(belief).diagonal(dim1=-2, dim2=-1)
+        std = (variance + self.floor.square()).sqrt()
         return self._mean(belief), std
 
     def _mean(self, belief: Belief) -> Tensor:
-        """Gains less 1, and offsets in units, ``[*B, P]``."""
+        """Gains less 1, offsets in units, and amounts, ``[*B, P]``."""
         return torch.linalg.solve(belief.precision + torch.diag(self.prior), belief.moment)
 
     def _covariance(self, belief: Belief) -> Tensor:
@@ -188,25 +255,31 @@ class CommandAdaptation(Float64Buffers):
         """Changes ``[*B, N, V]`` of the components that are rates of others, in float64."""
         return self.predictor.layout.delta(state, next_state)[..., self._rates].double()
 
-    def _predictions(self, state: Tensor, action: Tensor, acting: Tensor) -> tuple[Tensor, Tensor]:
-        """Changes of velocities ``[2, *B, N, V]`` under commands and under others, with derivatives by the others.
+    def _predictions(self, state: Tensor, action: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Changes of velocities ``[2, *B, N, V]`` of the robot as it was and as it is said to be.
 
-        Those are ``[*B, N, V, A]`` by a unit of each command.
+        And their derivatives ``[*B, N V, P]`` by gains, offsets and amounts there, by the noise.
         """
-        count, batch = action.shape[-1], action.shape[:-1]
+        gain, shift, amount = self._parts(theta)
+        given, batch, count = action.double(), action.shape[:-1], 2 + action.shape[-1] + amount.shape[-1]
+        scaled = (given - self.middle) / self.unit
+        acting = given + self.unit * (gain * scaled + shift)  # commands of the unchanged robot that act as these do
         # Towards the middle: models clip commands to their bounds.
         step = torch.where(acting > self.middle, -_STEP, _STEP)  # [*B, A]
-        moved = acting.unsqueeze(0) + torch.diag_embed(step * self.unit).movedim(-1, 0)
-        commands = torch.cat((action.double().unsqueeze(0), acting.unsqueeze(0), moved)).to(action.dtype)
-        states = state.expand(count + 2, *batch, *state.shape[-2:])
-        after = self._velocities(states, self.predictor.step(states, commands)[0])
-        return after[:2], (after[2:] - after[1:2]).movedim(0, -1) / step[..., None, None, :]
-
-    def _inputs(self, by_command: Tensor, action: Tensor) -> Tensor:
-        """Inputs ``[*B, N V, P]`` of the regression, by the noise."""
-        weighted = by_command * self.weight.unsqueeze(-1)
-        scaled = (action.double() - self.middle) / self.unit
-        return torch.cat((weighted * scaled[..., None, None, :], weighted), -1).flatten(-3, -2)
+        by_command = torch.diag_embed(step * self.unit).movedim(-1, 0)
+        by_amount = torch.diag_embed(torch.full_like(amount, _STEP)).movedim(-1, 0)
+        commands = torch.cat((given.unsqueeze(0), acting.expand(count - 1, *acting.shape)))
+        amounts = torch.cat((0 * amount.unsqueeze(0), amount.expand(count - 1, *amount.shape)))
+        commands[2 : 2 + len(by_command)] += by_command
+        amounts[2 + len(by_command) :] += by_amount
+        states = state.expand(count, *batch, *state.shape[-2:])
+        after = self.predictor.step(states, commands.to(action.dtype), self.mixture(amounts))[0]
+        change = self._velocities(states, after)
+        steps = torch.cat((step, torch.full_like(amount, _STEP)), -1)[..., None, None, :]
+        slopes = (change[2:] - change[1:2]).movedim(0, -1) / steps * self.weight.unsqueeze(-1)  # [*B, N, V, A + K]
+        by_shift, by_amount = slopes.split((action.shape[-1], amount.shape[-1]), -1)
+        inputs = torch.cat((by_shift * scaled[..., None, None, :], by_shift, by_amount), -1)
+        return change[:2], inputs.flatten(-3, -2)
 
     @torch.no_grad()
     @without_autocast
@@ -218,53 +291,62 @@ class CommandAdaptation(Float64Buffers):
             belief = self._updated(belief, state[:, step], action[:, step], state[:, step + 1], 1.0)
             if step + 1 == early:
                 square = self._mean(belief).square() / self._covariance(belief).diagonal(dim1=-2, dim2=-1)
-                inflation = square.mean().clamp(min=1.0)
-        self.floor.copy_(self._mean(belief).square().mean(0).sqrt())
+                square = _size(square)
+                inflation = square.median().clamp(min=1.0)
+                self.stretch.copy_((square / inflation).clamp(min=1.0))
+        self.floor.copy_(_size(self._mean(belief).square()).sqrt())
         self.weight /= inflation.sqrt()
         self.inflation.copy_(inflation)
 
 
 class AdaptedPredictor(TensorDictModuleBase):
-    """A predictor of a robot whose commands act as its own of ``gain * command + offset``.
+    """A predictor of a robot that changed.
 
     For environments, planners and losses, as any model: it rolls out in the predictor's one call, differentiably.
 
     Args:
-        predictor: of the unchanged robot, as of :class:`CommandAdaptation`.
-        commands: what is known of the robot; default: it is unchanged.
+        predictor: of the unchanged robot, as of :class:`Adaptation`.
+        change: what is known of the robot; default: it is unchanged.
+        variants: as of :class:`Adaptation`. With them the parameters that samples bring are not read.
     """
 
     gain: Tensor  # [A]
     offset: Tensor  # [A]
+    amount: Tensor  # [K]
 
-    def __init__(self, predictor: Predictor, commands: Commands | None = None) -> None:
+    def __init__(
+        self, predictor: Predictor, change: RobotChange | None = None, *, variants: Sequence[Scene] = ()
+    ) -> None:
         super().__init__()
         self.predictor, self.scene, self.layout = predictor, predictor.scene, predictor.layout
         self.fixed_batch = predictor.fixed_batch
         at = next(itertools.chain(predictor.parameters(), predictor.buffers())).device
         self.register_buffer("gain", torch.ones(predictor.scene.num_actions, device=at))
         self.register_buffer("offset", torch.zeros(predictor.scene.num_actions, device=at))
-        self.in_keys: list[NestedKey] = list(predictor.in_keys)
+        self.mixture = VariantMixture(predictor, variants)
+        self.register_buffer("amount", torch.zeros(len(variants), device=at))
+        self.in_keys: list[NestedKey] = list(predictor.in_keys[:2])
         self.out_keys: list[NestedKey] = list(predictor.out_keys)
-        if commands is not None:
-            self.take(commands)
+        if change is not None:
+            self.take(change)
 
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """As of the predictor, which refuses those of another variant."""
-        return self.predictor.parameters_in(tensordict)
+        """None: they are what adaptation says; without variants the predictor refuses those of another variant."""
+        return None if self.mixture.count else self.predictor.parameters_in(tensordict)
 
-    def take(self, commands: Commands) -> None:
+    def take(self, change: RobotChange) -> None:
         """Take what is known now, in place, so that planners that hold the model see it."""
-        self.gain.copy_(commands.gain)
-        self.offset.copy_(commands.offset)
+        self.gain.copy_(change.gain)
+        self.offset.copy_(change.offset)
+        self.amount.copy_(change.amount)
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """Next states ``[*B, N, 13]`` under commands ``[*B, A]``."""
-        return self.predictor.step(state, self._acting(action))[0]
+        return self.predictor.step(state, self._acting(action), self.mixture(self.amount))[0]
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
         """States ``[*B, T + 1, N, 13]`` from a start state under commands ``[*B, T, A]``."""
-        return self.predictor.rollout(state, self._acting(actions))[0]
+        return self.predictor.rollout(state, self._acting(actions), self.mixture(self.amount))[0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the next state."""
@@ -276,9 +358,14 @@ class AdaptedPredictor(TensorDictModuleBase):
         return self.gain.to(action.dtype) * action + self.offset.to(action.dtype)
 
 
+def _size(squares: Tensor) -> Tensor:
+    """Mean squares ``[P]`` of normal numbers of which so many as of squares ``[M, P]`` are small, whatever the rest."""
+    return squares.quantile(_SMALL, dim=0) / _SMALL_SQUARE
+
+
 def _significant(theta: Tensor, std: Tensor) -> Tensor:
-    """Numbers that are more than two standard deviations off 0; 0 for the others."""
-    return torch.where(theta.abs() > 2 * std, theta, 0.0)
+    """Numbers that are more than three standard deviations off 0; 0 for the others."""
+    return torch.where(theta.abs() > _SURE * std, theta, 0.0)
 
 
 def _rate_channels(layout: StateLayout) -> list[int]:
