@@ -319,17 +319,14 @@ def mean_squares(values: Tensor, counted: Tensor, layout: StateLayout) -> Tensor
 def mean_and_spread(members: Tensor, layout: StateLayout) -> tuple[Tensor, Tensor]:
     """Mean ``[*B, N, C]`` of states ``[K, *B, N, C]``, and the standard deviation ``[*B, N, D]`` of the members.
 
-    Rotations are averaged as rotation vectors about their mean. Where a member's state is not finite, the mean is that
+    Rotations differ by rotation vectors from their mean. Where a member's state is not finite, the mean is that
     of the others, or NaN without others, and the spread infinite.
     """
     finite = members.isfinite().flatten(-2).all(-1)[..., None, None]
     count = finite.sum(0)
     # Any finite member is near enough to their mean to begin with.
     first = finite.to(torch.uint8).argmax(0, keepdim=True)
-    mean = members.gather(0, first.expand_as(members[:1])).squeeze(0)
-    for _ in range(2):
-        change = torch.where(finite, layout.delta(mean, torch.where(finite, members, mean)), 0.0)
-        mean = layout.apply(mean, change.sum(0) / count)
+    mean = layout.mean(members, members.gather(0, first.expand_as(members[:1])).squeeze(0), finite)
     change = torch.where(finite, layout.delta(mean, torch.where(finite, members, mean)), 0.0)
     variance = change.square().sum(0) / (count - 1).clamp(min=1)
     # The gradient of a root is infinite at 0, in channels that cannot move.

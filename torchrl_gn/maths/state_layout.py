@@ -143,6 +143,25 @@ class StateLayout:
                 parts.append(rotated / rotated.norm(dim=-1, keepdim=True))
         return torch.cat(parts, dim=-1)
 
+    def mean(self, states: Tensor, near: Tensor, known: Tensor) -> Tensor:
+        """Mean ``[*B, size]`` over the first dimension of states ``[K, *B, size]`` that are ``known`` ``[K, *B, 1]``.
+
+        Of rotations and angles that of smallest squared chords (Markley et al. 2007), which for small differences is
+        the mean of the rotation vectors. ``near`` ``[*B, size]``: any of the states that are known.
+        """
+        parts, count = [], known.sum(0)
+        for component in self.components:
+            where = self.slices[component.name]
+            each, first = states[..., where], near[..., where]
+            if component.adds:  # small differences of large numbers stay exact
+                parts.append(first + torch.where(known, each - first, 0.0).sum(0) / count)
+                continue
+            if component.kind == "rotation":
+                each = torch.where((each * first).sum(-1, keepdim=True) < 0, -each, each)
+            total = torch.where(known, each, 0.0).sum(0)
+            parts.append(total / total.norm(dim=-1, keepdim=True))
+        return torch.cat(parts, dim=-1)
+
     def integrate(self, state: Tensor, delta: Tensor, timestep: float) -> Tensor:
         """Add the change due to the rates, ``timestep * (rate + rate') / 2``, to a residual ``[..., delta_size]``."""
         return delta + self._rate_term(state, delta, timestep)
