@@ -155,6 +155,27 @@ def test_constant_acceleration_and_steady_spin_leave_no_residual():
     torch.testing.assert_close(residual[6:9], timestep * acceleration)
 
 
+@pytest.mark.parametrize("layout", [BODY_STATE, JOINT_STATE])
+def test_means_are_where_changes_to_all_cancel(layout):
+    """To second order: the mean of rotations is of smallest chords, not of rotation vectors."""
+    start = random_state(layout, 4)
+    changes = 0.05 * torch.randn(6, 4, layout.delta_size, generator=torch.Generator().manual_seed(1)).double()
+    states = layout.apply(start.expand(6, -1, -1), changes)
+    if layout is BODY_STATE:
+        states[::2, :, layout.slices["orientation"]] *= -1  # q and -q
+    known = torch.ones(6, 4, 1, dtype=torch.bool)
+    mean = layout.mean(states, states[0], known)
+    assert layout.delta(mean, states).mean(0).abs().max() < 1e-4 < changes.mean(0).abs().max()
+    for component in layout.components:
+        if not component.adds:
+            size = mean[..., layout.slices[component.name]].norm(dim=-1)
+            torch.testing.assert_close(size, torch.ones_like(size))
+    known[1:3, 0], states[1:3, 0] = False, torch.nan
+    some = layout.mean(states, states[0], known)
+    torch.testing.assert_close(some[1:], mean[1:])
+    torch.testing.assert_close(some[0], layout.mean(states[[0, 3, 4, 5]], states[0], known[[0, 3, 4, 5]])[0])
+
+
 def test_gradients_of_delta_apply_and_integrate():
     state = random_state(BODY_STATE, 3).requires_grad_()
     after = BODY_STATE.apply(state.detach(), random_delta(BODY_STATE, 0.3, 3)).requires_grad_()
