@@ -53,6 +53,15 @@ def test_it_finds_the_numbers_to_rounding(arm, played):
     assert (found.interval()[:, 0] <= found.value).all()
 
 
+def test_contacts_do_not_hide_the_minimum():
+    """Over whole windows the squares have many minima; the first steps of each show the way."""
+    cheetah, numbers = load_scene("cheetah"), {"dof_damping": None, "body_mass": ["torso"]}
+    factors = np.exp(np.random.default_rng(1).uniform(-0.69, 0.69, 7))
+    played = collect_trajectories(with_factors(cheetah, numbers, factors), 6, 60, seed=1)
+    found = identify_parameters(cheetah, played, numbers, window=30)
+    np.testing.assert_allclose(found.factor, factors, rtol=1e-6)
+
+
 def test_starts_follow_from_states(arm, played):
     found = identify_parameters(arm, played.exclude("physics"), NUMBERS, window=30)
     np.testing.assert_allclose(found.factor, FACTORS, rtol=1e-5)

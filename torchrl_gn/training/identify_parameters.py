@@ -20,7 +20,7 @@ _DIFFERENCE = 1e-6  # of logarithms and starts, for one-sided differences
 _DAMPING = (1e-2, 1.0, 1e2, 1e4)  # factors of Levenberg and Marquardt that are tried at once
 _LARGEST = 1.0  # change of a logarithm in one iteration
 _CONVERGED = 1e-9  # largest change of a logarithm
-_FIRST = 0.1  # share of a window's steps that the search begins with
+_FIRST = (0.03, 0.1)  # shares of a window's steps that the search begins with
 _REWEIGHED = 3  # times that residuals are weighed anew
 _ROUNDING = 1e-9  # of the motion
 
@@ -67,7 +67,7 @@ def identify_parameters(
 
     Least squares of simulations over windows of the trajectories (multiple shooting) by Levenberg and Marquardt's
     method, in the logarithms; components are weighed by what is left of them. Standard deviations allow for residuals
-    that are alike within a window (clusters; Liang and Zeger 1986). It begins with the first tenth of each window:
+    that are alike within a window (clusters; Liang and Zeger 1986). It begins with the first steps of each window:
     over longer times dry friction and contacts make many minima.
 
     Args:
@@ -140,14 +140,17 @@ class _Problem:
 
     def begun(self, log: np.ndarray, iterations: int) -> np.ndarray:
         """Logarithms to search from: those that fit the first steps of each window, if they fit the rest better too."""
-        whole, self.steps = self.steps, max(1, round(_FIRST * self.steps))
-        try:
-            short = self.solve(log, iterations)
-        except FloatingPointError:  # the whole says so
-            short = log
-        self.steps = whole
-        costs = np.square(self.residuals(np.stack((log, short)), np.stack((self.starts,) * 2))).sum((1, 2, 3))
-        return short if costs[1] < costs[0] else log
+        whole = self.steps
+        for share in _FIRST:
+            self.steps = max(1, round(share * whole))
+            try:
+                short = self.solve(log, iterations)
+            except FloatingPointError:  # the whole says so
+                short = log
+            self.steps = whole
+            costs = np.square(self.residuals(np.stack((log, short)), np.stack((self.starts,) * 2))).sum((1, 2, 3))
+            log = short if costs[1] < costs[0] else log
+        return log
 
     def weigh(self, log: np.ndarray) -> np.ndarray:
         """Weigh components by what is left of them, ``[channels]``, and return that."""
