@@ -143,7 +143,7 @@ def main(cfg: DictConfig) -> None:
         tqdm.write(f"{label:30}" + "".join(f"{cell:>22}" for cell in cells))
         if "command" in fault:
             lines[label] = learned[:, :, fault["command"]].mT
-        elif variants and fault["body"] == cfg.load.body:
+        elif cfg.load is not None and fault["body"] == cfg.load.body:
             lines[label] = learned[:, :, -1].mT
     files = []
     if lines:

@@ -71,13 +71,12 @@ class VariantMixture(Float64Buffers):
         if not variants:
             return
         own = predictor.own_parameters()
-        apart = [
-            {name: value - own[name] for name, value in predictor.parameters_of(each).items()} for each in variants
-        ]
+        others = [predictor.parameters_of(each) for each in variants]
+        apart = [{str(name): value - own[name] for name, value in each.items()} for each in others]
         for number, each in enumerate(apart):
             if not any(bool((off != 0).any()) for off in each.values()):
                 raise ValueError(f"The model reads no physical parameter in which variant {number} differs.")
-        self.names = [str(name) for name in own.keys() if any(bool((each[name] != 0).any()) for each in apart)]
+        self.names = [name for name in apart[0] if any(bool((each[name] != 0).any()) for each in apart)]
         for name in self.names:
             self.register_buffer(f"own_{name}", own[name].double())
             self.register_buffer(f"apart_{name}", torch.stack([each[name] for each in apart], -1).double())
