@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_gn.dynamics.adaptation import AdaptedPredictor
-from torchrl_gn.dynamics.ensemble import BoundEnsemble, SplitEnsemble, mean_and_spread
+from torchrl_gn.dynamics.ensemble import BoundEnsemble, SplitEnsemble, mean_of
 from torchrl_gn.dynamics.predictor import Predictor
 
 
@@ -56,7 +56,7 @@ class ModulePredictor:
         self, state: Tensor, action: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDictBase]:
         if isinstance(self.module, BoundEnsemble):  # whose mean needs no calibration
-            return mean_and_spread(self.module.step(state, action), self.module.layout)[0], hidden_state  # pyright: ignore[reportReturnType]
+            return mean_of(self.module.step(state, action), self.module.layout), hidden_state  # pyright: ignore[reportReturnType]
         batch = state.shape[:-2]
         entries = TensorDict(batch_size=batch) if hidden_state is None else hidden_state.copy()
         for key, value in zip(self.keys, (state, action), strict=True):

@@ -316,19 +316,29 @@ def mean_squares(values: Tensor, counted: Tensor, layout: StateLayout) -> Tensor
     return torch.stack(parts, dim=-1)
 
 
+def mean_of(members: Tensor, layout: StateLayout) -> Tensor:
+    """The mean of :func:`mean_and_spread`, without the spread's cost."""
+    return _mean(members, layout)[0]
+
+
 def mean_and_spread(members: Tensor, layout: StateLayout) -> tuple[Tensor, Tensor]:
     """Mean ``[*B, N, C]`` of states ``[K, *B, N, C]``, and the standard deviation ``[*B, N, D]`` of the members.
 
     Rotations differ by rotation vectors from their mean. Where a member's state is not finite, the mean is that
     of the others, or NaN without others, and the spread infinite.
     """
-    finite = members.isfinite().flatten(-2).all(-1)[..., None, None]
+    mean, finite = _mean(members, layout)
     count = finite.sum(0)
-    # Any finite member is near enough to their mean to begin with.
-    first = finite.to(torch.uint8).argmax(0, keepdim=True)
-    mean = layout.mean(members, members.gather(0, first.expand_as(members[:1])).squeeze(0), finite)
     change = torch.where(finite, layout.delta(mean, torch.where(finite, members, mean)), 0.0)
     variance = change.square().sum(0) / (count - 1).clamp(min=1)
     # The gradient of a root is infinite at 0, in channels that cannot move.
     spread = torch.where(variance > 0, torch.where(variance > 0, variance, 1.0).sqrt(), 0.0)
     return mean, torch.where(count == len(members), spread, torch.inf)
+
+
+def _mean(members: Tensor, layout: StateLayout) -> tuple[Tensor, Tensor]:
+    """Mean ``[*B, N, C]`` of the members that are finite, and which are, ``[K, *B, 1, 1]``."""
+    finite = members.isfinite().flatten(-2).all(-1)[..., None, None]
+    # Any finite member is near enough to their mean to begin with.
+    first = finite.to(torch.uint8).argmax(0, keepdim=True)
+    return layout.mean(members, members.gather(0, first.expand_as(members[:1])).squeeze(0), finite), finite

@@ -84,9 +84,7 @@ def plot_band(
         where, of_std = BODY_STATE.slices[name], BODY_STATE.delta_slices[name]
         for channel, letter in enumerate(channels):
             color, center = AXES[channel], middle[:, where][:, channel]
-            for width, alpha in ((2, 0.12), (1, 0.2)):
-                reach = width * size[:, of_std][:, channel]
-                axes.fill_between(time, center - reach, center + reach, color=color, alpha=alpha, linewidth=0)
+            _band(axes, time, center, size[:, of_std][:, channel], color)
             axes.plot(time, true[:, where][:, channel], color=color, linewidth=1.6, label=letter)
             axes.plot(time, center, color=color, **_PREDICTED)
         _widen(axes, np.concatenate((true[:, where], middle[:, where])))
@@ -186,9 +184,8 @@ def plot_joints(
                 time = (first + np.arange(len(values))) * scene.timestep
                 color = colors[number % len(colors)]
                 axes.plot(time, values, color=color, linewidth=1.3, label=name)
-                for width, alpha in ((2, 0.12), (1, 0.2)) if name in stds else ():
-                    reach = width * stds[name][:, joint + 1, channel].double().cpu().numpy()
-                    axes.fill_between(time, values - reach, values + reach, color=color, alpha=alpha, linewidth=0)
+                if name in stds:
+                    _band(axes, time, values, stds[name][:, joint + 1, channel].double().cpu().numpy(), color)
                 axes.axvline(first * scene.timestep, color=MUTED, linewidth=0.8)
             clean(axes)
         grid[0, column].set_title(scene.joint_names[joint], fontsize=10)
@@ -223,6 +220,12 @@ def align_signs(true: np.ndarray, predicted: np.ndarray, where: slice) -> tuple[
     q[1:] *= np.cumprod(jumps)[:, None]
     p *= np.where(np.nan_to_num(p * q).sum(-1) < 0, -1.0, 1.0)[:, None]
     return true, predicted
+
+
+def _band(axes: Axes, time: np.ndarray, center: np.ndarray, std: np.ndarray, color: str) -> None:
+    """Shade one and two standard deviations about a line."""
+    for width, alpha in ((2, 0.12), (1, 0.2)):
+        axes.fill_between(time, center - width * std, center + width * std, color=color, alpha=alpha, linewidth=0)
 
 
 def _widen(axes: Axes, values: np.ndarray) -> None:

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_gn.dynamics import BoundEnsemble, as_predictor
-from torchrl_gn.dynamics.ensemble import mean_and_spread
+from torchrl_gn.dynamics.ensemble import mean_of
 from torchrl_gn.finite import require_finite
 
 
@@ -29,7 +29,7 @@ def rollout(
     """
     _check(state, actions, parameters)
     if isinstance(model, BoundEnsemble):
-        return mean_and_spread(model.rollout(state, actions), model.layout)[0]
+        return mean_of(model.rollout(state, actions), model.layout)
     return as_predictor(model).rollout(state, actions, parameters)[0]  # pyright: ignore[reportArgumentType]
 
 
@@ -72,7 +72,7 @@ def guarded_rollout(
     if isinstance(model, BoundEnsemble):
         options = {"limit": limit, "every": every}
         each = [guarded_rollout(member, state, actions, parameters, **options) for member in model.members]
-        mean, _ = mean_and_spread(torch.stack([member.states for member in each]), model.layout)
+        mean = mean_of(torch.stack([member.states for member in each]), model.layout)
         good = torch.stack([member.good_steps for member in each]).amin(0)
         return GuardedRollout(_held(mean, good), good)
     predictor = as_predictor(model)

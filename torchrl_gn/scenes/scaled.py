@@ -97,10 +97,10 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
     """
     names, rows = [], []
     for array, chosen in parameters.items():
-        _numbers(model, array)
-        kind = _KINDS[array.split("_")[0]]
+        values, element = _numbers(model, array), array.split("_")[0]
+        kind = _KINDS[element]
         count = {"body": model.nbody, "jnt": model.njnt, "dof": model.njnt, "geom": model.ngeom}.get(
-            array.split("_")[0], model.nu if kind == mujoco.mjtObj.mjOBJ_ACTUATOR else model.ntendon
+            element, model.nu if kind == mujoco.mjtObj.mjOBJ_ACTUATOR else model.ntendon
         )
         given = [mujoco.mj_id2name(model, kind, index) or f"#{index}" for index in range(count)]
         if chosen is not None and (unknown := [name for name in chosen if name not in given]):
@@ -108,9 +108,9 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
         for name in given if chosen is None else chosen:
             index = given.index(name)
             where = [index]
-            if array.startswith("dof_"):
+            if element == "dof":
                 where = np.flatnonzero(model.dof_jntid == index).tolist()
-            if not (getattr(model, array)[where] != 0).any():
+            if not (values[where] != 0).any():
                 if chosen is None:
                     continue
                 raise ValueError(f"{array} of {name!r} is 0, which no factor changes: give the scene a number first.")
