@@ -23,9 +23,8 @@ from _common import clean_exit, finish_run, open_run, with_help
 from _common.progress import HORIZON, collecting
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import Ensemble
-from torchrl_gn.envs import load_suite_task
 from torchrl_gn.evaluation import joint_errors, report
-from torchrl_gn.scenes import Scene, UnsupportedSceneError, load_scene
+from torchrl_gn.scenes import Scene, UnsupportedSceneError, load_scene, load_suite_task
 from torchrl_gn.training import load_pretrained
 
 EPISODE, PIECES = 1000, 5  # control steps of an episode, and pieces that it gives

@@ -263,7 +263,7 @@ def measure_policy(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) 
     """Returns of recipes/shac.py, a run for each set of options, and when they exceed TD-MPC2's."""
     out: dict[str, Any] = {}
     for index, options in enumerate(cfg.policy):
-        given = ["judged_reward=run", *options.split()]
+        given = options.split()
         numbers = run_recipe(cfg, "shac", folder / f"policy{index}", given)
         rounds, key = itertools.count(), "round {}/median_return_of_last_five"
         medians = itertools.takewhile(lambda each: each is not None, (numbers.get(key.format(of)) for of in rounds))

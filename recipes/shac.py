@@ -33,17 +33,20 @@ from _common import as_list, clean_exit, finish_run, load_system, open_log, refu
 from _common.actor_critic import WINDOW
 from _common.actor_critic_rounds import ActorCritic, Round, Task
 from _common.planning_task import reward_of
+from _common.suite_rounds import suite_task
 from torchrl_gn.atomic import atomic_path, read_json, write_json
 from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation import evaluate_errors, plot_learning_curves, rollout_video
 from torchrl_gn.interrupts import held
 from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.planners.plan import check_count
+from torchrl_gn.scenes import suite_name
 from torchrl_gn.training import RunFolder, Tracker, load_pretrained
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
 MAY_CHANGE = ("rounds", "zero_shot", "threads", "device", "logger", "run_dir")
 FALL = 0.15  # share of the best return that a round may lose
+PLACES = {"value": "value.safetensors", "reward": "reward.safetensors", "model": CHECKPOINT_FILE}  # in a run folder
 COLUMNS = {
     "frames": "frames",
     "minutes": "processor minutes",
@@ -145,6 +148,9 @@ def make_tasks(cfg: DictConfig, systems: list[str]) -> list[Task]:
     """The task on every system."""
     tasks = []
     for system in systems:
+        if suite_name(system) is not None:
+            tasks.append(suite_task(cfg, system, alone=len(systems) == 1))
+            continue
         scene = load_system(cfg, system)
         reward = reward_of(cfg, scene)
         judged = reward if cfg.judged_reward is None else reward_of(cfg, scene, "judged_reward")
@@ -182,7 +188,7 @@ def main(cfg: DictConfig) -> None:
         task.collect(done)
     rounds: list[dict[str, Any]] = [read_json(each.numbers) for each in done]
     latest = [run.path / "policy.safetensors"]
-    latest += [run.path / task.folder / name for name in ("value.safetensors", CHECKPOINT_FILE) for task in tasks]
+    latest += [run.path / task.folder / PLACES[what] for task in tasks for what in task.networks]
     policy, judged = None, []
     if done:  # whose last may have ended before these were written
         policy = learner.averaged(run.path, len(done) - 1)
@@ -235,9 +241,9 @@ def log_round(tracker: Tracker, numbers: dict[str, Any]) -> None:
 
 
 def keep_latest(learner: ActorCritic, last: Round, policy: BoundedPolicy, latest: list[Path]) -> None:
-    """Write the averaged policy, and the values and models of the last round, to their places in the run folder."""
+    """Write the averaged policy, and the other networks of the last round, to their places in the run folder."""
     learner.save_policy(latest[0], policy)
-    files = [last.of(what, task) for what in ("value", "model") for task in learner.tasks]
+    files = [last.of(what, task) for task in learner.tasks for what in task.networks]
     for source, target in zip(files, latest[1:], strict=True):
         copy_to(source, target)
 

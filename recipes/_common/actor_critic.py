@@ -11,16 +11,15 @@ from typing import Any, cast
 import mujoco
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_gn.data import sample_start_states
-from torchrl_gn.envs import SceneEnv, observation_env
+from torchrl_gn.envs import SceneEnv, SuiteTaskEnv, observation_env
 from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.planners import BoundedPolicy
 from torchrl_gn.scenes import ObservationGraph, Scene
 from torchrl_gn.training.nested_state import require_like
 from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
@@ -191,27 +190,44 @@ class ActorCriticOptimizer:
                 alpha.copy_(kept)
 
 
-def play(env: SceneEnv, policy: BoundedPolicy, *, episodes: int, steps: int, explore: bool) -> TensorDict:
+def play(
+    env: SceneEnv | SuiteTaskEnv,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    *,
+    episodes: int,
+    steps: int,
+    explore: bool,
+) -> TensorDict:
     """Episodes ``[M, T]`` in MuJoCo, from new starts."""
     kind = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
         env = cast(SceneEnv, for_learning(env))
         start = env.reset(TensorDict(batch_size=[episodes]))
-        return env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
+        return cast(
+            TensorDict, env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
+        )
 
 
-def windows(state: Tensor, action: Tensor) -> TensorDict:
-    """Cut ``state`` ``[K, T + 1, N, 13]`` and ``action`` ``[K, T, A]`` into trajectories of :data:`WINDOW` steps."""
+def windows(state: Tensor, action: Tensor, reward: Tensor | None = None) -> TensorDict:
+    """Cut trajectories into those of :data:`WINDOW` steps.
+
+    Args:
+        state: ``[K, T + 1, N, 13]``.
+        action: ``[K, T, A]``.
+        reward: ``[K, T, 1]`` that was paid, if it is to be learned.
+    """
     first = range(0, action.shape[1] - WINDOW + 1, WINDOW)
     parts = {
         "state": torch.cat([state[:, at : at + WINDOW + 1] for at in first]),
         "action": torch.cat([action[:, at : at + WINDOW].float() for at in first]),
     }
+    if reward is not None:
+        parts["reward"] = torch.cat([reward[:, at : at + WINDOW] for at in first])
     return TensorDict(parts, [len(parts["action"])])
 
 
-def played_windows(played: TensorDict) -> TensorDict:
+def played_windows(played: TensorDict, *, rewards: bool = False) -> TensorDict:
     """Trajectories of :func:`play`, without the episodes whose simulation became unstable."""
     alive = ~cast(Tensor, played["next", "terminated"]).flatten(1).any(1)
     state = torch.cat((played["state"], played["next", "state"][:, -1:]), 1)
-    return windows(state[alive], played["action"][alive])
+    return windows(state[alive], played["action"][alive], played["next", "reward"][alive] if rewards else None)

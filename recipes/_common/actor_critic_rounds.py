@@ -18,6 +18,7 @@ from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import (
     BoundEnsemble,
     BoundPredictor,
+    Canonicalizer,
     Ensemble,
     ForwardModel,
     SpecializedPredictor,
@@ -26,12 +27,14 @@ from torchrl_gn.dynamics import (
 )
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue, task_invariances
+from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateReward, StateValue, task_invariances
 from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import fit, load_pretrained, plain_config, save_checkpoint
 from torchrl_gn.training.tensor_files import write_tensors
 from torchrl_gn.training.workers import Workers
+
+_SCALED_BY = 5  # last rounds whose rewards the value is scaled by
 
 
 class Round:
@@ -46,7 +49,7 @@ class Round:
         return self.numbers.exists()
 
     def of(self, what: str, task: Task) -> Path:
-        """The file of a task's ``model``, ``value`` or ``played`` trajectories."""
+        """The file of a task's ``model``, ``value``, learned ``reward`` or ``played`` trajectories."""
         return self.path / task.folder / f"{what}.safetensors"
 
 
@@ -74,7 +77,7 @@ class Task:
         self.cfg, self.scene, self.reward, self.judge, self.folder = cfg, scene, reward, judge, folder
         self.device = Workers().device(cfg.device)
         self.squares = TargetSquares(scene, cfg.target_squares) if cfg.target_squares else None
-        self.invariances = task_invariances(scene, reward)
+        self.invariances = self._invariances()
         self.data: list[TensorDict] = []
         self.judged_starts = None if self.squares is None else self.squares.start_states
         if (suite_seed := cfg.evaluate.suite_seed) is not None:
@@ -83,11 +86,12 @@ class Task:
             states = self.squares.suite_states(cfg.evaluate.episodes, suite_seed)
             self.judged_starts = lambda n, _: states[:n]
 
+    def _invariances(self) -> Canonicalizer:
+        return task_invariances(self.scene, self.reward)
+
     def collect(self, done: list[Round]) -> None:
         """Trajectories of random control, and those that finished rounds played."""
-        cfg = self.cfg
-        first = collect_trajectories(self.scene, cfg.first.trajectories, steps=cfg.first.length, seed=cfg.seed)
-        self.data = [windows(first["state"], first["action"]).to(self.device)]
+        self.data = [self.play_at_random().to(self.device)]
         for each in done:
             played = load_tensors(each.of("played", self))
             self.data.append(TensorDict(played, [len(played["action"])]).to(self.device))
@@ -114,7 +118,7 @@ class Task:
         return next(played for played in reversed(self.data) if len(played))
 
     def learn_model(self, index: int) -> None:
-        """Train the model on all data, and tell the normalisers of policy and value of the newest."""
+        """Train the model, and what else is learned of the scene, on all data; tell normalisers of the newest."""
         cfg, first = self.cfg, index == 0
         steps, lr = (cfg.first.steps, None) if first else (cfg.model_steps, cfg.model_lr)
         data = cast(TensorDict, torch.cat(cast(Any, self.data)))
@@ -122,14 +126,17 @@ class Task:
         for number, member in enumerate(self.members):
             seed = cfg.seed + index + 1_000_000 * number
             fit(member, data, steps=steps, lr=lr, seed=seed, size_floor=None)
+        self.learn_reward(data, index)
         self._take_snapshot()
-        newest, rewards = self.newest, None
-        if first:
-            before, after = newest["state"][:, :-1], newest["state"][:, 1:]
+        seen = self.newest["state"].flatten(0, 1)
+        last = cast(TensorDict, torch.cat(cast(Any, self.data[-_SCALED_BY:])))
+        with torch.no_grad():
             reward = cast(Reward, self.loss.env.reward)  # on the device
-            rewards = reward(before, newest["action"], after, None).flatten(0, 1)
-        seen = newest["state"].flatten(0, 1)
-        self.loss.fit_normalizers(seen if self.squares is None else self.squares.move(seen), rewards)
+            rewards = reward(last["state"][:, :-1], last["action"], last["state"][:, 1:], None)
+        self.loss.fit_normalizers(seen if self.squares is None else self.squares.move(seen), rewards.flatten(0, 1))
+
+    def learn_reward(self, data: TensorDict, index: int) -> None:
+        """Nothing: the reward is known."""
 
     @property
     def members(self) -> list[BoundPredictor]:
@@ -163,6 +170,12 @@ class Task:
 
         return draw
 
+    def play_at_random(self) -> TensorDict:
+        """Trajectories of random control."""
+        cfg = self.cfg
+        first = collect_trajectories(self.scene, cfg.first.trajectories, steps=cfg.first.length, seed=cfg.seed)
+        return windows(first["state"], first["action"])
+
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
         """Trajectories of a round's episodes with exploration."""
         cfg, starts = self.cfg, None if self.squares is None else self.squares.start_states
@@ -170,9 +183,19 @@ class Task:
         return played_windows(play(env, policy, episodes=cfg.episodes, steps=cfg.steps, explore=True))
 
     def judged(self, policy: BoundedPolicy) -> TensorDict:
-        """Episodes ``[M, T]`` without exploration, from the same starts every round."""
+        """Episodes ``[M, T]`` without exploration, from the same starts every round; rewards of a frame."""
         env = SceneEnv(self.scene, self.judge, seed=10_000, start_states=self.judged_starts)
         return play(env, policy, episodes=self.cfg.evaluate.episodes, steps=self.cfg.evaluate.steps, explore=False)
+
+    @property
+    def networks(self) -> dict[str, ForwardModel | Ensemble | StateValue | StateReward]:
+        """What learns for the task beside the policy, by what :meth:`Round.of` calls it."""
+        return {"value": self.value, "model": self.trained}
+
+    def save(self, of: Round) -> None:
+        """Write the networks."""
+        for what, network in self.networks.items():
+            save_checkpoint(of.of(what, self), network, scene=self.scene, config=plain_config(self.cfg))
 
     def add(self, played: TensorDict, of: Round) -> None:
         """Keep a round's trajectories, also in its folder."""
@@ -232,11 +255,9 @@ class ActorCritic:
     def save(self, of: Round) -> None:
         """Write the networks of a round, with what the next needs."""
         of.path.mkdir(parents=True, exist_ok=True)
-        config = plain_config(self.cfg)
         for task in self.tasks:
             of.of("model", task).parent.mkdir(exist_ok=True)
-            save_checkpoint(of.of("model", task), task.trained, scene=task.scene, config=config)
-            save_checkpoint(of.of("value", task), task.value, scene=task.scene, config=config)
+            task.save(of)
         self.save_policy(of.policy, self.policy, training=self.optimizer.state_dict())
 
     def save_policy(self, path: Path, policy: BoundedPolicy, **options: Any) -> None:

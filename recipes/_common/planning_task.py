@@ -126,8 +126,8 @@ def _file_of(given: str, what: str) -> str | Path:
 
 
 def reward_of(cfg: DictConfig, scene: Scene, key: str = "reward") -> Reward:
-    """The task's reward, by name or of terms."""
-    named = isinstance(cfg[key], str)
+    """The task's reward, by name, of terms, or the suite's own."""
+    named = cfg[key] is None or isinstance(cfg[key], str)
     return make_reward(cfg[key] if named else cast(Any, OmegaConf.to_container(cfg[key])), scene)
 
 

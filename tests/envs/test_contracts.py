@@ -213,12 +213,12 @@ def begins_like(kind: str, row: TensorDictBase, seed: int) -> bool:
 
 
 def check_against_dm_control(kind: str, row: TensorDictBase, seed: int) -> None:
-    from torchrl_gn.envs.suite_env import _suite, load_suite_task
+    from torchrl_gn.scenes.suite_tasks import load_suite_task, suite_modules
 
     names = ("cartpole", "swingup") if kind == "suite" else ("swimmer", "swimmer3")
     loaded = load_suite_task(*names, seed)
     limit = (LIMIT - 0.5) * loaded.control_timestep()
-    own = _suite()[2].Environment(
+    own = suite_modules()[2].Environment(
         loaded.physics, loaded.task, time_limit=limit, control_timestep=loaded.control_timestep()
     )
     # TorchRL's wrapper resets once when it is made, and SerialEnv's once more at the first reset.

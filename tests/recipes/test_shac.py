@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from torchrl_gn.atomic import read_json, write_json
+from torchrl_gn.data import Simulator
+from torchrl_gn.scenes.suite_tasks import full_physics, load_suite_task
 from torchrl_gn.training import load_pretrained, save_checkpoint
 
 SMALL = (
@@ -114,6 +117,61 @@ def test_one_judged_episode_has_no_spread(tmp_path, call):
     code, _, errors = call(*SMALL, "rounds=1", "evaluate.episodes=1", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0 and "warning" not in errors.lower(), errors
     assert json.loads((tmp_path / "metrics.json").read_text())["std"] == 0.0
+
+
+SUITE = (*SMALL[3:], "system=suite:cartpole/swingup", "timestep=null", "action_repeat=2")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reward", ["null", "learned"])
+def test_a_task_of_the_suite_is_paid_by_dm_control(reward, tmp_path, call):
+    pytest.importorskip("dm_control.suite")
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    options = (f"reward={reward}", "reward_steps=3", "evaluate.steps=500")
+    for folder, rounds in ((whole, 2), (resumed, 1), (resumed, 2)):
+        code, output, errors = call(*SUITE, *options, f"rounds={rounds}", f"run_dir={folder}", recipe="shac")
+        assert code == 0 and "warning" not in errors.lower(), errors
+        assert (str(folder / "reward.safetensors") in output) == (reward == "learned")
+    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (whole, resumed)]
+    for name in ("reward", "return", "frames", "error", "entropy", "loss_value"):
+        assert metrics[0][name] == metrics[1][name]
+    assert metrics[0]["frames"] == 2 * (4 * 50 + 2 * 2 * 50)
+    assert abs(metrics[0]["return"] - 1000 * metrics[0]["reward"]) < 1e-3
+
+    # The same policy in dm_control itself, from the starts that it was judged by.
+    policy, env = load_pretrained(whole / "policy.safetensors").policy, load_suite_task("cartpole", "swingup", 0)
+    returns = []
+    for seed in np.random.SeedSequence(10_000).generate_state(2):
+        env.task.random.seed(int(seed))
+        step, total = env.reset(), 0.0
+        while not step.last():
+            state = Simulator(policy.scene).observe(torch.from_numpy(full_physics(env)).unsqueeze(0))
+            with torch.no_grad():
+                action = policy.act(state)[0].double().numpy()
+            for _ in range(2):
+                step = env.step(action)
+                total += step.reward
+        returns.append(total)
+    assert abs(metrics[0]["return"] - np.mean(returns)) < 1e-2
+    played = load_file(whole / "rounds/001/played.safetensors")
+    assert ("reward" in played) == (reward == "learned")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("timestep=0.02",), "timestep=0.02: suite:cartpole/swingup has its own"),
+        (("judged_reward=run",), "judged_reward=run: suite:cartpole/swingup has its own"),
+        (("target_squares=[1]",), "has starts of its own"),
+        (("system=suite:dog/run",), "There is no scene of the suite's dog/run"),
+        (("system=suite:reacher/easy",), "is no task of the suite whose reward is known"),
+        (("system=pendulum", "reward=learned"), "no reward 'learned' for scene 'pendulum'"),
+        (("system=pendulum",), "'pendulum' is no task of the suite whose reward is known"),
+    ],
+)
+def test_refuses_options_that_the_suites_tasks_have(options, message, tmp_path, call):
+    code, _, errors = call(*SUITE, "reward=null", *options, f"run_dir={tmp_path / 'x'}", recipe="shac")
+    assert code == 1 and message in errors, errors
 
 
 SWIMMERS = (

@@ -1,4 +1,4 @@
-"""Rewards of the control suite's running and swimming tasks, against the suite itself."""
+"""Rewards of the control suite's tasks, against the suite itself."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from torchrl_gn.data import Simulator
-from torchrl_gn.rewards import Near, Reward, Run, RunUpright, make_reward
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.rewards import SUITE_TASKS, Near, Reward, Run, RunUpright, make_reward, suite_reward, tolerance
+from torchrl_gn.scenes import load_scene, load_suite_task
+from torchrl_gn.scenes.suite_tasks import full_physics
 
 suite = pytest.importorskip("dm_control.suite")
 
@@ -97,3 +98,73 @@ def test_refuses_what_does_not_fit() -> None:
         Run(scene, "torso", speed=0.0)
     with pytest.raises(ValueError, match="from 0"):
         RunUpright(scene, "torso", speed=-1.0)
+
+
+FAST = ("cheetah/run", "cartpole/swingup", "hopper/hop", "quadruped/run", "humanoid/stand")
+# Without a gradient: what they pay for the state is all or nothing.
+BINARY = {
+    "acrobot/swingup_sparse",
+    "ball_in_cup/catch",
+    "cartpole/balance_sparse",
+    "cartpole/swingup_sparse",
+    "finger/spin",
+    "hopper/stand",
+    "pendulum/swingup",
+}
+
+
+@pytest.mark.parametrize(
+    "task", [task if task in FAST else pytest.param(task, marks=pytest.mark.slow) for task in SUITE_TASKS]
+)
+def test_is_what_dm_control_pays(task: str) -> None:
+    """Along episodes of random actions whose speeds are set to anything now and then."""
+    domain, name = task.split("/")
+    scene, env = load_scene(f"suite:{task}"), load_suite_task(domain, name, 0)
+    rng, spec, data = np.random.default_rng(0), env.action_spec(), env.physics.data.ptr
+    states, actions, paid = [], [], []
+    speeds = [0.0] if "fish" in task else [0.1, 1.0, 20.0]  # its fins weigh nothing
+    for episode in range(12):
+        env.reset()
+        if episode < 3:
+            env.physics.reset()  # to the pose of the file, where point_mass has its target
+        for step in range(12):
+            if step % 4 == 0:
+                data.qvel[:] = rng.uniform(-1, 1, scene.model.nv) * rng.choice(speeds)
+                env.physics.forward()
+            action = rng.uniform(spec.minimum, spec.maximum) * rng.choice([0.0, 1.0])
+            before = full_physics(env)
+            paid.append(env.step(action).reward)
+            states.append((before, full_physics(env)))
+            actions.append(action)
+    before, after = Simulator(scene).observe(torch.from_numpy(np.stack(states))).unbind(1)
+    after.requires_grad_()
+    given = suite_reward(scene)(before, torch.from_numpy(np.stack(actions)), after, None)
+    np.testing.assert_allclose(given.detach().squeeze(-1).numpy(), paid, atol=1e-9)
+    if task not in BINARY:
+        assert np.std(paid) > 1e-3
+        (gradient,) = torch.autograd.grad(given.sum(), after)
+        assert bool(gradient.isfinite().all()) and bool((gradient != 0).any())
+
+
+def test_by_the_scene_alone() -> None:
+    scene = load_scene("suite:pendulum/swingup")
+    state = Simulator(scene).observe(torch.as_tensor(scene.rest_physics).unsqueeze(0))
+    for reward in (suite_reward(scene), make_reward(None, scene)):
+        assert reward(state, torch.zeros(1, 1), state, None).item() == 1.0  # the pole at rest stands
+    with pytest.raises(ValueError, match="'cheetah' is no task of the suite whose reward is known; there are acrobot"):
+        make_reward(None, load_scene("cheetah"))
+    with pytest.raises(ValueError, match="'reacher-easy' is no task"):
+        suite_reward(load_scene("suite:reacher/easy"))
+
+
+@pytest.mark.parametrize("sigmoid", ["gaussian", "linear", "long_tail", "quadratic"])
+@pytest.mark.parametrize("margin", [0.0, 0.7])
+def test_tolerance_is_dm_controls(sigmoid, margin: float) -> None:
+    from dm_control.utils import rewards
+
+    x = np.linspace(-3, 3, 61)
+    theirs = rewards.tolerance(x, bounds=(-0.5, 1.0), margin=margin, sigmoid=sigmoid, value_at_margin=0.2)
+    ours = tolerance(torch.from_numpy(x), -0.5, 1.0, margin=margin, sigmoid=sigmoid, at_margin=0.2)
+    np.testing.assert_allclose(ours.numpy(), theirs, atol=1e-12)
+    with pytest.raises(ValueError, match="got 'round'"):
+        tolerance(torch.zeros(1), margin=1.0, sigmoid="round")  # pyright: ignore[reportArgumentType]

@@ -8,6 +8,7 @@ import numpy as np
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError, steadier_physics
 from torchrl_gn.data.start_poses import StartPoses
 from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.suite_tasks import SuiteStarts
 
 _ATTEMPTS = 10
 
@@ -15,7 +16,8 @@ _ATTEMPTS = 10
 def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) -> np.ndarray:
     """Draw full MuJoCo states ``[n, S]``, float64 (``mjSTATE_FULLPHYSICS``).
 
-    Models from MJCF: :class:`~torchrl_gn.data.StartPoses`. The paper's systems as the suite's resets:
+    Models from MJCF: :class:`~torchrl_gn.data.StartPoses`. Tasks of the suite (``"suite:cheetah/run"``): dm_control's
+    own, one after another. The paper's systems as the suite's resets:
 
     - Cartpole: slider uniform in 0.1 m, hinge in 0.034 rad either side, velocities with standard deviation 0.01.
     - Cheetah: limited joints uniform in their limits.
@@ -69,7 +71,7 @@ def _draw_each(simulator: Simulator, variant: np.ndarray, rng: np.random.Generat
         for which in np.unique(variant):
             rows = variant == which
             if which not in simulator.start_poses:
-                simulator.start_poses[which] = StartPoses(simulator.scenes[which])
+                simulator.start_poses[which] = _source(simulator.scenes[which])
             states[rows] = simulator.start_poses[which].draw(int(rows.sum()), rng)
         return states
     if len(simulator.scenes) == 1:
@@ -82,6 +84,11 @@ def _overlaps(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray) -> 
     mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     mujoco.mj_fwdPosition(model, data)
     return bool((data.contact.dist < 0).any())
+
+
+def _source(scene: Scene) -> StartPoses | SuiteStarts:
+    suite = scene.origin.get("suite")
+    return StartPoses(scene) if suite is None else SuiteStarts(*suite.split("/"))
 
 
 def _draw(scene: Scene, n: int, rng: np.random.Generator) -> np.ndarray:

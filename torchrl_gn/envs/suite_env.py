@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from torchrl.envs import (
 )
 
 from torchrl_gn.scenes import ObservationGraph
-from torchrl_gn.scenes.systems.system import INSTALL_SUITE
+from torchrl_gn.scenes.suite_tasks import load_suite_task, suite_modules
 
 
 def suite_env(
@@ -78,37 +77,6 @@ def observation_env(graph: ObservationGraph, domain: str, task: str, **options) 
         given = f"Task {domain} {task} has observations {observation} and {actions} actions"
         raise ValueError(f"{given}, graph {graph.name!r} arranges {dict(graph.observation)} and {graph.num_actions}.")
     return suite_env(domain, task, keys=list(graph.observation), **options)
-
-
-@cache
-def _suite() -> tuple[Any, Any, Any]:
-    before = os.environ.get("MUJOCO_GL")
-    os.environ.setdefault("MUJOCO_GL", "off")  # look for no display
-    try:
-        from dm_control import suite
-        from dm_control.rl import control
-        from dm_control.suite import swimmer
-    except ImportError as error:
-        raise ImportError(f"Tasks of the suite need dm_control: {INSTALL_SUITE}.") from error
-    finally:
-        if before is None:
-            del os.environ["MUJOCO_GL"]
-    return suite, swimmer, control
-
-
-def load_suite_task(domain: str, task: str, seed: int) -> Any:
-    """dm_control's environment of a task of the suite, loaded without a display; swimmers have any number of links.
-
-    Raises ValueError for an unknown task, ImportError without dm_control.
-    """
-    suite, swimmer, _ = _suite()
-    links = task.removeprefix("swimmer")
-    if domain == "swimmer" and links.isdigit() and (domain, task) not in suite.ALL_TASKS:
-        return swimmer.swimmer(int(links), random=seed)
-    if (domain, task) not in suite.ALL_TASKS:
-        known = sorted(name for owner, name in suite.ALL_TASKS if owner == domain) or sorted(suite.TASKS_BY_DOMAIN)
-        raise ValueError(f"The suite has no task {domain} {task}; there are {', '.join(known)}.")
-    return suite.load(domain, task, {"random": seed})
 
 
 class _SuiteEnv(DMControlWrapper):
@@ -172,6 +140,6 @@ def _make(domain: str, task: str, timestep: float | None, steps: int | None, *, 
         raise ValueError(f"timestep={timestep} must be a positive multiple of the physics step, {physics_step} s.")
     # Half a step less, so that rounding errors cannot add a step.
     limit = loaded._step_limit * loaded.control_timestep() if steps is None else (steps - 0.5) * step
-    *_, control = _suite()
+    *_, control = suite_modules()
     env = control.Environment(loaded.physics, loaded.task, time_limit=limit, control_timestep=step)
     return _SuiteEnv(env)

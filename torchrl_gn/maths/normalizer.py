@@ -61,6 +61,13 @@ class Normalizer(Float64Buffers):
         return self.std == 0
 
     @torch.no_grad()
+    def reset(self) -> None:
+        """Forget all data."""
+        for buffer in (self.count, self.mean, self.m2):
+            buffer.zero_()
+        self._refresh()
+
+    @torch.no_grad()
     def update(self, features: Tensor, mask: Tensor | None = None) -> None:
         """Add a batch ``[..., F]`` where the bool ``mask`` is True; ValueError if misshapen or not finite there."""
         if features.shape[-1] != self.size:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
 
@@ -17,18 +19,52 @@ class LayerNormMLP(nn.Module):
 
     Observations of bodies have all sorts of scales, and an overestimated value drives a policy on them into the flat
     ends of its squashing function, where nothing is learned any more. ValueError without a hidden size.
+
+    Args:
+        linear: whether a linear map of the inputs, at first 0, adds to the output, which then has no bounds.
     """
 
-    def __init__(self, in_features: int, out_features: int, hidden: Sequence[int]) -> None:
+    def __init__(self, in_features: int, out_features: int, hidden: Sequence[int], *, linear: bool = False) -> None:
         super().__init__()
         if not hidden:
             raise ValueError("hidden=[] must name at least one hidden size.")
         first, *rest = hidden
         self.first = nn.Sequential(nn.Linear(in_features, first), nn.LayerNorm(first), nn.Tanh())
         self.rest = MLP(first, out_features, num_cells=rest, activation_class=nn.SiLU)
+        self.linear = nn.Linear(in_features, out_features, bias=False) if linear else None
+        if self.linear is not None:
+            nn.init.zeros_(self.linear.weight)
 
     @without_autocast
     def forward(self, *inputs: Tensor) -> Tensor:
         """Output ``[*B, out_features]`` of inputs ``[*B, F_k]`` side by side, in their dtype."""
         together = torch.cat(inputs, dim=-1)
-        return self.rest(self.first(together.to(dtype_of(self.first)))).to(together.dtype)
+        given = together.to(dtype_of(self.first))
+        output = self.rest(self.first(given))
+        return (output if self.linear is None else output + self.linear(given)).to(together.dtype)
+
+
+@torch.no_grad()
+def renormalize(
+    networks: Sequence[LayerNormMLP], normalizer: Normalizer, values: Tensor, *, constant: float = 0.0
+) -> None:
+    """Fit the normaliser of the networks' one output to other values ``[*B, 1]``; they predict what they did.
+
+    As Pop-Art does (van Hasselt et al. 2016), for values that grow while they are learned.
+
+    Args:
+        constant: standard deviation of values that are all alike; 0: the networks predict that constant.
+    """
+    before, std = normalizer.mean.clone(), normalizer.std.clone()
+    normalizer.reset()
+    values = values.reshape(-1, 1).to(before)
+    normalizer.update(values)
+    if constant and bool(normalizer.constant):
+        away = constant * (len(values) / 2 + 1) ** 0.5
+        normalizer.update(values.mean() + torch.tensor([[-away], [away]]).to(values))
+    for network in networks if bool((std > 0) & (normalizer.std > 0)) else ():
+        last, factor = cast(nn.Linear, network.rest[-1]), std / normalizer.std
+        for layer in (last, network.linear):
+            if layer is not None:
+                layer.weight.mul_(factor.to(layer.weight.dtype))
+        last.bias.copy_((last.bias * std + before - normalizer.mean) / normalizer.std)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
 from typing import cast
 
 import torch
@@ -19,6 +20,7 @@ from torchrl_gn.envs.episode_ends import alive_of
 from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
+from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
 from torchrl_gn.objectives.checks import read_entries
 from torchrl_gn.planners import BoundedPolicy, StateValue
 from torchrl_gn.planners.plan import check_pessimism
@@ -48,7 +50,7 @@ class SHACLoss(LossModule):
     Args:
         policy: its network and standard deviations are learned.
         value: gives the discount :math:`\gamma`.
-        env: imagines the steps. No gradient reaches its model's weights.
+        env: imagines the steps. No gradient reaches the weights of its model or reward.
         steps: ``H``.
         lmbda: :math:`\lambda` of the value's targets.
         target_entropy: default: minus one for every component of an action.
@@ -128,11 +130,16 @@ class SHACLoss(LossModule):
 
     @without_autocast
     def fit_normalizers(self, state: Tensor, reward: Tensor | None = None) -> None:
-        """Add states ``[*B, N, 13]`` to the normalisers; scale a new value by rewards ``[*B, 1]`` that never end."""
+        """Add states ``[*B, N, 13]`` to the normalisers; scale values, and the loss, by rewards ``[*B, 1]`` for ever.
+
+        The value stays what it is: :func:`~torchrl_gn.networks.layer_norm_mlp.renormalize`.
+        """
         for network in (self.policy, self.value):
             network.features.update(state)
-        if reward is not None and not self.value.fitted:
-            self.value.normalizer.update(reward / max(1 - self.value.discount, 1e-3))
+        if reward is not None:
+            members = cast(list[LayerNormMLP], list(self.value.members))
+            returns = reward / max(1 - self.value.discount, 1e-3)
+            renormalize(members, self.value.normalizer, returns, constant=1.0)  # until something is paid
 
     def _imagine(self, state: Tensor) -> tuple[TensorDict, Tensor]:
         """Steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of the entropy of its actions."""
@@ -140,7 +147,12 @@ class SHACLoss(LossModule):
         # Not reset(), which asks whether an episode has ended: it would wait for a device.
         now = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
         steps, entropies = [], []
-        with frozen(self.env.world_model), self.policy.prepared(), set_exploration_type(ExplorationType.RANDOM):
+        with ExitStack() as stack:
+            for each in (self.env.world_model, self.env.reward):
+                if isinstance(each, nn.Module):
+                    stack.enter_context(frozen(each))
+            stack.enter_context(self.policy.prepared())
+            stack.enter_context(set_exploration_type(ExplorationType.RANDOM))
             for _ in range(self.steps):
                 action, log_prob = self.policy.sample(state := cast(Tensor, now["state"]), self.members)
                 for each in (state, action):

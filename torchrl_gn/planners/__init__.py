@@ -10,5 +10,6 @@ from torchrl_gn.planners.return_to_go import ReturnToGo as ReturnToGo
 from torchrl_gn.planners.state_features import StateFeatures as StateFeatures
 from torchrl_gn.planners.state_features import task_invariances as task_invariances
 from torchrl_gn.planners.state_policy import StatePolicy as StatePolicy
+from torchrl_gn.planners.state_reward import StateReward as StateReward
 from torchrl_gn.planners.state_value import StateValue as StateValue
 from torchrl_gn.planners.terminal_reward import TerminalReward as TerminalReward

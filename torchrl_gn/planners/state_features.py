@@ -57,6 +57,12 @@ class StateFeatures(Float64Buffers):
             self.update(state)
 
     @torch.no_grad()
+    def refit(self, state: Tensor) -> None:
+        """Fit the normaliser to states ``[*B, N, 13]`` alone; ValueError if one is not finite."""
+        self.normalizer.reset()
+        self.update(state)
+
+    @torch.no_grad()
     @without_autocast
     def update(self, state: Tensor) -> None:
         """Add states ``[*B, N, 13]`` to the normaliser; ValueError if one is not finite."""

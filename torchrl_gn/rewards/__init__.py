@@ -9,8 +9,10 @@ from torchrl_gn.rewards.imitate_pose import ImitatePose as ImitatePose
 from torchrl_gn.rewards.imitate_pose import arm_reach as arm_reach
 from torchrl_gn.rewards.reward import FreezeGoal as FreezeGoal
 from torchrl_gn.rewards.reward import Reward as Reward
+from torchrl_gn.rewards.suite import SUITE_TASKS as SUITE_TASKS
 from torchrl_gn.rewards.suite import Run as Run
 from torchrl_gn.rewards.suite import RunUpright as RunUpright
+from torchrl_gn.rewards.suite import suite_reward as suite_reward
 from torchrl_gn.rewards.tasks import REWARD_TYPES as REWARD_TYPES
 from torchrl_gn.rewards.tasks import AngularSpeed as AngularSpeed
 from torchrl_gn.rewards.tasks import Balance as Balance
@@ -22,4 +24,5 @@ from torchrl_gn.rewards.tasks import Velocity as Velocity
 from torchrl_gn.rewards.tasks import VerticalDistance as VerticalDistance
 from torchrl_gn.rewards.tasks import available_rewards as available_rewards
 from torchrl_gn.rewards.tasks import make_reward as make_reward
+from torchrl_gn.rewards.tolerance import tolerance as tolerance
 from torchrl_gn.rewards.weighted_sum import WeightedSum as WeightedSum

@@ -1,10 +1,12 @@
-"""The control suite's running tasks as rewards on states, for returns that compare with the suite's learners."""
+"""The control suite's tasks as differentiable rewards on states, for returns that compare with the suite's learners."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,9 +14,10 @@ from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.rewards.tolerance import tolerance
 from torchrl_gn.scenes.scene import Scene
 
-_STAND_HEIGHT, _EDGE = 1.2, 0.1  # metres; the suite's value at the margin of a Gaussian tolerance
+_ANY = math.inf
 
 
 class CenterOfMassVelocity(Float64Buffers):
@@ -48,7 +51,89 @@ class CenterOfMassVelocity(Float64Buffers):
         return (self.share.to(state.dtype).unsqueeze(-1) * velocity).sum(-2)
 
 
-class Run(Reward):
+class Place(Float64Buffers):
+    """Position ``[*B, 3]``, metres, and velocity of a point that is fixed in a body, in the world's frame.
+
+    Args:
+        body: name; ``"world"`` for a point that stays.
+        offset: ``[3]`` of the point in the body's frame.
+    """
+
+    offset: Tensor
+
+    def __init__(self, scene: Scene, body: str, offset: np.ndarray) -> None:
+        super().__init__()
+        self.bodies = None if body == "world" else Bodies(scene, [body])
+        self.constants({"offset": np.array(offset, dtype=np.float64)})
+
+    @classmethod
+    def of_geom(cls, scene: Scene, name: str) -> Place:
+        geom = scene.model.geom(name)
+        return cls(scene, scene.model.body(int(geom.bodyid[0])).name, geom.pos)
+
+    @classmethod
+    def of_site(cls, scene: Scene, name: str) -> Place:
+        site = scene.model.site(name)
+        return cls(scene, scene.model.body(int(site.bodyid[0])).name, site.pos)
+
+    @classmethod
+    def of_mass(cls, scene: Scene, body: str) -> Place:
+        """A body's centre of mass, without those that hang on it."""
+        return cls(scene, body, scene.model.body(body).ipos)
+
+    def forward(self, state: Tensor) -> Tensor:
+        offset = self.offset.to(state.dtype)
+        if self.bodies is None:
+            return offset.expand(*state.shape[:-2], 3)
+        position, orientation = (each.squeeze(-2) for each in self.bodies.pose(state))
+        return position + quaternion.rotate(orientation, offset.expand_as(position))
+
+    def velocity(self, state: Tensor) -> Tensor:
+        assert self.bodies is not None
+        orientation, spin = self.bodies.orientation(state).squeeze(-2), self.bodies.angular_velocity(state).squeeze(-2)
+        arm = quaternion.rotate(orientation, self.offset.to(state.dtype).expand_as(spin))
+        return self.bodies.linear_velocity(state).squeeze(-2) + torch.linalg.cross(spin, arm)
+
+
+class HingeRates(Float64Buffers):
+    """Rates ``[*B, K]``, rad/s, of hinges."""
+
+    axis: Tensor
+
+    def __init__(self, scene: Scene, joints: list[str]) -> None:
+        super().__init__()
+        model = scene.model
+        below = [int(model.joint(name).bodyid[0]) for name in joints]
+        above = [int(model.body_parentid[body]) for body in below]
+        self.moving = Bodies(scene, [model.body(body).name for body in below])
+        self.parents = [None if body == 0 else Bodies(scene, [model.body(body).name]) for body in above]
+        self.constants({"axis": np.stack([model.joint(name).axis for name in joints])})
+
+    def forward(self, state: Tensor) -> Tensor:
+        spin, orientation = self.moving.angular_velocity(state), self.moving.orientation(state)
+        still = torch.zeros_like(spin[..., :1, :])
+        parents = torch.cat([still if of is None else of.angular_velocity(state) for of in self.parents], -2)
+        axis = quaternion.rotate(orientation, self.axis.to(state.dtype).expand_as(spin))
+        return ((spin - parents) * axis).sum(-1)
+
+
+class SuiteReward(Reward):
+    """Base of the suite's rewards: ``[*B, 1]`` from 0 to 1, of the state after a step and the action before it."""
+
+    def __init__(self, scene: Scene, **shown: object) -> None:
+        super().__init__()
+        self.shown = {"scene": scene.name, **shown}
+
+    def upright(self, bodies: Bodies, state: Tensor) -> Tensor:
+        """Cosine ``[*B, K]`` of the angle of each body's z axis to the vertical."""
+        return quaternion.to_matrix(bodies.orientation(state))[..., 8]
+
+    def small(self, action: Tensor) -> Tensor:
+        """The suite's factor ``[*B, 1]``, 0.8 to 1, for small actions."""
+        return (4 + tolerance(action, margin=1, sigmoid="quadratic", at_margin=0.0).mean(-1, keepdim=True)) / 5
+
+
+class Run(SuiteReward):
     r"""The suite's ``cheetah run``: speed of the centre of mass along x over ``speed``, within 0 and 1.
 
     Example:
@@ -58,39 +143,245 @@ class Run(Reward):
     """
 
     def __init__(self, scene: Scene, body: str, *, speed: float = 10.0) -> None:
-        super().__init__()
         if not 0 < speed < math.inf:
             raise ValueError(f"speed must be a positive number of m/s, got {speed}")
+        super().__init__(scene, body=body, speed=float(speed))
         self.velocity, self.speed = CenterOfMassVelocity(scene, body), float(speed)
-        self.shown = {"scene": scene.name, "body": body, "speed": self.speed}
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         return (self.velocity(next_state)[..., :1] / self.speed).clamp(0.0, 1.0)
 
 
-class RunUpright(Reward):
+class RunUpright(SuiteReward):
     r"""The suite's ``walker run`` (``speed=8``), ``walk`` (1) and ``stand`` (0): upright, and as fast as ``speed``.
 
     .. math:: \tfrac{1}{4} (3\, h + \tfrac{1 + \cos\theta}{2}) \cdot \tfrac{1}{6} (5\, v + 1)
 
     with :math:`h` 1 from 1.2 m of the body's height and a Gaussian below, :math:`\theta` its angle to the vertical, and
-    :math:`v` the speed of the centre of mass along x over ``speed``, within 0 and 1 (the second factor 1 for 0).
+    :math:`v` 1 from ``speed`` of the centre of mass along x, half of it at half of the speed, 0 at rest (the second
+    factor 1 for ``speed=0``).
     """
 
     def __init__(self, scene: Scene, body: str, *, speed: float = 8.0) -> None:
-        super().__init__()
         if not 0 <= speed < math.inf:
             raise ValueError(f"speed must be a number of m/s from 0, got {speed}")
+        super().__init__(scene, body=body, speed=float(speed))
         self.bodies, self.velocity, self.speed = Bodies(scene, [body]), CenterOfMassVelocity(scene, body), float(speed)
-        self.shown = {"scene": scene.name, "body": body, "speed": self.speed}
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        position, orientation = self.bodies.pose(next_state)
-        low = (_STAND_HEIGHT - position[..., 2]).clamp(min=0.0) / (_STAND_HEIGHT / 2)
-        standing = torch.exp(math.log(_EDGE) * low.square())
-        stand = (3 * standing + (1 + quaternion.to_matrix(orientation)[..., 8]) / 2) / 4
+        standing = tolerance(self.bodies.position(next_state)[..., 2], 1.2, _ANY, margin=0.6)
+        stand = (3 * standing + (1 + self.upright(self.bodies, next_state)) / 2) / 4
         if self.speed == 0:
             return stand
-        # Half of the reward at half of the speed, none at rest: the suite's linear tolerance.
         moving = (self.velocity(next_state)[..., :1] / self.speed).clamp(0.0, 1.0)
         return stand * (5 * moving + 1) / 6
+
+
+class TipUp(SuiteReward):
+    """The suite's ``acrobot swingup``: the tip's distance from the target above."""
+
+    def __init__(self, scene: Scene, *, sparse: bool = False) -> None:
+        super().__init__(scene, sparse=sparse)
+        self.tip, self.target = Place.of_site(scene, "tip"), Place.of_site(scene, "target")
+        self.radius, self.margin = float(scene.model.site("target").size[0]), 0.0 if sparse else 1.0
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        away = _length(self.target(next_state) - self.tip(next_state))
+        return tolerance(away, 0.0, self.radius, margin=self.margin)
+
+
+class PolesUp(SuiteReward):
+    """The suite's ``cartpole``: poles upright and slow, the cart in the middle, small actions."""
+
+    def __init__(self, scene: Scene, *, sparse: bool = False) -> None:
+        super().__init__(scene, sparse=sparse)
+        hinges = [name for name in scene.joint_names if name.startswith("hinge")]
+        self.cart, self.poles = Bodies(scene, ["cart"]), Bodies(scene, [f"pole_{k + 1}" for k in range(len(hinges))])
+        self.rates, self.sparse = HingeRates(scene, hinges), sparse
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        upright, place = self.upright(self.poles, next_state), self.cart.position(next_state)[..., 0]
+        if self.sparse:
+            up = tolerance(upright, 0.995, 1.0 + 1e-9).prod(-1, keepdim=True)  # a cosine may round beyond 1
+            return up * tolerance(place, -0.25, 0.25)
+        centered = (1 + tolerance(place, margin=2)) / 2
+        slow = (1 + tolerance(self.rates(next_state), margin=5).amin(-1, keepdim=True)) / 2
+        return ((upright + 1) / 2).mean(-1, keepdim=True) * self.small(action) * slow * centered
+
+
+class PoleUp(SuiteReward):
+    """The suite's ``pendulum swingup``: 1 within 8 degrees of the vertical, else 0."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.pole = Bodies(scene, ["pole"])
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return tolerance(self.upright(self.pole, next_state), math.cos(math.radians(8)), _ANY)
+
+
+class Hop(SuiteReward):
+    """The suite's ``hopper hop`` (``speed=2``) and ``stand`` (0): the torso above the foot, and at least so fast."""
+
+    def __init__(self, scene: Scene, *, speed: float = 2.0) -> None:
+        super().__init__(scene, speed=speed)
+        self.torso, self.foot = Place.of_mass(scene, "torso"), Place.of_mass(scene, "foot")
+        self.velocity, self.speed = CenterOfMassVelocity(scene, "torso"), speed
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        height = (self.torso(next_state) - self.foot(next_state))[..., 2:]
+        standing = tolerance(height, 0.6, 2.0)
+        return standing * (self.small(action) if self.speed == 0 else _fast(self.velocity(next_state), self.speed, 0.5))
+
+
+class Walk(SuiteReward):
+    """The suite's ``quadruped walk`` (``speed=0.5``) and ``run`` (5): upright, and forward in the torso's frame."""
+
+    def __init__(self, scene: Scene, *, speed: float) -> None:
+        super().__init__(scene, speed=speed)
+        self.torso, self.speed = Bodies(scene, ["torso"]), speed
+        site = scene.model.site("torso")  # of the velocimeter
+        self.place = Place.of_site(scene, "torso")
+        self.forward_axis = Place(scene, "torso", np.array(_axes(site.quat)[:, 0]))
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        ahead = self.forward_axis(next_state) - self.torso.position(next_state).squeeze(-2)
+        speed = (self.place.velocity(next_state) * ahead).sum(-1, keepdim=True)
+        upright = (1 + self.upright(self.torso, next_state)) / 2
+        moving = tolerance(speed, self.speed, _ANY, margin=self.speed, sigmoid="linear", at_margin=0.5)
+        return upright.clamp(0.0, 1.0) * moving
+
+
+class HeadUp(SuiteReward):
+    """The suite's ``humanoid stand`` (``speed=0``), ``walk`` (1) and ``run`` (10)."""
+
+    def __init__(self, scene: Scene, *, speed: float) -> None:
+        super().__init__(scene, speed=speed)
+        self.head, self.torso = Bodies(scene, ["head"]), Bodies(scene, ["torso"])
+        self.velocity, self.speed = CenterOfMassVelocity(scene, "torso"), speed
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        height = self.head.position(next_state)[..., 2]
+        standing = tolerance(height, 1.4, _ANY, margin=0.35)
+        upright = tolerance(
+            self.upright(self.torso, next_state), 0.9, _ANY, margin=1.9, sigmoid="linear", at_margin=0.0
+        )
+        velocity = self.velocity(next_state)[..., :2]
+        if self.speed == 0:
+            moving = tolerance(velocity, margin=2).mean(-1, keepdim=True)
+        else:
+            moving = (1 + 5 * (_length(velocity) / self.speed).clamp(max=1.0)) / 6
+        return self.small(action) * standing * upright * moving
+
+
+class Spin(SuiteReward):
+    """The suite's ``finger spin``: 1 where the body turns faster than 15 rad/s, else 0."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.rate = HingeRates(scene, ["hinge"])
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return tolerance(self.rate(next_state), -_ANY, -15.0)
+
+
+class TorsoUp(SuiteReward):
+    """The suite's ``fish upright``."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.torso = Bodies(scene, ["torso"])
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return tolerance(self.upright(self.torso, next_state), 1.0, 1.0, margin=1)
+
+
+class CaughtBall(SuiteReward):
+    """The suite's ``ball_in_cup catch``: 1 while the ball is in the cup, else 0."""
+
+    inside: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.ball, self.cup = Bodies(scene, ["ball"]), Place.of_site(scene, "target")
+        size = scene.model.site("target").size[[0, 2]] - scene.model.geom("ball").size[0]
+        self.register_buffer("inside", torch.from_numpy(size.copy()), persistent=False)
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        away = (self.cup(next_state) - self.ball.position(next_state).squeeze(-2)).abs()[..., ::2]
+        return (away < self.inside).all(-1, keepdim=True).to(next_state.dtype)
+
+
+class MassAtTarget(SuiteReward):
+    """The suite's ``point_mass easy``: the mass at its target, by small actions."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.mass, self.target = Place.of_geom(scene, "pointmass"), Place.of_geom(scene, "target")
+        self.size = float(scene.model.geom("target").size[0])
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        away = _length(self.target(next_state) - self.mass(next_state))
+        return tolerance(away, 0.0, self.size, margin=self.size) * self.small(action)
+
+
+def _length(vector: Tensor) -> Tensor:
+    """Lengths ``[*B, 1]`` whose gradient is 0 at 0, where the root's is infinite."""
+    square = vector.square().sum(-1, keepdim=True)
+    away = square > 0
+    return torch.where(away, torch.where(away, square, 1.0).sqrt(), 0.0)
+
+
+def _fast(velocity: Tensor, speed: float, at_margin: float) -> Tensor:
+    """The suite's reward ``[*B, 1]`` for a speed along x."""
+    return tolerance(velocity[..., :1], speed, _ANY, margin=speed / 2, sigmoid="linear", at_margin=at_margin)
+
+
+def _axes(orientation: np.ndarray) -> np.ndarray:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, orientation)
+    return matrix.reshape(3, 3)
+
+
+_REWARDS: dict[str, Callable[[Scene], Reward]] = {
+    "acrobot/swingup": TipUp,
+    "acrobot/swingup_sparse": lambda scene: TipUp(scene, sparse=True),
+    "ball_in_cup/catch": CaughtBall,
+    "cartpole/balance": PolesUp,
+    "cartpole/balance_sparse": lambda scene: PolesUp(scene, sparse=True),
+    "cartpole/swingup": PolesUp,
+    "cartpole/swingup_sparse": lambda scene: PolesUp(scene, sparse=True),
+    "cartpole/three_poles": PolesUp,
+    "cartpole/two_poles": PolesUp,
+    "cheetah/run": lambda scene: Run(scene, "torso"),
+    "finger/spin": Spin,
+    "fish/upright": TorsoUp,
+    "hopper/hop": Hop,
+    "hopper/stand": lambda scene: Hop(scene, speed=0.0),
+    "humanoid/run": lambda scene: HeadUp(scene, speed=10.0),
+    "humanoid/run_pure_state": lambda scene: HeadUp(scene, speed=10.0),
+    "humanoid/stand": lambda scene: HeadUp(scene, speed=0.0),
+    "humanoid/walk": lambda scene: HeadUp(scene, speed=1.0),
+    "pendulum/swingup": PoleUp,
+    "point_mass/easy": MassAtTarget,
+    "quadruped/run": lambda scene: Walk(scene, speed=5.0),
+    "quadruped/walk": lambda scene: Walk(scene, speed=0.5),
+    "walker/run": lambda scene: RunUpright(scene, "torso"),
+    "walker/stand": lambda scene: RunUpright(scene, "torso", speed=0.0),
+    "walker/walk": lambda scene: RunUpright(scene, "torso", speed=1.0),
+}
+
+SUITE_TASKS: tuple[str, ...] = tuple(_REWARDS)
+"""Tasks of the suite whose reward :func:`suite_reward` knows."""
+
+
+def suite_reward(scene: Scene) -> Reward:
+    """The reward of a scene of the suite, ``load_scene("suite:cheetah/run")``, as dm_control pays it.
+
+    Differentiable, but for rewards of 0 or 1. ValueError for another scene, or a task that is not known.
+    """
+    task = scene.origin.get("suite")
+    if task not in _REWARDS:
+        known = f"there are {', '.join(SUITE_TASKS)}"
+        raise ValueError(f"Scene {scene.name!r} is no task of the suite whose reward is known; {known}.")
+    return _REWARDS[task](scene)

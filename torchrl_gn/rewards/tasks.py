@@ -17,7 +17,7 @@ from torchrl_gn.rewards.bodies import Bodies, require_bodies
 from torchrl_gn.rewards.distance import REACHED, Distance, Near
 from torchrl_gn.rewards.imitate_pose import ImitatePose
 from torchrl_gn.rewards.reward import Reward
-from torchrl_gn.rewards.suite import Run, RunUpright
+from torchrl_gn.rewards.suite import Run, RunUpright, suite_reward
 from torchrl_gn.rewards.weighted_sum import rewards_from_options
 from torchrl_gn.scenes.scene import Scene
 
@@ -258,8 +258,8 @@ def available_rewards() -> tuple[tuple[str, str], ...]:
     return tuple(_REWARDS)
 
 
-def make_reward(task: str | Sequence[Mapping[str, Any]], scene: Scene) -> Reward:
-    """Build a reward: of the paper by its task's name, or a weighted sum from options.
+def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene) -> Reward:
+    """Build a reward: of the paper by its task's name, a weighted sum from options, or that of a task of the suite.
 
     Paper: Walker2d's ``"inverse_verticality"`` is largest for a standing walker, as in the paper's text. For a walker
     on its head use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
@@ -267,13 +267,16 @@ def make_reward(task: str | Sequence[Mapping[str, Any]], scene: Scene) -> Reward
     Args:
         task: a task's name, such as ``"balance"``, for a system's scene or variant; or the terms of a sum, such as
             ``[{"type": "Velocity", "body": "torso", "axis": "x"}, {"type": "Effort", "weight": 0.1}]``
-            (:data:`REWARD_TYPES`).
+            (:data:`REWARD_TYPES`); or None for what dm_control pays in a scene of the suite's
+            (:func:`~torchrl_gn.rewards.suite_reward`).
 
     Raises:
         ValueError: for an unknown task (the message lists all), type or argument.
         TypeError: for a robot known by its joints alone.
     """
     require_bodies(scene)
+    if task is None:
+        return suite_reward(scene)
     if not isinstance(task, str):
         return rewards_from_options(task, scene, REWARD_TYPES)
     system = re.sub(r"^swimmer\d+$", "swimmerN", scene.origin.get("system", scene.name))

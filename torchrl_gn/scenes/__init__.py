@@ -22,6 +22,9 @@ from torchrl_gn.scenes.scene import SceneChangedWarning as SceneChangedWarning
 from torchrl_gn.scenes.scene import SceneError as SceneError
 from torchrl_gn.scenes.scene import StaticGraph as StaticGraph
 from torchrl_gn.scenes.scene import UnsupportedSceneError as UnsupportedSceneError
+from torchrl_gn.scenes.suite_tasks import hidden_by_task as hidden_by_task
+from torchrl_gn.scenes.suite_tasks import load_suite_task as load_suite_task
+from torchrl_gn.scenes.suite_tasks import suite_name as suite_name
 from torchrl_gn.scenes.systems import SYSTEMS as SYSTEMS
 from torchrl_gn.scenes.systems import ParameterRange as ParameterRange
 from torchrl_gn.scenes.variants import has_variants as has_variants

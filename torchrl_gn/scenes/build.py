@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 
 import mujoco
@@ -125,7 +126,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
         _converge(spec.option)
         spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
         spec.option.enableflags &= ~int(sleep)
-        graph = topology(spec.compile())
+        graph = topology(compiled(spec))
         for sensor in list(spec.sensors):  # rays and contact forces can take longer than all else of a step
             spec.delete(sensor)
         round_delays(spec)
@@ -134,12 +135,19 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
                 body.name = body.name or f"body{body.id}"
                 for kind in _FRAME_SENSORS:
                     spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname=body.name)
-        model = spec.compile()
+        model = compiled(spec)
     except ValueError as error:
         raise SceneError(f"MuJoCo cannot compile scene {name!r}: {error}") from error
     if model.njnt == 0:
         raise SceneError(f"Scene {name!r} has no joint, so nothing can move. Add one.")
     return model, graph
+
+
+def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a model, without MuJoCo's advice on what its next versions will no longer read."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "compiler attribute .* is deprecated")
+        return spec.compile()
 
 
 def shrink_textures(spec: mujoco.MjSpec, pixels: int) -> None:

@@ -20,6 +20,7 @@ from torchrl_gn.scenes.mjcf_text import inlined, model_assets, read_text, reads_
 from torchrl_gn.scenes.scaled import variant_of
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
 from torchrl_gn.scenes.stored_mjcf import checked, is_among, model_files, packed, require_stored, unpacked
+from torchrl_gn.scenes.suite_tasks import load_suite_task, suite_model_file, suite_name
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
 from torchrl_gn.scenes.urdf import add_motors, is_urdf, with_local_meshes
 from torchrl_gn.scenes.variants import build_system, make_variant
@@ -43,10 +44,12 @@ def load_scene(
 
     Args:
         source: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"swimmerN"`` with N of at least
-            3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), an MJCF or URDF file, ``"package://NAME/PATH"`` of
-            one in an installed Python package, its text, or an ``MjSpec``. Visual meshes may be missing, which warns.
+            3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), a task of the control suite (``"suite:cheetah/run"``), an
+            MJCF or URDF file, ``"package://NAME/PATH"`` of one in an installed Python package, its text, or an
+            ``MjSpec``. Visual meshes may be missing, which warns.
         timestep: control step, seconds, a multiple of the physics step; default: the paper's for its systems, the
-            multiple nearest to 20 ms and at most 25 ms for other models (one physics step if that is longer).
+            suite's for its tasks, the multiple nearest to 20 ms and at most 25 ms for other models (one physics step
+            if that is longer).
         name: name of the scene; default: that of the system, file or model.
         parameters: parameters of a variant (:func:`~torchrl_gn.scenes.parameter_ranges`), also beyond their ranges; the
             others are the standard system's.
@@ -65,7 +68,9 @@ def load_scene(
         SceneError: if the MJCF is invalid or ``timestep`` does not fit.
         UnsupportedSceneError: if the graph cannot represent an element, which the message names.
     """
+    suite = suite_name(source)
     is_system = isinstance(source, str) and not _is_mjcf(source) and find_system(source) is not None
+    is_system = is_system or suite is not None
     if action_bounds is not None and (is_system or parameters is not None):
         raise ValueError(f"{source!r} has bounds of its own; action_bounds go with MJCF models.")
     if wide_starts != 0.5 and (is_system or parameters is not None):
@@ -89,6 +94,8 @@ def load_scene(
         raise TypeError("load_scene needs MJCF, not a compiled MjModel; give its file, text or MjSpec.")
     if not isinstance(source, (str, os.PathLike)):
         raise TypeError(f"load_scene takes a name, a path, MJCF text or an MjSpec, got {type(source).__name__}.")
+    if suite is not None:
+        return _suite_scene(*suite, name=name, timestep=timestep)
     if isinstance(source, str) and is_package_path(source):
         source = package_path(source)
     if isinstance(source, str) and not _is_mjcf(source):
@@ -161,7 +168,7 @@ def _rebuilt(description: dict) -> Scene:
         return variant_of(_rebuilt(unchanged), factors)
     if system and "parameters" in description:
         return make_variant(system.name, description["parameters"], timestep=timestep, name=name)
-    keys = ("system", "mjcf", "assets", "action_bounds", "wide_starts", "mocap_actions", "motors")
+    keys = ("system", "suite", "mjcf", "assets", "action_bounds", "wide_starts", "mocap_actions", "motors")
     return build_scene(
         system.build() if system else _rebuild_mjcf(description),
         name=name,
@@ -172,6 +179,16 @@ def _rebuilt(description: dict) -> Scene:
         mocap_actions=description.get("mocap_actions", False),
         origin={key: description[key] for key in keys if key in description},
     )
+
+
+def _suite_scene(domain: str, task: str, *, name: str | None, timestep: float | None) -> Scene:
+    """The scene of a task of the control suite."""
+    if timestep is None:
+        timestep = load_suite_task(domain, task, 0).control_timestep()
+    with suite_model_file(domain, task) as path:
+        spec, origin = _read_mjcf(path)
+        origin["suite"] = f"{domain}/{task}"
+        return build_scene(spec, name=name or f"{domain}-{task}", timestep=timestep, origin=origin)
 
 
 def _unknown(name: str) -> str:

@@ -11,6 +11,7 @@ from torchrl_gn.training.fit import History as History
 from torchrl_gn.training.fit import fit as fit
 from torchrl_gn.training.fit import fit_ensemble as fit_ensemble
 from torchrl_gn.training.fit_physics import fit_physics as fit_physics
+from torchrl_gn.training.fit_reward import fit_reward as fit_reward
 from torchrl_gn.training.fit_value import ImitationHistory as ImitationHistory
 from torchrl_gn.training.fit_value import ValueHistory as ValueHistory
 from torchrl_gn.training.fit_value import fit_policy as fit_policy

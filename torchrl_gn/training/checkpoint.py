@@ -19,7 +19,7 @@ import torchrl_gn
 from torchrl_gn.dynamics import BoundPredictor, Ensemble, ForwardModel
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths import Normalizer
-from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateValue
+from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateReward, StateValue
 from torchrl_gn.policies import Agent
 from torchrl_gn.scenes import Scene, scene_from_description
 from torchrl_gn.training.description_limits import MemoryLimit, check_whole_numbers
@@ -33,13 +33,15 @@ _IN_HEADER = 4  # version, which it reads too, that has the description in the h
 _DESCRIPTION = "description"  # name of the tensor with the bytes of the description's JSON
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
-Trained = ForwardModel | Ensemble | IdentifyingModel | Agent | StateValue | BoundedPolicy  # what a checkpoint can hold
+# What a checkpoint can hold.
+Trained = ForwardModel | Ensemble | IdentifyingModel | Agent | StateValue | StateReward | BoundedPolicy
 KINDS: dict[str, type[Trained]] = {
     "forward_model": ForwardModel,
     "ensemble": Ensemble,
     "identifying_model": IdentifyingModel,
     "agent": Agent,
     "state_value": StateValue,
+    "state_reward": StateReward,
     "state_policy": StatePolicy,
     "graph_state_policy": GraphStatePolicy,
 }
@@ -93,6 +95,11 @@ class Checkpoint:
     def value(self) -> StateValue:
         """The value of states; CheckpointError if it is another kind of model."""
         return self._as(StateValue)
+
+    @property
+    def reward(self) -> StateReward:
+        """The learned reward; CheckpointError if it is another kind of model."""
+        return self._as(StateReward)
 
     @property
     def policy(self) -> BoundedPolicy:

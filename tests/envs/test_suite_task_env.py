@@ -1,0 +1,93 @@
+"""Episodes of the suite by states: what dm_control plays and pays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_gn.data import Simulator
+from torchrl_gn.envs import SuiteTaskEnv
+from torchrl_gn.scenes import load_scene, load_suite_task
+from torchrl_gn.scenes.suite_tasks import full_physics
+
+pytest.importorskip("dm_control.suite")
+
+
+def test_specs() -> None:
+    check_env_specs(SuiteTaskEnv(load_scene("suite:cartpole/swingup"), num_envs=2))
+
+
+def test_plays_and_pays_as_dm_control() -> None:
+    scene = load_scene("suite:hopper/hop", timestep=0.06)
+    env, theirs = SuiteTaskEnv(scene, num_envs=2, seed=4), load_suite_task("hopper", "hop", 0)
+    assert env.action_repeat == 3
+    theirs.task.random.seed(int(np.random.SeedSequence(4).generate_state(2)[1]))
+    theirs.reset()
+    now = env.reset()
+    actions = torch.rand(2, 10, scene.num_actions) * 2 - 1
+    for step in range(10):
+        torch.testing.assert_close(
+            now["state"][1], Simulator(scene).observe(torch.from_numpy(full_physics(theirs))), rtol=0, atol=1e-12
+        )
+        now = env.step(now.set("action", actions[:, step]))["next"]
+        paid = sum(theirs.step(actions[1, step].double().numpy()).reward for _ in range(3))
+        assert now["reward"][1].item() == pytest.approx(paid, abs=1e-6)
+        assert not now["done"].any()
+
+
+def test_episodes_end_at_the_time_limit_and_begin_anew() -> None:
+    env = SuiteTaskEnv(load_scene("suite:pendulum/swingup", timestep=5.0), num_envs=2)
+    played = env.rollout(6, break_when_any_done=False)  # an episode takes 20 s
+    assert played["next", "truncated"].squeeze(-1)[0].tolist() == [False, False, False, True, False, False]
+    assert torch.equal(played["next", "truncated"], played["next", "done"]) and not played["next", "terminated"].any()
+    assert not torch.equal(played["state"][:, 0], played["state"][:, 4])
+    env.rollout(4)
+    with pytest.raises(RuntimeError, match="episode 0 has ended; reset it"):
+        env.step(env.fake_tensordict().set("action", torch.zeros(2, 1)))
+
+
+def test_some_episodes_begin_anew_and_others_stay() -> None:
+    env = SuiteTaskEnv(load_scene("suite:cartpole/swingup"), num_envs=3, seed=0)
+    now = env.rollout(5)[:, -1]["next"]
+    again = env.reset(now.select("state").set("_reset", torch.tensor([[False], [True], [False]])))
+    changed = (again["state"] != now["state"]).flatten(1).any(1)
+    assert changed.tolist() == [False, True, False]
+
+
+def test_seeds() -> None:
+    env = SuiteTaskEnv(load_scene("suite:cheetah/run"), num_envs=2, seed=1)
+    first = env.reset()["state"]
+    assert not torch.equal(first[0], first[1])
+    env.set_seed(1)
+    assert torch.equal(env.reset()["state"], first)
+
+
+def test_an_unstable_episode_is_terminated(monkeypatch: pytest.MonkeyPatch) -> None:
+    from torchrl_gn.scenes.suite_tasks import suite_modules
+
+    env = SuiteTaskEnv(load_scene("suite:pendulum/swingup"), num_envs=2)
+    now = env.reset()
+
+    def fails(*_):
+        raise suite_modules()[2].PhysicsError("diverged")
+
+    monkeypatch.setattr(env.episodes[0], "step", fails)
+    after = env.step(now.set("action", torch.zeros(2, 1)))["next"]
+    assert after["terminated"].flatten().tolist() == [True, False] and not after["truncated"].any()
+    assert torch.equal(after["state"][0], now["state"][0]) and after["reward"][0] == 0
+
+
+def test_refuses_what_does_not_fit() -> None:
+    with pytest.raises(ValueError, match="'pendulum' is no task of the suite"):
+        SuiteTaskEnv(load_scene("pendulum"))
+    with pytest.raises(ValueError, match="no multiple of the suite's, 0.02 s"):
+        SuiteTaskEnv(load_scene("suite:finger/spin", timestep=0.03))
+    with pytest.raises(ValueError, match="num_envs=0"):
+        SuiteTaskEnv(load_scene("suite:pendulum/swingup"), num_envs=0)
+    env = SuiteTaskEnv(load_scene("suite:pendulum/swingup"))
+    with pytest.raises(ValueError, match="'action' has nan"):
+        env.step(env.reset().set("action", torch.full((1, 1), torch.nan)))
+    assert isinstance(env.reset(), TensorDict) and "pendulum" in repr(env)

@@ -1,0 +1,125 @@
+"""A learned reward: what it reads, fits and keeps."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_gn.data import Simulator, collect_trajectories
+from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.planners import StateReward, task_invariances
+from torchrl_gn.rewards import make_reward
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import fit_reward, load_pretrained, save_checkpoint
+
+
+def paid_data(name: str, task, count: int = 12, scale: float = 1.0) -> tuple:
+    scene = load_scene(name)
+    found = collect_trajectories(scene, count, steps=50, seed=0)
+    state, action = found["state"], found["action"].float()
+    reward = scale * make_reward(task, scene)(state[:, :-1], action, state[:, 1:]).float()
+    return scene, TensorDict({"state": state, "action": action, "reward": reward}, [count])
+
+
+def error_of(reward: StateReward, data: TensorDict) -> float:
+    """Mean squared error in variances."""
+    with torch.no_grad():
+        found = reward(data["state"][:, :-1], data["action"], data["state"][:, 1:])
+    return float((found - data["reward"]).square().mean() / data["reward"].var())
+
+
+def test_learns_what_is_paid() -> None:
+    scene, data = paid_data("cartpole", "balance")
+    torch.manual_seed(0)
+    reward = StateReward(scene, hidden=[64, 64])
+    assert error_of(reward, data) > 0.5
+    last = fit_reward(reward, data, steps=600)
+    assert error_of(reward, data) < 0.02 and last < 0.02
+    state = data["state"][:, 1:].clone().requires_grad_()
+    reward(data["state"][:, :-1], data["action"], state).sum().backward()
+    assert state.grad is not None and bool((state.grad != 0).any()) and bool(state.grad.isfinite().all())
+
+
+def test_reads_the_state_before_and_the_action() -> None:
+    scene, data = paid_data("cartpole", "balance")
+    drawn = torch.Generator().manual_seed(1)
+    before = data["state"][:, :-1, 1, 7:8]  # the cart's velocity
+    data["reward"] = before + 0.5 * data["action"] + 0 * torch.rand(before.shape, generator=drawn)
+    torch.manual_seed(0)
+    reward = StateReward(scene, hidden=[64, 64])
+    fit_reward(reward, data, steps=600)
+    assert error_of(reward, data) < 0.02
+
+
+def test_goes_on_where_what_is_paid_has_grown() -> None:
+    """A new scale changes the normaliser, not what the network predicts."""
+    scene, data = paid_data("cartpole", "balance")
+    torch.manual_seed(0)
+    reward = StateReward(scene, hidden=[64, 64])
+    fit_reward(reward, data, steps=600)
+    with torch.no_grad():
+        before = reward(data["state"][:, :-1], data["action"], data["state"][:, 1:])
+    more = data.clone()
+    more["reward"] = 5 * more["reward"] - 2
+    fit_reward(reward, more, steps=1, lr=1e-12)
+    with torch.no_grad():
+        after = reward(data["state"][:, :-1], data["action"], data["state"][:, 1:])
+    assert reward.normalizer.std.item() == pytest.approx(float(more["reward"].double().std(correction=0)))
+    torch.testing.assert_close(after, before, rtol=1e-3, atol=1e-3)
+    fit_reward(reward, more, steps=600)
+    assert error_of(reward, more) < 0.02
+
+
+def test_grows_beyond_the_data_as_what_is_paid_does() -> None:
+    """Its inputs are normalised by the last data, and a linear part does not saturate."""
+    scene, data = paid_data("cartpole", "balance")
+    torch.manual_seed(0)
+    reward = StateReward(scene, hidden=[64, 64])
+    slow, fast = data.clone(), data.clone()
+    for each, factor in ((slow, 0.4), (fast, 1.0)):
+        each["state"][..., 7:] *= factor
+        each["reward"] = each["state"][:, 1:, 1, 7:8].clone()  # the cart's velocity
+    fit_reward(reward, slow, steps=600)
+    assert error_of(reward, fast) < 0.3
+    fit_reward(reward, fast, steps=600)
+    assert error_of(reward, fast) < 0.01 and error_of(reward, slow) < 0.3
+
+
+def test_a_constant_reward_is_that_constant() -> None:
+    scene, data = paid_data("cartpole", "balance")
+    data["reward"] = torch.full_like(data["reward"], 0.25)
+    reward = StateReward(scene, hidden=[8])
+    fit_reward(reward, data, steps=5)
+    found = reward(data["state"][:, :-1], data["action"], data["state"][:, 1:])
+    torch.testing.assert_close(found, torch.full_like(found, 0.25))
+    data["reward"][0] = 1.0  # the first time that something else is paid
+    fit_reward(reward, data, steps=300)
+    assert error_of(reward, data) < 0.5
+
+
+def test_invariances_and_files(tmp_path) -> None:
+    scene = load_scene("cheetah")
+    torch.manual_seed(0)
+    reward = StateReward(scene, hidden=[8], canonicalizer=Canonicalizer(recenter=True, yaw=False))
+    data = collect_trajectories(scene, 2, steps=5, seed=0)
+    paid = torch.arange(10.0).reshape(2, 5, 1)
+    fit_reward(reward, TensorDict({"state": data["state"], "action": data["action"], "reward": paid}, [2]), steps=2)
+    assert task_invariances(scene, reward) == Canonicalizer(recenter=True, yaw=False)
+    save_checkpoint(tmp_path / "reward.safetensors", reward, scene=scene)
+    again = load_pretrained(tmp_path / "reward.safetensors").reward
+    state = Simulator(scene).observe(torch.as_tensor(scene.rest_physics).unsqueeze(0))
+    action = torch.rand(1, scene.num_actions)
+    assert torch.equal(again(state, action, state), reward(state, action, state)) and repr(again) == repr(reward)
+
+
+def test_refuses_what_does_not_fit() -> None:
+    scene, data = paid_data("cartpole", "balance", 2)
+    reward = StateReward(scene, hidden=[8])
+    with pytest.raises(ValueError, match="do not fit"):
+        fit_reward(reward, TensorDict({**dict(data.items()), "reward": data["reward"][:, :-1]}, [2]))
+    data["reward"][1, 3] = torch.nan
+    with pytest.raises(ValueError, match="'reward' of the data has nan at index"):
+        fit_reward(reward, data)
+    with pytest.raises(ValueError, match="hidden"):
+        StateReward(scene, hidden=[])

@@ -1,0 +1,76 @@
+"""The reward of a scene's steps, learned from what was paid for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
+from torchrl_gn.planners.state_features import StateFeatures, check_hidden
+from torchrl_gn.rewards import Reward
+from torchrl_gn.scenes import Scene
+
+
+class StateReward(Reward):
+    """Reward of a step, a network over :class:`~torchrl_gn.planners.StateFeatures` before and after, and the action.
+
+    For tasks that pay by rules which are unknown, or have no gradient: that of the network is smooth. A linear part
+    lets what is paid for speed grow beyond the data. Learned by :func:`~torchrl_gn.training.fit_reward`; 0 until then.
+    It knows no target.
+
+    Args:
+        hidden: hidden sizes of the network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
+        canonicalizer: as of the features.
+
+    Example:
+        >>> from torchrl_gn.scenes import load_scene
+        >>> reward = StateReward(scene := load_scene("pendulum"))
+        >>> state = torch.zeros(5, scene.num_nodes, 13)
+        >>> reward(state, torch.zeros(5, 1), state).shape
+        torch.Size([5, 1])
+    """
+
+    scale: Tensor
+
+    def __init__(
+        self, scene: Scene, *, hidden: Sequence[int] = (128, 128), canonicalizer: Canonicalizer | None = None
+    ) -> None:
+        super().__init__()
+        self.hidden, self.features = check_hidden(hidden), StateFeatures(scene, canonicalizer)
+        self.shown = {"scene": scene.name, "hidden": self.hidden}
+        self.network = LayerNormMLP(2 * self.features.size + scene.num_actions, 1, self.hidden, linear=True)
+        self.normalizer = Normalizer(1)
+        half_range = (torch.as_tensor(scene.action_high) - torch.as_tensor(scene.action_low)) / 2
+        usable = half_range.isfinite() & (half_range > 0)
+        self.register_buffer("scale", torch.where(usable, half_range, 1.0).float(), persistent=False)
+
+    @property
+    def scene(self) -> Scene:
+        return self.features.scene
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return self.normalizer.inverse(self.normalized(self.inputs(state, action, next_state))).to(next_state.dtype)
+
+    def inputs(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """What the network reads ``[*B, F]`` of a step."""
+        dtype = next(self.network.parameters()).dtype
+        before, after = (self.features(each, dtype) for each in (state, next_state))
+        return torch.cat((before, after, (action / self.scale.to(action.dtype)).to(dtype)), -1)
+
+    def normalized(self, inputs: Tensor) -> Tensor:
+        """Rewards ``[*B, 1]``, in standard deviations from the mean."""
+        return self.network(inputs)
+
+    def description(self) -> dict[str, Any]:
+        """JSON-able values from which :meth:`from_description` rebuilds the network."""
+        return {**self.features.description(), "hidden": self.hidden}
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> StateReward:
+        """Build the network of a :meth:`description`, with fresh weights."""
+        return cls(**StateFeatures.arguments_from(description))

@@ -1,0 +1,42 @@
+"""The control suite's tolerance: 1 within bounds, less at larger distances from them."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Sigmoid = Literal["gaussian", "linear", "long_tail", "quadratic"]
+
+
+def tolerance(
+    value: Tensor,
+    low: float = 0.0,
+    high: float = 0.0,
+    *,
+    margin: float = 0.0,
+    sigmoid: Sigmoid = "gaussian",
+    at_margin: float = 0.1,
+) -> Tensor:
+    """1 where ``low <= value <= high``, and less outside, as ``dm_control.utils.rewards.tolerance``; elementwise.
+
+    Differentiable; without a margin it is 0 outside, and its gradient is 0 everywhere.
+
+    Args:
+        margin: distance from the nearest bound at which it is ``at_margin``.
+    """
+    beyond = (low - value).clamp(min=0.0) + (value - high).clamp(min=0.0)
+    if margin == 0:
+        return (beyond == 0).to(value.dtype)
+    share = beyond / margin
+    if sigmoid == "gaussian":
+        return torch.exp(math.log(at_margin) * share.square())
+    if sigmoid == "linear":
+        return (1 - (1 - at_margin) * share).clamp(min=0.0)
+    if sigmoid == "quadratic":
+        return (1 - (1 - at_margin) * share.square()).clamp(min=0.0)
+    if sigmoid == "long_tail":
+        return 1 / (1 + (1 / at_margin - 1) * share.square())
+    raise ValueError(f"sigmoid must be gaussian, linear, long_tail or quadratic, got {sigmoid!r}")

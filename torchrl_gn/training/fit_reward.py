@@ -1,0 +1,66 @@
+"""Learn the reward of steps from what was paid for them."""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.finite import require_finite
+from torchrl_gn.maths.precision import without_autocast
+from torchrl_gn.networks.layer_norm_mlp import renormalize
+from torchrl_gn.planners.state_reward import StateReward
+from torchrl_gn.training.optimizers import make_optimizer
+
+
+@without_autocast
+def fit_reward(
+    reward: StateReward,
+    data: TensorDictBase,
+    *,
+    steps: int = 1000,
+    batch_size: int = 256,
+    lr: float = 1e-3,
+    seed: int = 0,
+) -> float:
+    """Fit a reward, in place, to what steps paid; return the mean squared error of the last tenth, in variances.
+
+    Normalisers are fitted to these data alone: speeds and what is paid for them grow as a policy learns.
+
+    Args:
+        data: ``[K, T]``: ``state`` ``[K, T + 1, N, 13]``, ``action`` ``[K, T, A]`` and ``reward`` ``[K, T, 1]``.
+        steps: optimiser steps.
+        lr: peak learning rate of Adam, cosine to 0.
+        seed: of the batches.
+
+    Raises:
+        KeyError: an entry is missing.
+        ValueError: an entry is misshapen, or has NaN or Inf.
+        FloatingPointError: the gradient is not finite; no weight changes at that step.
+    """
+    state, action, paid = (cast(Tensor, data[key]) for key in ("state", "action", "reward"))
+    if paid.shape != (*action.shape[:-1], 1) or state.shape[:2] != (len(action), action.shape[1] + 1):
+        given = f"{list(state.shape)}, {list(action.shape)} and {list(paid.shape)}"
+        raise ValueError(f"state [K, T + 1, N, 13], action [K, T, A] and reward [K, T, 1] do not fit: {given}.")
+    require_finite(paid, "'reward' of the data")
+    reward.features.refit(state)
+    with torch.no_grad():
+        inputs = reward.inputs(state[:, :-1], action, state[:, 1:]).flatten(0, 1)
+    target = paid.flatten(0, 1).double()
+    renormalize([reward.network], reward.normalizer, target)
+    normalized = reward.normalizer(target, inputs.dtype)
+    optimizer = make_optimizer(reward.network, "adam", lr=lr)
+    generator = torch.Generator(inputs.device).manual_seed(seed)
+    recent = []
+    for step in range(steps):
+        batch = torch.randint(len(inputs), (batch_size,), generator=generator, device=inputs.device)
+        loss = (reward.normalized(inputs[batch]) - normalized[batch]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step(step, step / steps)
+        if step >= steps - max(1, steps // 10):
+            recent.append(loss.detach())
+    return float(torch.stack(recent).mean()) if recent else math.nan
