@@ -112,12 +112,15 @@ class ActorCriticOptimizer:
         self.optimizer = torch.optim.Adam([{"params": of, "lr": lr} for of, lr in groups], betas=_BETAS, fused=True)
         self.clipped = [self.policy, *self.values, *([alpha] for alpha in self.alphas)]
         self._by_torch, self._graph = 2 if self.alphas[0].is_cuda else math.inf, None  # updates before the recording
-        self._states: list[Tensor] = []
+        self._states: list[TensorDict] = []
 
     def learn(
-        self, starts: Sequence[Callable[[int], Tensor]], *, updates: int, batch_size: int, desc: str
+        self, starts: Sequence[Callable[[int], TensorDict]], *, updates: int, batch_size: int, desc: str
     ) -> dict[str, float]:
-        """Update from states ``[batch_size, N, 13]`` that every task's ``starts`` draws; means of the last quarter."""
+        """Update from the states ``[batch_size]`` that every task's ``starts`` draws; means of the last quarter.
+
+        They have ``state`` ``[batch_size, N, 13]`` and, where episodes have one, ``target`` ``[batch_size, 3]``.
+        """
         kept: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
             for update in range(updates):
@@ -128,7 +131,7 @@ class ActorCriticOptimizer:
                 bar.update()
         return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in kept.items()}
 
-    def _update(self, draws: Sequence[Callable[[], Tensor]], when: str) -> list[dict[str, Tensor]]:
+    def _update(self, draws: Sequence[Callable[[], TensorDict]], when: str) -> list[dict[str, Tensor]]:
         """Update from the states that are drawn for every loss; numbers of each. FloatingPointError changes nothing."""
         if self._graph is None and self._by_torch < 1:
             self._record([draw() for draw in draws])
@@ -149,13 +152,13 @@ class ActorCriticOptimizer:
             raise FloatingPointError(f"The gradient is not finite at {when}; lower the learning rate.")
         return [{name: next(rest) for name in _KEPT} for _ in self.losses]
 
-    def _backward(self, loss: SHACLoss, state: Tensor) -> dict[str, Tensor]:
-        """Add the gradient of a loss in states ``[B, N, 13]``."""
-        out = loss(TensorDict({"state": state}, [len(state)]))
+    def _backward(self, loss: SHACLoss, starts: TensorDict) -> dict[str, Tensor]:
+        """Add the gradient of a loss from states ``[B]``."""
+        out = loss(starts)
         (out["loss_actor"] / len(self.losses) + out["loss_value"] + out["loss_alpha"]).backward()
         return {name: out[name].detach() for name in _KEPT}
 
-    def _record(self, states: list[Tensor]) -> None:
+    def _record(self, states: list[TensorDict]) -> None:
         """Record the update of as many states."""
         self._states = states
         gc.collect()  # what earlier updates left of their gradients belongs to another stream
@@ -208,13 +211,14 @@ def play(
         )
 
 
-def windows(state: Tensor, action: Tensor, reward: Tensor | None = None) -> TensorDict:
+def windows(state: Tensor, action: Tensor, reward: Tensor | None = None, target: Tensor | None = None) -> TensorDict:
     """Cut trajectories into those of :data:`WINDOW` steps.
 
     Args:
         state: ``[K, T + 1, N, 13]``.
         action: ``[K, T, A]``.
         reward: ``[K, T, 1]`` that was paid, if it is to be learned.
+        target: ``[K, 3]`` of the episodes, if they have one.
     """
     first = range(0, action.shape[1] - WINDOW + 1, WINDOW)
     parts = {
@@ -223,6 +227,8 @@ def windows(state: Tensor, action: Tensor, reward: Tensor | None = None) -> Tens
     }
     if reward is not None:
         parts["reward"] = torch.cat([reward[:, at : at + WINDOW] for at in first])
+    if target is not None:
+        parts["target"] = target.repeat(len(first), 1)
     return TensorDict(parts, [len(parts["action"])])
 
 
@@ -230,4 +236,10 @@ def played_windows(played: TensorDict, *, rewards: bool = False) -> TensorDict:
     """Trajectories of :func:`play`, without the episodes whose simulation became unstable."""
     alive = ~cast(Tensor, played["next", "terminated"]).flatten(1).any(1)
     state = torch.cat((played["state"], played["next", "state"][:, -1:]), 1)
-    return windows(state[alive], played["action"][alive], played["next", "reward"][alive] if rewards else None)
+    target = played.get("target", None)
+    return windows(
+        state[alive],
+        played["action"][alive],
+        played["next", "reward"][alive] if rewards else None,
+        None if target is None else target[alive, 0],
+    )

@@ -10,9 +10,8 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from torch import Tensor
 
-from _common.actor_critic import ActorCriticOptimizer, TargetSquares, play, played_windows, windows
+from _common.actor_critic import WINDOW, ActorCriticOptimizer, TargetSquares, play, played_windows, windows
 from _common.tensor_files import load_tensors
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import (
@@ -72,7 +71,8 @@ class Task:
     loss: SHACLoss
 
     def __init__(self, cfg: DictConfig, scene: Scene, reward: Reward, judge: Reward, folder: str) -> None:
-        if reward.target_shape is not None:
+        self.targeted = reward.target_shape is not None
+        if self.targeted and "suite" not in scene.origin:
             raise ValueError(f"A policy of states does not know the target of {reward}.")
         self.cfg, self.scene, self.reward, self.judge, self.folder = cfg, scene, reward, judge, folder
         self.device = Workers().device(cfg.device)
@@ -101,7 +101,7 @@ class Task:
         cfg, config = self.cfg, plain_config(self.cfg)
         if begun is None:
             model = new_model(self.scene, cfg.members, config["model"])
-            options = {"discount": cfg.discount, "hidden": cfg.hidden}
+            options = {"discount": cfg.discount, "hidden": cfg.hidden, "target": self.targeted}
             self.value = StateValue(self.scene, canonicalizer=self.invariances, **options)
         else:
             model = load_pretrained(begun.of("model", self)).trained
@@ -132,8 +132,11 @@ class Task:
         last = cast(TensorDict, torch.cat(cast(Any, self.data[-_SCALED_BY:])))
         with torch.no_grad():
             reward = cast(Reward, self.loss.env.reward)  # on the device
-            rewards = reward(last["state"][:, :-1], last["action"], last["state"][:, 1:], None)
-        self.loss.fit_normalizers(seen if self.squares is None else self.squares.move(seen), rewards.flatten(0, 1))
+            targets = last["target"].unsqueeze(1).expand(*last["action"].shape[:2], 3) if self.targeted else None
+            rewards = reward(last["state"][:, :-1], last["action"], last["state"][:, 1:], targets)
+        target = self.newest["target"].repeat_interleave(WINDOW + 1, 0) if self.targeted else None
+        seen = seen if self.squares is None else self.squares.move(seen)
+        self.loss.fit_normalizers(seen, rewards.flatten(0, 1), target)
 
     def learn_reward(self, data: TensorDict, index: int) -> None:
         """Nothing: the reward is known."""
@@ -154,19 +157,23 @@ class Task:
             model = specialize(self.model)
             env.world_model = cast(Any, model.split() if isinstance(model, BoundEnsemble) else model)
 
-    def starts(self) -> Callable[[int], Tensor]:
-        """What draws states ``[size, N, 13]`` to imagine from, half of the newest episodes, half of all."""
-        states = []
+    def starts(self) -> Callable[[int], TensorDict]:
+        """What draws states ``[size]`` to imagine from, half of the newest episodes, half of all."""
+        found = []
         for data in self.data, [self.newest]:
-            states.append(torch.cat([part["state"][:, :-1].flatten(0, 1) for part in data]))
+            states = torch.cat([part["state"][:, :-1].flatten(0, 1) for part in data])
+            entries = {"state": states}
+            if self.targeted:
+                entries["target"] = torch.cat([part["target"].repeat_interleave(WINDOW, 0) for part in data])
+            found.append(TensorDict(entries, [len(states)]))
 
-        def draw(size: int) -> Tensor:
+        def draw(size: int) -> TensorDict:
             counts = size - size // 2, size // 2
-            draws = zip(states, counts, strict=True)
-            parts = [of[torch.randint(len(of), (count,), device=of.device)] for of, count in draws]
+            draws = zip(found, counts, strict=True)
+            parts = [of[torch.randint(len(of), (count,), device=self.device)] for of, count in draws]
             if self.squares is not None:
-                parts[0] = self.squares.move(parts[0])
-            return torch.cat(parts)
+                parts[0]["state"] = self.squares.move(parts[0]["state"])
+            return cast(TensorDict, torch.cat(cast(Any, parts)))
 
         return draw
 
@@ -224,11 +231,14 @@ class ActorCritic:
     def _new_policy(self) -> BoundedPolicy:
         first = self.tasks[0]
         if self.cfg.policy == "graph":
+            if any(task.targeted for task in self.tasks):
+                raise ValueError("policy=graph does not read the target that episodes of this task have: policy=mlp.")
             return GraphStatePolicy(first.scene, canonicalizer=first.invariances, **plain_config(self.cfg)["graph"])
         if self.cfg.policy != "mlp" or len(self.tasks) > 1:
             wanted = "mlp or graph" if len(self.tasks) == 1 else "graph to learn on several systems"
             raise ValueError(f"policy={self.cfg.policy} must be {wanted}.")
-        return StatePolicy(first.scene, hidden=self.cfg.hidden, canonicalizer=first.invariances)
+        options = {"hidden": self.cfg.hidden, "canonicalizer": first.invariances, "target": first.targeted}
+        return StatePolicy(first.scene, **options)
 
     def learn(self, index: int) -> dict[str, float]:
         """Train the models, then policy and values in them."""

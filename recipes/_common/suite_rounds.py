@@ -18,7 +18,7 @@ from torchrl_gn.data import spline_controls
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.envs import SuiteTaskEnv
 from torchrl_gn.planners import BoundedPolicy, StateReward
-from torchrl_gn.scenes import Scene, hidden_by_task, load_scene
+from torchrl_gn.scenes import Scene, has_target, hidden_by_task, load_scene
 from torchrl_gn.training import fit_reward, load_pretrained
 
 LEARNED = "learned"
@@ -41,13 +41,14 @@ class SuiteTask(Task):
     def __init__(self, cfg: DictConfig, scene: Scene, folder: str) -> None:
         self.learns_reward = cfg.reward == LEARNED
         if self.learns_reward:
-            reward = StateReward(scene, hidden=cfg.hidden, canonicalizer=_hidden(scene))
+            target = has_target(scene.origin["suite"])
+            reward = StateReward(scene, hidden=cfg.hidden, canonicalizer=_hidden(scene), target=target)
         else:
             reward = reward_of(cfg, scene)
         super().__init__(cfg, scene, reward, reward, folder)
 
     def _invariances(self) -> Canonicalizer:
-        return _hidden(self.scene) if self.learns_reward else super()._invariances()
+        return _hidden(self.scene)
 
     @cached_property
     def _played(self) -> SuiteTaskEnv:

@@ -10,6 +10,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.data import Simulator
 from torchrl_gn.envs import SuiteTaskEnv
+from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene, load_suite_task
 from torchrl_gn.scenes.suite_tasks import full_physics
 
@@ -55,6 +56,19 @@ def test_some_episodes_begin_anew_and_others_stay() -> None:
     again = env.reset(now.select("state").set("_reset", torch.tensor([[False], [True], [False]])))
     changed = (again["state"] != now["state"]).flatten(1).any(1)
     assert changed.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("task", ["reacher/easy", "finger/turn_hard", "fish/swim", "swimmer/swimmer6"])
+def test_shows_the_target_of_each_episode(task: str) -> None:
+    env = SuiteTaskEnv(scene := load_scene(f"suite:{task}"), num_envs=2, seed=0)
+    check_env_specs(env)
+    played = env.rollout(5)
+    target = played["target"]
+    assert target.shape == (2, 5, 3) and not torch.equal(target[0, 0], target[1, 0])
+    assert torch.equal(target, target[:, :1].expand_as(target)) and torch.equal(played["next", "target"], target)
+    known = make_reward(None, scene)(played["state"], played["action"], played["next", "state"], target)
+    torch.testing.assert_close(known.float(), played["next", "reward"])
+    assert not torch.equal(env.reset()["target"], target[:, 0])
 
 
 def test_seeds() -> None:

@@ -15,7 +15,7 @@ from torchrl_gn.dynamics import Ensemble, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.objectives import SHACLoss
 from torchrl_gn.planners import StatePolicy, StateValue
-from torchrl_gn.rewards import make_reward
+from torchrl_gn.rewards import Distance, make_reward
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained
 
@@ -241,3 +241,49 @@ def test_nothing_counts_after_an_end(model, scenes, starts):
         mean = sum(returns) / len(returns) / loss.value.normalizer.std.item()
         wanted = -mean - loss.log_alpha.exp().item() * entropy / count
     assert out["loss_actor"].item() == pytest.approx(wanted, rel=1e-4)
+
+
+def targeted_loss(model, scene, starts: Tensor, target: Tensor, **options) -> SHACLoss:
+    torch.manual_seed(0)
+    env = ModelEnv(specialize(model.bind(scene)), Distance(scene, "pole", offset=(0.0, 0.0, 0.5)))
+    policy = StatePolicy(scene, hidden=(16,), target=True)
+    value = StateValue(scene, discount=0.9, hidden=(16,), target=True)
+    loss = SHACLoss(policy, value, env, **options)
+    spread = starts + 0.3 * torch.randn(starts.shape, dtype=starts.dtype)
+    loss.fit_normalizers(spread, -3 * torch.rand(100, 1), target)
+    return loss
+
+
+def test_episodes_may_have_a_target(model, scenes, starts):
+    target = torch.randn(len(starts), 3, generator=torch.Generator().manual_seed(0)).double()
+    loss = targeted_loss(model, scenes["pendulum"], starts, target, steps=4)
+    batch = TensorDict({"state": starts, "target": target}, [len(starts)])
+    torch.manual_seed(1)
+    out = loss(batch)
+    torch.manual_seed(1)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        start = loss.env.reset(batch.select("state"), set_state=True).set("target", target).set("task", target)
+        played = loss.env.rollout(4, loss.policy, tensordict=start, auto_reset=False)
+        reward, last = played["next", "reward"], loss.value(played["next", "state"][:, -1], target)
+    total = sum(0.9**k * reward[:, k] for k in range(4)) + 0.9**4 * last
+    wanted = -(total / loss.value.normalizer.std).mean() - loss.log_alpha.exp() * out["entropy"]
+    torch.testing.assert_close(out["loss_actor"].detach().double(), wanted.detach().double(), rtol=1e-5, atol=1e-6)
+    elsewhere = loss(batch.clone().set("target", target.flip(0)))
+    assert abs(float((elsewhere["loss_value"] - out["loss_value"]).detach())) > 1e-4
+    (out["loss_actor"] + out["loss_value"]).backward()
+    assert all(each.grad is not None for each in (*loss.policy.parameters(), *loss.value.parameters()))
+    with pytest.raises(KeyError, match="SHACLoss needs 'target'"):
+        loss(batch.select("state"))
+
+
+def test_policy_value_and_reward_share_the_target(model, scenes, starts):
+    scene = scenes["pendulum"]
+    loss = targeted_loss(model, scene, starts, torch.zeros(len(starts), 3).double(), steps=2)
+    plain = ModelEnv(model.bind(scene), make_reward("balance", scene))
+    for policy, value, env in (
+        (loss.policy, loss.value, plain),
+        (StatePolicy(scene), loss.value, loss.env),
+        (loss.policy, StateValue(scene), loss.env),
+    ):
+        with pytest.raises(ValueError, match="must all have a target, or none"):
+            SHACLoss(policy, value, env)

@@ -124,6 +124,23 @@ SUITE = (*SMALL[3:], "system=suite:cartpole/swingup", "timestep=null", "action_r
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reward", ["null", "learned"])
+def test_a_policy_reads_the_target_of_an_episode(reward, tmp_path, call):
+    pytest.importorskip("dm_control.suite")
+    options = (f"reward={reward}", "reward_steps=3", "system=suite:reacher/easy")
+    code, _, errors = call(*SUITE, *options, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
+    assert code == 0 and "warning" not in errors.lower(), errors
+    played = load_file(tmp_path / "rounds/001/played.safetensors")
+    assert played["target"].shape == (2, 3) and not torch.equal(*played["target"])
+    policy, state = load_pretrained(tmp_path / "policy.safetensors").policy, played["state"][:, 0]
+    assert policy.in_keys == ["state", "target"]
+    actions = [policy.act(state, target) for target in (played["target"], played["target"].flip(0))]
+    assert (actions[0] - actions[1]).abs().max() > 1e-4
+    with pytest.raises(ValueError, match=r"need a target \[2, 3\], got None"):
+        policy.act(state)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reward", ["null", "learned"])
 def test_a_task_of_the_suite_is_paid_by_dm_control(reward, tmp_path, call):
     pytest.importorskip("dm_control.suite")
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
@@ -164,7 +181,8 @@ def test_a_task_of_the_suite_is_paid_by_dm_control(reward, tmp_path, call):
         (("judged_reward=run",), "judged_reward=run: suite:cartpole/swingup has its own"),
         (("target_squares=[1]",), "has starts of its own"),
         (("system=suite:dog/run",), "There is no scene of the suite's dog/run"),
-        (("system=suite:reacher/easy",), "is no task of the suite whose reward is known"),
+        (("system=suite:humanoid_CMU/stand",), "is no task of the suite whose reward is known"),
+        (("system=suite:reacher/easy", "policy=graph"), "policy=graph does not read the target"),
         (("system=pendulum", "reward=learned"), "no reward 'learned' for scene 'pendulum'"),
         (("system=pendulum",), "'pendulum' is no task of the suite whose reward is known"),
     ],

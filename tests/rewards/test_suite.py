@@ -10,7 +10,7 @@ import torch
 from torchrl_gn.data import Simulator
 from torchrl_gn.rewards import SUITE_TASKS, Near, Reward, Run, RunUpright, make_reward, suite_reward, tolerance
 from torchrl_gn.scenes import load_scene, load_suite_task
-from torchrl_gn.scenes.suite_tasks import full_physics
+from torchrl_gn.scenes.suite_tasks import episode_target, full_physics, has_target
 
 suite = pytest.importorskip("dm_control.suite")
 
@@ -108,6 +108,10 @@ BINARY = {
     "cartpole/balance_sparse",
     "cartpole/swingup_sparse",
     "finger/spin",
+    "finger/turn_easy",
+    "finger/turn_hard",
+    "reacher/easy",
+    "reacher/hard",
     "hopper/stand",
     "pendulum/swingup",
 }
@@ -121,8 +125,8 @@ def test_is_what_dm_control_pays(task: str) -> None:
     domain, name = task.split("/")
     scene, env = load_scene(f"suite:{task}"), load_suite_task(domain, name, 0)
     rng, spec, data = np.random.default_rng(0), env.action_spec(), env.physics.data.ptr
-    states, actions, paid = [], [], []
-    speeds = [0.0] if "fish" in task else [0.1, 1.0, 20.0]  # its fins weigh nothing
+    states, actions, targets, paid = [], [], [], []
+    speeds = {"fish": [0.0], "swimmer": [0.0, 0.1]}.get(domain, [0.1, 1.0, 20.0])  # which stay stable
     for episode in range(12):
         env.reset()
         if episode < 3:
@@ -136,10 +140,14 @@ def test_is_what_dm_control_pays(task: str) -> None:
             paid.append(env.step(action).reward)
             states.append((before, full_physics(env)))
             actions.append(action)
+            targets.append(episode_target(env) if has_target(task) else np.zeros(3))
     before, after = Simulator(scene).observe(torch.from_numpy(np.stack(states))).unbind(1)
     after.requires_grad_()
-    given = suite_reward(scene)(before, torch.from_numpy(np.stack(actions)), after, None)
+    reward, goals = suite_reward(scene), torch.from_numpy(np.stack(targets))
+    given = reward(before, torch.from_numpy(np.stack(actions)), after, goals if has_target(task) else None)
+    assert reward.target_shape == ((3,) if has_target(task) else None)
     np.testing.assert_allclose(given.detach().squeeze(-1).numpy(), paid, atol=1e-9)
+    assert has_target(task) or len(np.unique(paid)) > 1 or task in BINARY
     if task not in BINARY:
         assert np.std(paid) > 1e-3
         (gradient,) = torch.autograd.grad(given.sum(), after)
@@ -153,8 +161,8 @@ def test_by_the_scene_alone() -> None:
         assert reward(state, torch.zeros(1, 1), state, None).item() == 1.0  # the pole at rest stands
     with pytest.raises(ValueError, match="'cheetah' is no task of the suite whose reward is known; there are acrobot"):
         make_reward(None, load_scene("cheetah"))
-    with pytest.raises(ValueError, match="'reacher-easy' is no task"):
-        suite_reward(load_scene("suite:reacher/easy"))
+    with pytest.raises(ValueError, match="'humanoid_CMU-stand' is no task"):
+        suite_reward(load_scene("suite:humanoid_CMU/stand"))
 
 
 @pytest.mark.parametrize("sigmoid", ["gaussian", "linear", "long_tail", "quadratic"])

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
-from torchrl_gn.scenes.suite_tasks import full_physics, load_suite_task, suite_modules
+from torchrl_gn.scenes.suite_tasks import episode_target, full_physics, has_target, load_suite_task, suite_modules
 
 
 class SuiteTaskEnv(EnvBase):
@@ -25,6 +25,7 @@ class SuiteTaskEnv(EnvBase):
 
     Entries:
         - ``state`` ``[M, N, 13]`` float64: as of :class:`~torchrl_gn.envs.SceneEnv`.
+        - ``target`` ``[M, 3]`` float64, of tasks whose episodes have one: its place, metres, world frame.
         - ``action`` ``[M, A]`` float32.
         - ``done``, ``truncated``, ``terminated`` ``[M, 1]``: at the time limit, an episode is truncated; it is
           terminated where the task ends it, or the simulation becomes unstable, with the last good state kept.
@@ -56,10 +57,14 @@ class SuiteTaskEnv(EnvBase):
         self.action_repeat = _frames_of(scene, self.episodes[0].control_timestep())
         self._error = suite_modules()[2].PhysicsError
         self._physics = np.zeros((num_envs, scene.physics_size))
+        self._targets = np.zeros((num_envs, 3)) if has_target(scene.origin["suite"]) else None
         self._over = torch.ones(num_envs, 1, dtype=torch.bool)  # which must be reset before they go on
         count = self.batch_size
         shape = torch.Size([*count, scene.num_nodes, scene.state_size])
-        self.observation_spec = Composite({"state": Unbounded(shape=shape, dtype=torch.float64)}, shape=count)
+        seen = {"state": Unbounded(shape=shape, dtype=torch.float64)}
+        if self._targets is not None:
+            seen["target"] = Unbounded(shape=torch.Size([*count, 3]), dtype=torch.float64)
+        self.observation_spec = Composite(seen, shape=count)
         low, high = (torch.as_tensor(of).float().expand(num_envs, -1) for of in (scene.action_low, scene.action_high))
         self.action_spec = Bounded(low=low, high=high, shape=low.shape, dtype=torch.float32)
         self.reward_spec = Unbounded(shape=torch.Size([*count, 1]), dtype=torch.float32)
@@ -82,7 +87,9 @@ class SuiteTaskEnv(EnvBase):
                 env.reset()
                 self._over[index] = False
                 self._physics[index] = full_physics(env)
-        return TensorDict({"state": self._state()}, self.batch_size, device=self.device)
+                if self._targets is not None:
+                    self._targets[index] = episode_target(env)
+        return TensorDict(self._seen(), self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = cast(Tensor, tensordict["action"])
@@ -99,7 +106,7 @@ class SuiteTaskEnv(EnvBase):
                 discount = 0.0
             if discount is not None:
                 ended["terminated" if discount == 0 else "truncated"][index] = True
-        entries = {"state": self._state(), "reward": torch.from_numpy(paid).float(), **ended}
+        entries = {**self._seen(), "reward": torch.from_numpy(paid).float(), **ended}
         self._over = ended["truncated"] | ended["terminated"]
         entries["done"] = self._over.clone()
         return TensorDict(entries, self.batch_size, device=self.device)
@@ -114,8 +121,9 @@ class SuiteTaskEnv(EnvBase):
                 return paid, step.discount
         return paid, None
 
-    def _state(self) -> Tensor:
-        return self.simulator.observe(torch.from_numpy(self._physics.copy()))
+    def _seen(self) -> dict[str, Tensor]:
+        seen = {"state": self.simulator.observe(torch.from_numpy(self._physics.copy()))}
+        return seen if self._targets is None else {**seen, "target": torch.from_numpy(self._targets.copy())}
 
     def __repr__(self) -> str:
         return f"SuiteTaskEnv({self.scene.name!r}, num_envs={len(self.episodes)})"

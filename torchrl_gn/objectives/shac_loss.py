@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -44,8 +44,9 @@ class SHACLoss(LossModule):
     In an ensemble every state is imagined from by every one of its ``K`` members, with the same noise of the actions:
     ``K B`` trajectories. The policy maximises the mean of their returns less ``pessimism`` standard deviations.
 
-    Reads ``state`` ``[B, N, 13]``. Writes ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to
-    weights of its own; and ``reward``, the mean of imagined steps, and ``entropy``.
+    Reads ``state`` ``[B, N, 13]`` and, for a policy and value with a target, ``target`` ``[B, 3]``. Writes
+    ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to weights of its own; and ``reward``, the
+    mean of imagined steps, and ``entropy``.
 
     Args:
         policy: its network and standard deviations are learned.
@@ -88,6 +89,13 @@ class SHACLoss(LossModule):
                 )
             env.scene.require_timestep(network.scene.timestep, f"{type(network).__name__}")
         check_pessimism(pessimism, env)
+        wanted = getattr(env.reward, "target_shape", None)
+        if not (policy.targeted == value.features.target == (wanted is not None)):
+            raise ValueError(
+                f"Policy, value and reward must all have a target, or none: target={policy.targeted},"
+                f" {value.features.target} and {wanted}."
+            )
+        self.targeted = policy.targeted
         self.policy, self.value, self.steps, self._fitted = policy, value, int(steps), False
         self.pessimism, self.members = pessimism, env.members
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
@@ -100,15 +108,16 @@ class SHACLoss(LossModule):
 
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        (state,) = read_entries(self, tensordict, ["state"])
+        state, *targets = read_entries(self, tensordict, ["state", "target"] if self.targeted else ["state"])
         if not self._fitted:
             if not (self.policy.fitted and self.value.fitted):
                 raise RuntimeError("Normalisers of policy or value have seen no data: call fit_normalizers first.")
             self._fitted = True  # asking waits for a device
-        imagined, entropies = self._imagine(state)
+        target = targets[0].repeat(self.members, 1) if targets else None
+        imagined, entropies = self._imagine(state, target)
         final = imagined["next", "state"][:, -1]
         with frozen(self.value):
-            last = self.value(final)
+            last = self.value(final, target)
         reward, ended = imagined["next", "reward"], imagined["next", "terminated"]
         alive = alive_of(ended).to(reward.dtype)
         counted = alive[:, :-1] / alive[:, :-1].mean()
@@ -121,7 +130,7 @@ class SHACLoss(LossModule):
         return TensorDict(
             {
                 "loss_actor": -(total / scale).mean() - alpha.detach() * entropy,
-                "loss_value": self._value_loss(imagined, alive[:, :-1]),
+                "loss_value": self._value_loss(imagined, alive[:, :-1], target),
                 "loss_alpha": alpha * (entropy.detach() - self.target_entropy),
                 "reward": (counted * reward.detach()).mean(),
                 "entropy": entropy.detach(),
@@ -129,23 +138,25 @@ class SHACLoss(LossModule):
         )
 
     @without_autocast
-    def fit_normalizers(self, state: Tensor, reward: Tensor | None = None) -> None:
+    def fit_normalizers(self, state: Tensor, reward: Tensor | None = None, target: Tensor | None = None) -> None:
         """Add states ``[*B, N, 13]`` to the normalisers; scale values, and the loss, by rewards ``[*B, 1]`` for ever.
 
         The value stays what it is: :func:`~torchrl_gn.networks.layer_norm_mlp.renormalize`.
         """
         for network in (self.policy, self.value):
-            network.features.update(state)
+            network.features.update(state, *(() if target is None else (target,)))
         if reward is not None:
             members = cast(list[LayerNormMLP], list(self.value.members))
             returns = reward / max(1 - self.value.discount, 1e-3)
             renormalize(members, self.value.normalizer, returns, constant=1.0)  # until something is paid
 
-    def _imagine(self, state: Tensor) -> tuple[TensorDict, Tensor]:
+    def _imagine(self, state: Tensor, target: Tensor | None = None) -> tuple[TensorDict, Tensor]:
         """Steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of the entropy of its actions."""
         state = state.repeat(self.members, 1, 1)
         # Not reset(), which asks whether an episode has ended: it would wait for a device.
         now = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
+        if target is not None:
+            now["task"] = cast(Any, self.env.reward).task_of(state, target)
         steps, entropies = [], []
         with ExitStack() as stack:
             for each in (self.env.world_model, self.env.reward):
@@ -154,7 +165,7 @@ class SHACLoss(LossModule):
             stack.enter_context(self.policy.prepared())
             stack.enter_context(set_exploration_type(ExplorationType.RANDOM))
             for _ in range(self.steps):
-                action, log_prob = self.policy.sample(state := cast(Tensor, now["state"]), self.members)
+                action, log_prob = self.policy.sample(state := cast(Tensor, now["state"]), self.members, target)
                 for each in (state, action):
                     if each.requires_grad:  # neither under no_grad, nor of a frozen policy
                         each.register_hook(_finite_rows)
@@ -166,12 +177,13 @@ class SHACLoss(LossModule):
                 now = step_mdp(now, exclude_done=True)
         return cast(TensorDict, torch.stack(steps, 1)), torch.stack(entropies, 1)
 
-    def _value_loss(self, imagined: TensorDict, alive: Tensor) -> Tensor:
+    def _value_loss(self, imagined: TensorDict, alive: Tensor, target: Tensor | None) -> Tensor:
         """Squared error of the value on its targets, in variances of its normaliser."""
         dtype = next(self.value.members.parameters()).dtype
         with torch.no_grad():
             states = torch.cat((imagined["state"], imagined["next", "state"][:, -1:]), 1)
-            features = self.value.features(states, dtype)
+            place = None if target is None else target.unsqueeze(1).expand(*states.shape[:2], 3)
+            features = self.value.features(states, dtype, place)
             here, there = features[:, :-1], features[:, 1:]
             done = imagined["next", "terminated"].clone()
             done[:, -1] = True  # imagination ends

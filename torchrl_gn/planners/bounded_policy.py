@@ -26,7 +26,8 @@ _LOG_STD, _LOG_STD_BOUNDS = -1.0, (-5.0, 1.0)  # at first, and where it may get
 class BoundedPolicy(TensorDictModuleBase):
     """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to float32 ``action`` ``[*B, A]``.
 
-    Explores, with TorchRL's exploration type RANDOM, by Gaussian noise before the tanh that bounds its actions.
+    Policies of episodes with a target (:attr:`targeted`) read ``target`` ``[*B, 3]``, too. Explores, with TorchRL's
+    exploration type RANDOM, by Gaussian noise before the tanh that bounds its actions.
 
     Args:
         stds: number of learned standard deviations.
@@ -59,7 +60,7 @@ class BoundedPolicy(TensorDictModuleBase):
         """The policy for a scene, sharing its weights; ValueError if it cannot drive it or has another timestep."""
 
     @abstractmethod
-    def unbounded(self, state: Tensor) -> Tensor:
+    def unbounded(self, state: Tensor, target: Tensor | None = None) -> Tensor:
         """Actions ``[*B, A]`` before the tanh, without exploration; ValueError for states of another shape."""
 
     @abstractmethod
@@ -74,6 +75,11 @@ class BoundedPolicy(TensorDictModuleBase):
     @property
     def scene(self) -> Scene:
         return self.features.scene
+
+    @property
+    def targeted(self) -> bool:
+        """Whether it reads the target of an episode."""
+        return False
 
     @property
     def fitted(self) -> bool:
@@ -92,19 +98,21 @@ class BoundedPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         explores, state = exploration_type() == ExplorationType.RANDOM, tensordict["state"]
-        return tensordict.set("action", self.sample(state)[0] if explores else self.act(state))
+        target = tensordict["target"] if self.targeted else None
+        action = self.sample(state, target=target)[0] if explores else self.act(state, target)
+        return tensordict.set("action", action)
 
-    def act(self, state: Tensor) -> Tensor:
+    def act(self, state: Tensor, target: Tensor | None = None) -> Tensor:
         """Actions ``[*B, A]`` in states ``[*B, N, 13]``; ValueError for another shape."""
-        return self._bounded(self.unbounded(state))
+        return self._bounded(self.unbounded(state, target))
 
-    def sample(self, state: Tensor, copies: int = 1) -> tuple[Tensor, Tensor]:
+    def sample(self, state: Tensor, copies: int = 1, target: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Random actions ``[*B, A]``, reparameterised, and the log densities ``[*B]`` of their scaled ones.
 
         Each of ``copies`` equal parts of the first dimension gets the same noise.
         """
         std = self.log_stds.clamp(*_LOG_STD_BOUNDS).exp()
-        before = self.unbounded(state)
+        before = self.unbounded(state, target)
         noise = torch.randn_like(before if copies == 1 else before.chunk(copies)[0])
         noise = noise if copies == 1 else torch.cat([noise] * copies)
         before = before + std * noise

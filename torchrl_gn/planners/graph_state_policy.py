@@ -99,7 +99,7 @@ class GraphStatePolicy(BoundedPolicy):
         return policy
 
     @without_autocast
-    def unbounded(self, state: Tensor) -> Tensor:
+    def unbounded(self, state: Tensor, target: Tensor | None = None) -> Tensor:
         core = self._fold() if self._folded is None else self._folded
         return core.predict(self.features(state, self.log_std.dtype)).flatten(-2)[..., self.take]
 

@@ -6,8 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.finite import require_real
@@ -30,19 +32,26 @@ class StateFeatures(Float64Buffers):
 
     Args:
         canonicalizer: which of the scene's invariances are built in, see :func:`task_invariances`. Default: none.
+        target: whether episodes have a target, a place ``[*B, 3]``, metres, world frame. Bodies are then seen from it
+            along the axes on which the scene may be shifted, without ``recenter``; the others of it are features.
     """
 
     rest: Tensor
     pivot: Tensor
+    shifted: Tensor
 
-    def __init__(self, scene: Scene, canonicalizer: Canonicalizer | None = None) -> None:
+    def __init__(self, scene: Scene, canonicalizer: Canonicalizer | None = None, *, target: bool = False) -> None:
         super().__init__()
         require_bodies(scene)
+        if target and canonicalizer is not None and canonicalizer.recenter:
+            raise ValueError("Features of states and a target need recenter=False: where bodies are from it counts.")
+        self.target = target
         self.scene, self.options = scene, canonicalizer or Canonicalizer(recenter=False, yaw=False)
         self.canonicalizer = self.options.bind(scene, scene.layout)
         self.physical = PhysicalParameters.of(scene)
         self.constants({"rest": self.physical.rest, "pivot": self.physical.pivot})
-        self.size = scene.num_nodes * scene.layout.encoded_size()
+        self.constants({"shifted": np.outer(scene.predicted, scene.translation_invariant)})  # [N, 3]
+        self.size = scene.num_nodes * scene.layout.encoded_size() + 3 * target
         self.normalizer = Normalizer(self.size, floor=FLOOR, limit=LIMIT)
 
     @property
@@ -51,36 +60,47 @@ class StateFeatures(Float64Buffers):
         return self.normalizer.fitted
 
     @torch.no_grad()
-    def fit(self, state: Tensor) -> None:
+    def fit(self, state: Tensor, target: Tensor | None = None) -> None:
         """Fit the normaliser to states ``[*B, N, 13]``, unless it has seen some; ValueError if one is not finite."""
         if not self.fitted:
-            self.update(state)
+            self.update(state, target)
 
     @torch.no_grad()
-    def refit(self, state: Tensor) -> None:
+    def refit(self, state: Tensor, target: Tensor | None = None) -> None:
         """Fit the normaliser to states ``[*B, N, 13]`` alone; ValueError if one is not finite."""
         self.normalizer.reset()
-        self.update(state)
+        self.update(state, target)
 
     @torch.no_grad()
     @without_autocast
-    def update(self, state: Tensor) -> None:
+    def update(self, state: Tensor, target: Tensor | None = None) -> None:
         """Add states ``[*B, N, 13]`` to the normaliser; ValueError if one is not finite."""
-        self.normalizer.update(self._encoded(state))
+        self.normalizer.update(self._encoded(state, target))
 
     @without_autocast
-    def forward(self, state: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        """Features ``[*B, F]`` of states ``[*B, N, 13]``; differentiable."""
-        return self.normalizer(self._encoded(state), dtype)
+    def forward(self, state: Tensor, dtype: torch.dtype | None = None, target: Tensor | None = None) -> Tensor:
+        """Features ``[*B, F]`` of states ``[*B, N, 13]``; differentiable. ValueError without a wanted target."""
+        return self.normalizer(self._encoded(state, target), dtype)
 
-    def _encoded(self, state: Tensor) -> Tensor:
+    def _encoded(self, state: Tensor, target: Tensor | None) -> Tensor:
         check_states(self.scene, state)
+        if not self.target:
+            return self._of_bodies(state)
+        if target is None or target.shape != (*state.shape[:-2], 3):
+            given = None if target is None else list(target.shape)
+            raise ValueError(f"States {list(state.shape)} need a target {[*state.shape[:-2], 3]}, got {given}.")
+        target, free = target.to(state.dtype), self.shifted.to(state.dtype)
+        seen = state - pad(target.unsqueeze(-2) * free, (0, state.shape[-1] - 3))
+        return torch.cat((self._of_bodies(seen), target * (1 - free.amax(0))), -1)
+
+    def _of_bodies(self, state: Tensor) -> Tensor:
         canonical = self.canonicalizer(state, self.physical._replace(rest=self.rest, pivot=self.pivot))
         return self.scene.layout.encode(canonical.state, "matrix", canonical.matrices).flatten(-2)
 
     def description(self) -> dict[str, Any]:
         """JSON-able values for :meth:`arguments_from`."""
-        return {"scene": self.scene.description(), "canonicalizer": asdict(self.options)}
+        target = {"target": True} if self.target else {}
+        return {"scene": self.scene.description(), "canonicalizer": asdict(self.options), **target}
 
     @staticmethod
     def arguments_from(description: dict[str, Any]) -> dict[str, Any]:

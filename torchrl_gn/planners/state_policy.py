@@ -22,6 +22,10 @@ class StatePolicy(BoundedPolicy):
     a planner's ``proposal``. Differentiable. Explores, with TorchRL's exploration type RANDOM, by noise before the
     tanh that bounds its actions, of one learned standard deviation for each.
 
+    Args:
+        hidden: hidden sizes of the network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
+        canonicalizer, target: as of the features.
+
     Raises:
         ValueError: the scene has no actions, or some without bounds.
 
@@ -36,10 +40,16 @@ class StatePolicy(BoundedPolicy):
     features: StateFeatures  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(
-        self, scene: Scene, *, hidden: Sequence[int] = (128, 128), canonicalizer: Canonicalizer | None = None
+        self,
+        scene: Scene,
+        *,
+        hidden: Sequence[int] = (128, 128),
+        canonicalizer: Canonicalizer | None = None,
+        target: bool = False,
     ) -> None:
         super().__init__(scene, scene.num_actions)
-        self.hidden, self.features = check_hidden(hidden), StateFeatures(scene, canonicalizer)
+        self.hidden, self.features = check_hidden(hidden), StateFeatures(scene, canonicalizer, target=target)
+        self.in_keys += ["target"] if target else []
         self.network = LayerNormMLP(self.features.size, scene.num_actions, self.hidden)
 
     def for_scene(self, scene: Scene) -> StatePolicy:
@@ -48,8 +58,12 @@ class StatePolicy(BoundedPolicy):
         scene.require_timestep(self.scene.timestep, "The policy")
         return self
 
-    def unbounded(self, state: Tensor) -> Tensor:
-        return self.network(self.features(state, next(self.network.parameters()).dtype))
+    @property
+    def targeted(self) -> bool:
+        return self.features.target
+
+    def unbounded(self, state: Tensor, target: Tensor | None = None) -> Tensor:
+        return self.network(self.features(state, next(self.network.parameters()).dtype, target))
 
     def scaled(self, features: Tensor) -> Tensor:
         """Actions ``[*B, A]`` in units of half their range, -1 to 1, of features ``[*B, F]``."""

@@ -21,11 +21,10 @@ class StateReward(Reward):
 
     For tasks that pay by rules which are unknown, or have no gradient: that of the network is smooth. A linear part
     lets what is paid for speed grow beyond the data. Learned by :func:`~torchrl_gn.training.fit_reward`; 0 until then.
-    It knows no target.
 
     Args:
         hidden: hidden sizes of the network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
-        canonicalizer: as of the features.
+        canonicalizer, target: as of the features; the target is the task, ``[*B, 3]``.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -38,10 +37,16 @@ class StateReward(Reward):
     scale: Tensor
 
     def __init__(
-        self, scene: Scene, *, hidden: Sequence[int] = (128, 128), canonicalizer: Canonicalizer | None = None
+        self,
+        scene: Scene,
+        *,
+        hidden: Sequence[int] = (128, 128),
+        canonicalizer: Canonicalizer | None = None,
+        target: bool = False,
     ) -> None:
         super().__init__()
-        self.hidden, self.features = check_hidden(hidden), StateFeatures(scene, canonicalizer)
+        self.hidden, self.features = check_hidden(hidden), StateFeatures(scene, canonicalizer, target=target)
+        self.target_shape = (3,) if target else None
         self.shown = {"scene": scene.name, "hidden": self.hidden}
         self.network = LayerNormMLP(2 * self.features.size + scene.num_actions, 1, self.hidden, linear=True)
         self.normalizer = Normalizer(1)
@@ -54,12 +59,16 @@ class StateReward(Reward):
         return self.features.scene
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        return self.normalizer.inverse(self.normalized(self.inputs(state, action, next_state))).to(next_state.dtype)
+        target = None
+        if self.target_shape is not None:
+            target = self.require_task(task, next_state).expand(*next_state.shape[:-2], 3)
+        inputs = self.inputs(state, action, next_state, target)
+        return self.normalizer.inverse(self.normalized(inputs)).to(next_state.dtype)
 
-    def inputs(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    def inputs(self, state: Tensor, action: Tensor, next_state: Tensor, target: Tensor | None = None) -> Tensor:
         """What the network reads ``[*B, F]`` of a step."""
         dtype = next(self.network.parameters()).dtype
-        before, after = (self.features(each, dtype) for each in (state, next_state))
+        before, after = (self.features(each, dtype, target) for each in (state, next_state))
         return torch.cat((before, after, (action / self.scale.to(action.dtype)).to(dtype)), -1)
 
     def normalized(self, inputs: Tensor) -> Tensor:

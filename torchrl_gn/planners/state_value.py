@@ -26,7 +26,7 @@ class StateValue(nn.Module):
         discount: :math:`\gamma` of a control step.
         hidden: hidden sizes of each network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
         members: number of networks.
-        canonicalizer: as of the features.
+        canonicalizer, target: as of the features.
 
     Example:
         >>> import torch
@@ -44,6 +44,7 @@ class StateValue(nn.Module):
         hidden: Sequence[int] = (128, 128),
         members: int = 2,
         canonicalizer: Canonicalizer | None = None,
+        target: bool = False,
     ) -> None:
         super().__init__()
         if not 0 < discount <= 1:
@@ -51,7 +52,7 @@ class StateValue(nn.Module):
         if members < 1:
             raise ValueError(f"members={members} must be at least 1.")
         self.discount, self.hidden = float(discount), check_hidden(hidden)
-        self.features = StateFeatures(scene, canonicalizer)
+        self.features = StateFeatures(scene, canonicalizer, target=target)
         self.members = nn.ModuleList(LayerNormMLP(self.features.size, 1, self.hidden) for _ in range(members))
         self.normalizer = Normalizer(1)
 
@@ -64,10 +65,10 @@ class StateValue(nn.Module):
         """Whether it has learned from data. Waits for the device."""
         return self.normalizer.fitted
 
-    def forward(self, state: Tensor) -> Tensor:
+    def forward(self, state: Tensor, target: Tensor | None = None) -> Tensor:
         """Values ``[*B, 1]`` of states ``[*B, N, 13]``, in their dtype; ValueError for another shape."""
         weight = next(self.members.parameters())
-        return self.of_features(self.features(state, weight.dtype)).to(state.dtype)
+        return self.of_features(self.features(state, weight.dtype, target)).to(state.dtype)
 
     def of_features(self, features: Tensor) -> Tensor:
         """Values ``[*B, 1]`` of features ``[*B, F]``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -325,6 +325,60 @@ class MassAtTarget(SuiteReward):
         return tolerance(away, 0.0, self.size, margin=self.size) * self.small(action)
 
 
+class PlaceAtTarget(SuiteReward):
+    """The suite's ``reacher`` and ``finger turn``: 1 where a place is within ``radius`` of the episode's target.
+
+    Args:
+        axes: of the world, along which the distance counts.
+    """
+
+    target_shape = (3,)
+
+    def __init__(self, scene: Scene, place: Place, axes: Sequence[int], radius: float) -> None:
+        super().__init__(scene, radius=radius)
+        self.place, self.axes, self.radius = place, list(axes), radius
+
+    def away(self, state: Tensor, task: Tensor | None) -> Tensor:
+        """Distance ``[*B, 1]``."""
+        return _length((self.require_task(task, state) - self.place(state))[..., self.axes])
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        return tolerance(self.away(next_state, task), 0.0, self.radius)
+
+
+class SwimUpright(PlaceAtTarget):
+    """The suite's ``fish swim``: the mouth at the episode's target, the torso upright."""
+
+    def __init__(self, scene: Scene) -> None:
+        radius = sum(float(scene.model.geom(name).size[0]) for name in ("mouth", "target"))
+        super().__init__(scene, Place.of_geom(scene, "mouth"), (0, 1, 2), radius)
+        self.torso = Bodies(scene, ["torso"])
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        near = tolerance(self.away(next_state, task), 0.0, self.radius, margin=2 * self.radius)
+        return (7 * near + (1 + self.upright(self.torso, next_state)) / 2) / 8
+
+
+class NoseAtTarget(PlaceAtTarget):
+    """The suite's ``swimmer``: the nose near the episode's target."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene, Place.of_geom(scene, "nose"), (0, 1), float(scene.model.geom("target").size[0]))
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        away = self.away(next_state, task)
+        return tolerance(away, 0.0, self.radius, margin=5 * self.radius, sigmoid="long_tail")
+
+
+def _reacher(scene: Scene, target: float) -> Reward:
+    finger = Place.of_geom(scene, "finger")
+    return PlaceAtTarget(scene, finger, (0, 1), target + float(scene.model.geom("finger").size[0]))
+
+
+def _turned(scene: Scene, target: float) -> Reward:
+    return PlaceAtTarget(scene, Place.of_site(scene, "tip"), (0, 2), target)
+
+
 def _length(vector: Tensor) -> Tensor:
     """Lengths ``[*B, 1]`` whose gradient is 0 at 0, where the root's is infinite."""
     square = vector.square().sum(-1, keepdim=True)
@@ -355,6 +409,9 @@ _REWARDS: dict[str, Callable[[Scene], Reward]] = {
     "cartpole/two_poles": PolesUp,
     "cheetah/run": lambda scene: Run(scene, "torso"),
     "finger/spin": Spin,
+    "finger/turn_easy": lambda scene: _turned(scene, 0.07),  # the sizes of the targets are of the tasks, not the model
+    "finger/turn_hard": lambda scene: _turned(scene, 0.03),
+    "fish/swim": SwimUpright,
     "fish/upright": TorsoUp,
     "hopper/hop": Hop,
     "hopper/stand": lambda scene: Hop(scene, speed=0.0),
@@ -366,6 +423,10 @@ _REWARDS: dict[str, Callable[[Scene], Reward]] = {
     "point_mass/easy": MassAtTarget,
     "quadruped/run": lambda scene: Walk(scene, speed=5.0),
     "quadruped/walk": lambda scene: Walk(scene, speed=0.5),
+    "reacher/easy": lambda scene: _reacher(scene, 0.05),
+    "reacher/hard": lambda scene: _reacher(scene, 0.015),
+    "swimmer/swimmer15": NoseAtTarget,
+    "swimmer/swimmer6": NoseAtTarget,
     "walker/run": lambda scene: RunUpright(scene, "torso"),
     "walker/stand": lambda scene: RunUpright(scene, "torso", speed=0.0),
     "walker/walk": lambda scene: RunUpright(scene, "torso", speed=1.0),
@@ -378,7 +439,8 @@ SUITE_TASKS: tuple[str, ...] = tuple(_REWARDS)
 def suite_reward(scene: Scene) -> Reward:
     """The reward of a scene of the suite, ``load_scene("suite:cheetah/run")``, as dm_control pays it.
 
-    Differentiable, but for rewards of 0 or 1. ValueError for another scene, or a task that is not known.
+    Differentiable, but for rewards of 0 or 1. Where episodes have a target (reacher, finger turn, fish swim, swimmer)
+    that is the reward's. ValueError for another scene, or a task that is not known.
     """
     task = scene.origin.get("suite")
     if task not in _REWARDS:

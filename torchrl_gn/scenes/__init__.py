@@ -22,6 +22,7 @@ from torchrl_gn.scenes.scene import SceneChangedWarning as SceneChangedWarning
 from torchrl_gn.scenes.scene import SceneError as SceneError
 from torchrl_gn.scenes.scene import StaticGraph as StaticGraph
 from torchrl_gn.scenes.scene import UnsupportedSceneError as UnsupportedSceneError
+from torchrl_gn.scenes.suite_tasks import has_target as has_target
 from torchrl_gn.scenes.suite_tasks import hidden_by_task as hidden_by_task
 from torchrl_gn.scenes.suite_tasks import load_suite_task as load_suite_task
 from torchrl_gn.scenes.suite_tasks import suite_name as suite_name

@@ -22,6 +22,7 @@ from torchrl_gn.scenes.systems.system import INSTALL_SUITE
 _NAME = re.compile(r"suite:(\w+)/(\w+)")
 # Tasks whose models are drawn at random, or come with meshes or terrains that a scene does not hold.
 _NO_SCENES = re.compile(r"(dog|lqr|manipulator|stacker)/\w+|quadruped/(escape|fetch)")
+_TARGET = re.compile(r"reacher/\w+|finger/turn_\w+|fish/swim|swimmer/\w+")  # tasks whose episodes have a target
 # Arrays of a model that tasks change at the start of an episode without an effect on the bodies: targets, their looks.
 _TARGETS = {"site_pos", "site_size", "geom_pos", "geom_size"}
 _LOOKS = {"site_rgba", "geom_rgba", "light_pos", "geom_rbound", "geom_aabb", "bvh_aabb"}
@@ -190,6 +191,19 @@ def hidden_by_task(domain: str, task: str) -> tuple[bool, bool]:
         mujoco.mju_mulQuat(turned[orientation : orientation + 4], half, start[orientation : orientation + 4])
         mujoco.mju_rotVecQuat(turned[velocity : velocity + 3], start[velocity : velocity + 3], half)
     return bool(places) and stays(shifted), bool(turns) and stays(turned)
+
+
+def has_target(task: str) -> bool:
+    """Whether episodes of ``"reacher/easy"`` have a target, each its own."""
+    return _TARGET.fullmatch(task) is not None
+
+
+def episode_target(env: Any) -> np.ndarray:
+    """Place ``[3]``, metres, world frame, of the target of the running episode of a task that has one."""
+    model, data = env.physics.model.ptr, env.physics.data.ptr
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "target")
+    place = data.geom("target").xpos if site < 0 else data.site("target").xpos
+    return np.array(place)
 
 
 class SuiteStarts:

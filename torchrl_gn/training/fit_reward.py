@@ -31,7 +31,8 @@ def fit_reward(
     Normalisers are fitted to these data alone: speeds and what is paid for them grow as a policy learns.
 
     Args:
-        data: ``[K, T]``: ``state`` ``[K, T + 1, N, 13]``, ``action`` ``[K, T, A]`` and ``reward`` ``[K, T, 1]``.
+        data: ``[K]``: ``state`` ``[K, T + 1, N, 13]``, ``action`` ``[K, T, A]``, ``reward`` ``[K, T, 1]`` and, of a
+            reward with a target, ``target`` ``[K, 3]``.
         steps: optimiser steps.
         lr: peak learning rate of Adam, cosine to 0.
         seed: of the batches.
@@ -46,12 +47,14 @@ def fit_reward(
         given = f"{list(state.shape)}, {list(action.shape)} and {list(paid.shape)}"
         raise ValueError(f"state [K, T + 1, N, 13], action [K, T, A] and reward [K, T, 1] do not fit: {given}.")
     require_finite(paid, "'reward' of the data")
-    reward.features.refit(state)
+    target = cast(Tensor, data["target"]).unsqueeze(1) if reward.features.target else None
+    reward.features.refit(state, None if target is None else target.expand(*state.shape[:2], 3))
     with torch.no_grad():
-        inputs = reward.inputs(state[:, :-1], action, state[:, 1:]).flatten(0, 1)
-    target = paid.flatten(0, 1).double()
-    renormalize([reward.network], reward.normalizer, target)
-    normalized = reward.normalizer(target, inputs.dtype)
+        place = None if target is None else target.expand(*paid.shape[:2], 3)
+        inputs = reward.inputs(state[:, :-1], action, state[:, 1:], place).flatten(0, 1)
+    paid = paid.flatten(0, 1).double()
+    renormalize([reward.network], reward.normalizer, paid)
+    normalized = reward.normalizer(paid, inputs.dtype)
     optimizer = make_optimizer(reward.network, "adam", lr=lr)
     generator = torch.Generator(inputs.device).manual_seed(seed)
     recent = []
