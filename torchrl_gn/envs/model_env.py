@@ -142,6 +142,13 @@ class ModelEnv(ModelBasedEnvBase):
         env.world_model = cast(Any, self.world_model.split())
         return env
 
+    def of_states(self) -> ModelEnv:
+        """This environment without reward, ``done`` and value: :func:`imagined_steps` then adds those of all steps."""
+        env = copy.copy(self)
+        env._modules = dict(self._modules)  # copies share it
+        env.reward = env.ends = env.terminal = None
+        return env
+
     @property
     def _parameters_key(self) -> NestedKey | None:
         return getattr(self.world_model, "parameters_key", None)

@@ -16,7 +16,7 @@ from torchrl.objectives.value import TDLambdaEstimator
 
 from torchrl_gn.dynamics.ensemble import lower_bound
 from torchrl_gn.envs import ModelEnv
-from torchrl_gn.envs.episode_ends import alive_of
+from torchrl_gn.envs.episode_ends import alive_of, imagined_steps
 from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
@@ -154,10 +154,10 @@ class SHACLoss(LossModule):
         """Steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of the entropy of its actions."""
         state = state.repeat(self.members, 1, 1)
         # Not reset(), which asks whether an episode has ended: it would wait for a device.
-        now = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
+        start = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
+        env, now, steps, entropies = self.env.of_states(), start.copy(), [], []
         if target is not None:
-            now["task"] = cast(Any, self.env.reward).task_of(state, target)
-        steps, entropies = [], []
+            start["task"] = cast(Any, self.env.reward).task_of(state, target)
         with ExitStack() as stack:
             for each in (self.env.world_model, self.env.reward):
                 if isinstance(each, nn.Module):
@@ -170,12 +170,18 @@ class SHACLoss(LossModule):
                     if each.requires_grad:  # neither under no_grad, nor of a frozen policy
                         each.register_hook(_finite_rows)
                 entropies.append(-log_prob)
-                now = self.env.step(now.set("action", action))
-                steps.append(
-                    now.select("state", "action", ("next", "state"), ("next", "reward"), ("next", "terminated"))
-                )
+                now = env.step(now.set("action", action))
+                steps.append(now.select("state", "action", ("next", "terminated")))
                 now = step_mdp(now, exclude_done=True)
-        return cast(TensorDict, torch.stack(steps, 1)), torch.stack(entropies, 1)
+            played = cast(TensorDict, torch.stack(steps, 1))
+            states = torch.cat((played["state"], cast(Tensor, now["state"]).unsqueeze(1)), 1)
+            # The rewards of all steps at once: as many small operations as for one.
+            trusted = ~played["next", "terminated"].squeeze(-1)
+            imagined = imagined_steps(self.env, start, states, played["action"], trusted)
+        played["next"] = TensorDict(
+            {"state": states[:, 1:], "reward": imagined.rewards, "terminated": ~imagined.alive[:, 1:]}, played.shape
+        )
+        return played, torch.stack(entropies, 1)
 
     def _value_loss(self, imagined: TensorDict, alive: Tensor, target: Tensor | None) -> Tensor:
         """Squared error of the value on its targets, in variances of its normaliser."""
