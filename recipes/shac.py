@@ -1,16 +1,18 @@
 """Learn a policy by a short-horizon actor-critic through a graph network that learns beside it.
 
-    python recipes/shac.py [system=cheetah] [reward=run] [key=value ...]
+    python recipes/shac.py [system=suite:cheetah/run] [key=value ...]
 
 Round by round: the policy and a value learn in the model, from states that were played (SHACLoss); the policy plays in
-MuJoCo, with exploration; the model learns from all that was played. The reward is known, and differentiable. For a
-policy from the suite's observations, whose reward may be learned too, see recipes/svg.py. Finished rounds are kept: the
-same run_dir goes on, with more rounds too. Results: docs/results/short-horizon-actor-critic.md.
+MuJoCo, with exploration; the model learns from all that was played, and so does the reward, unless it is known. Tasks
+of the control suite are played by dm_control, and what it pays is the return; their model is of one frame, the policy
+acts every action_repeat frames. Other systems have a reward that is known, and differentiable. For a policy from the
+suite's observations see recipes/svg.py. Finished rounds are kept: the same run_dir goes on, with more rounds too.
+Results: docs/results/short-horizon-actor-critic.md.
 
 Writes config.yaml, metrics.json, table.md, the learning curve (curve.json and curve.png), a video of the last round's
 first judged episode (episode.gif), and the policy, averaged over rounds, and the last value and model
-(policy.safetensors, value.safetensors, checkpoint/): recipes/mpc.py takes the run folder as policy=, value= and
-checkpoint=. Every round's own are in rounds/. With several systems, a graph network as the policy learns on all at
+(policy.safetensors, value.safetensors, checkpoint/; reward.safetensors, if it is learned): recipes/mpc.py takes the run
+folder of another system as policy=, value= and checkpoint=. Every round's own are in rounds/. With several systems, a graph network as the policy learns on all at
 once, and each has its own value, model and video. All options: recipes/config/shac.yaml.
 """
 

@@ -232,14 +232,12 @@ def windows(state: Tensor, action: Tensor, reward: Tensor | None = None, target:
     return TensorDict(parts, [len(parts["action"])])
 
 
-def played_windows(played: TensorDict, *, rewards: bool = False) -> TensorDict:
+def played_windows(played: TensorDict) -> TensorDict:
     """Trajectories of :func:`play`, without the episodes whose simulation became unstable."""
-    alive = ~cast(Tensor, played["next", "terminated"]).flatten(1).any(1)
-    state = torch.cat((played["state"], played["next", "state"][:, -1:]), 1)
-    target = played.get("target", None)
-    return windows(
-        state[alive],
-        played["action"][alive],
-        played["next", "reward"][alive] if rewards else None,
-        None if target is None else target[alive, 0],
-    )
+    played = unbroken(played)
+    return windows(torch.cat((played["state"], played["next", "state"][:, -1:]), 1), played["action"])
+
+
+def unbroken(played: TensorDict) -> TensorDict:
+    """Episodes whose simulation did not become unstable."""
+    return played[~cast(Tensor, played["next", "terminated"]).flatten(1).any(1)]

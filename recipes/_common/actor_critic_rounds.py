@@ -75,6 +75,7 @@ class Task:
         if self.targeted and "suite" not in scene.origin:
             raise ValueError(f"A policy of states does not know the target of {reward}.")
         self.cfg, self.scene, self.reward, self.judge, self.folder = cfg, scene, reward, judge, folder
+        self.modelled, self.model_steps = scene, 1  # scene of the model, and its steps under an action
         self.device = Workers().device(cfg.device)
         self.squares = TargetSquares(scene, cfg.target_squares) if cfg.target_squares else None
         self.invariances = self._invariances()
@@ -100,16 +101,17 @@ class Task:
         """Make model, value and loss, or read them from the last round."""
         cfg, config = self.cfg, plain_config(self.cfg)
         if begun is None:
-            model = new_model(self.scene, cfg.members, config["model"])
+            model = new_model(self.modelled, cfg.members, config["model"])
             options = {"discount": cfg.discount, "hidden": cfg.hidden, "target": self.targeted}
             self.value = StateValue(self.scene, canonicalizer=self.invariances, **options)
         else:
             model = load_pretrained(begun.of("model", self)).trained
             self.value = load_pretrained(begun.of("value", self)).value
         self.trained = cast("ForwardModel | Ensemble", model).to(self.device)
-        self.model = self.trained.bind(self.scene)
+        self.model = self.trained.bind(self.modelled)
         imagined = ModelEnv(self.model, self.reward)  # until the model has learned: learn_model() takes a snapshot
         options = {"steps": cfg.horizon, "lmbda": cfg.lmbda, "pessimism": cfg.pessimism}
+        options["action_repeat"] = self.model_steps
         self.loss = SHACLoss(policy, self.value, imagined, **options).to(self.device)
 
     @property
@@ -133,7 +135,7 @@ class Task:
         with torch.no_grad():
             reward = cast(Reward, self.loss.env.reward)  # on the device
             targets = last["target"].unsqueeze(1).expand(*last["action"].shape[:2], 3) if self.targeted else None
-            rewards = reward(last["state"][:, :-1], last["action"], last["state"][:, 1:], targets)
+            rewards = self.model_steps * reward(last["state"][:, :-1], last["action"], last["state"][:, 1:], targets)
         target = self.newest["target"].repeat_interleave(WINDOW + 1, 0) if self.targeted else None
         seen = seen if self.squares is None else self.squares.move(seen)
         self.loss.fit_normalizers(seen, rewards.flatten(0, 1), target)
@@ -202,7 +204,8 @@ class Task:
     def save(self, of: Round) -> None:
         """Write the networks."""
         for what, network in self.networks.items():
-            save_checkpoint(of.of(what, self), network, scene=self.scene, config=plain_config(self.cfg))
+            scene = self.scene if what == "value" else self.modelled
+            save_checkpoint(of.of(what, self), network, scene=scene, config=plain_config(self.cfg))
 
     def add(self, played: TensorDict, of: Round) -> None:
         """Keep a round's trajectories, also in its folder."""

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from _common.actor_critic import play, played_windows
+from _common.actor_critic import play, unbroken, windows
 from _common.actor_critic_rounds import Round, Task
 from _common.planning_task import reward_of
 from torchrl_gn.data import spline_controls
@@ -31,28 +31,34 @@ def suite_task(cfg: DictConfig, system: str, *, alone: bool = True) -> SuiteTask
             raise ValueError(f"{name}={cfg[name]}: {system} has its own; action_repeat= makes control steps longer.")
     if cfg.target_squares:
         raise ValueError(f"target_squares={list(cfg.target_squares)}: {system} has starts of its own.")
-    scene = load_scene(system, timestep=cfg.action_repeat * load_scene(system).timestep)
-    return SuiteTask(cfg, scene, "" if alone else scene.name)
+    frame = load_scene(system)
+    scene = load_scene(system, timestep=cfg.action_repeat * frame.timestep)
+    return SuiteTask(cfg, scene, frame, "" if alone else scene.name)
 
 
 class SuiteTask(Task):
-    """A task of the suite, whose policy is judged by what dm_control pays."""
+    """A task of the suite, whose policy is judged by what dm_control pays.
 
-    def __init__(self, cfg: DictConfig, scene: Scene, folder: str) -> None:
+    The model and the reward are of one frame, ``frame``, the policy and value of the control steps of ``scene``: what a
+    body does in contact is predicted the worse the longer the step.
+    """
+
+    def __init__(self, cfg: DictConfig, scene: Scene, frame: Scene, folder: str) -> None:
         self.learns_reward = cfg.reward == LEARNED
         if self.learns_reward:
-            target = has_target(scene.origin["suite"])
-            reward = StateReward(scene, hidden=cfg.hidden, canonicalizer=_hidden(scene), target=target)
+            target = has_target(frame.origin["suite"])
+            reward = StateReward(frame, hidden=cfg.hidden, canonicalizer=_hidden(frame), target=target)
         else:
-            reward = reward_of(cfg, scene)
+            reward = reward_of(cfg, frame)
         super().__init__(cfg, scene, reward, reward, folder)
+        self.modelled, self.model_steps = frame, cfg.action_repeat
 
     def _invariances(self) -> Canonicalizer:
         return _hidden(self.scene)
 
     @cached_property
     def _played(self) -> SuiteTaskEnv:
-        return SuiteTaskEnv(self.scene, num_envs=self.cfg.episodes)
+        return SuiteTaskEnv(self.scene, num_envs=self.cfg.episodes, frames=True)
 
     @cached_property
     def _judged(self) -> SuiteTaskEnv:
@@ -67,16 +73,24 @@ class SuiteTask(Task):
 
     def play_at_random(self) -> TensorDict:
         first, found = self.cfg.first, []
-        env = SuiteTaskEnv(self.scene, seed=self.cfg.seed)
+        env = SuiteTaskEnv(self.scene, frames=True, seed=self.cfg.seed)
         controls = spline_controls(self.scene, first.trajectories, first.length, self.cfg.seed)
         for sequence in torch.from_numpy(controls).float():
             found.append(play(env, _replay(sequence), episodes=1, steps=first.length, explore=False))
-        return played_windows(cast(TensorDict, torch.cat(found)), rewards=self.learns_reward)
+        return self._windows(cast(TensorDict, torch.cat(found)))
 
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
         self._played.set_seed(seed)
-        played = play(self._played, policy, episodes=self.cfg.episodes, steps=self.cfg.steps, explore=True)
-        return played_windows(played, rewards=self.learns_reward)
+        sizes = {"episodes": self.cfg.episodes, "steps": self.cfg.steps}
+        return self._windows(play(self._played, policy, **sizes, explore=True))
+
+    def _windows(self, played: TensorDict) -> TensorDict:
+        """Trajectories of frames."""
+        played = unbroken(played)
+        state = torch.cat((played["state"][:, :1], played["next", "frames"].flatten(1, 2)), 1)
+        paid = played["next", "paid"].flatten(1, 2) if self.learns_reward else None
+        target = played["target"][:, 0] if self.targeted else None
+        return windows(state, played["action"].repeat_interleave(self.model_steps, 1), paid, target)
 
     def judged(self, policy: BoundedPolicy) -> TensorDict:
         self._judged.set_seed(10_000)

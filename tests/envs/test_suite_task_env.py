@@ -39,6 +39,25 @@ def test_plays_and_pays_as_dm_control() -> None:
         assert not now["done"].any()
 
 
+def test_shows_the_frames_of_a_step() -> None:
+    coarse, fine = (load_scene("suite:walker/run", timestep=step) for step in (0.05, 0.025))
+    env, each = SuiteTaskEnv(coarse, num_envs=2, frames=True, seed=3), SuiteTaskEnv(fine, num_envs=2, seed=3)
+    check_env_specs(env)
+    for of in (env, each):
+        of.set_seed(3)
+    now, other = env.reset(), each.reset()
+    assert torch.equal(now["frames"], now["state"].unsqueeze(1).expand(-1, 2, -1, -1)) and not now["paid"].any()
+    for _ in range(3):
+        action = torch.rand(2, 6) * 2 - 1
+        now = env.step(now.set("action", action))["next"]
+        for frame in range(2):
+            other = each.step(other.set("action", action))["next"]
+            assert torch.equal(now["frames"][:, frame], other["state"])
+            assert torch.equal(now["paid"][:, frame], other["reward"])
+        assert torch.equal(now["state"], other["state"])
+        torch.testing.assert_close(now["reward"], now["paid"].sum(1))
+
+
 def test_episodes_end_at_the_time_limit_and_begin_anew() -> None:
     env = SuiteTaskEnv(load_scene("suite:pendulum/swingup", timestep=5.0), num_envs=2)
     played = env.rollout(6, break_when_any_done=False)  # an episode takes 20 s

@@ -276,6 +276,41 @@ def test_episodes_may_have_a_target(model, scenes, starts):
         loss(batch.select("state"))
 
 
+def test_actions_are_repeated_in_the_model(model, scenes, starts):
+    scene, coarse = scenes["pendulum"], load_scene("pendulum", timestep=3 * scenes["pendulum"].timestep)
+    torch.manual_seed(0)
+    env = ModelEnv(specialize(model.bind(scene)), make_reward("balance", scene))
+    policy, value = StatePolicy(coarse, hidden=(16,)), StateValue(coarse, discount=0.9, hidden=(16,))
+    loss = SHACLoss(policy, value, env, steps=2, action_repeat=3, lmbda=1.0)
+    loss.fit_normalizers(starts + 0.3 * torch.randn(starts.shape, dtype=starts.dtype), -3 * torch.rand(100, 1))
+    batch = TensorDict({"state": starts}, [len(starts)])
+    torch.manual_seed(1)
+    out = loss(batch)
+    torch.manual_seed(1)
+    with torch.no_grad():
+        now, total, paid = env.reset(batch, set_state=True), 0.0, []
+        for k in range(2):
+            action = policy.sample(now["state"])[0]
+            paid.append(0.0)
+            for _ in range(3):
+                after = env.step(now.set("action", action))["next"]
+                paid[k] = paid[k] + after["reward"]
+                now = after.select("state")
+            total = total + 0.9**k * paid[k]
+        last = value(now["state"])
+        wanted = -((total + 0.9**2 * last) / value.normalizer.std).mean()
+        wanted = wanted - loss.log_alpha.exp() * out["entropy"]
+    torch.testing.assert_close(out["loss_actor"].detach().double(), wanted.double(), rtol=1e-5, atol=1e-6)
+    torch.manual_seed(1)
+    played, entropies = loss._imagine(starts)
+    assert played.shape == (len(starts), 2) and entropies.shape == (len(starts), 2)
+    torch.testing.assert_close(played["next", "reward"].detach(), torch.stack(paid, 1))
+    with pytest.raises(ValueError, match=r"control steps of 0\.06 s, action_repeat=2 of the model's 0\.02 s"):
+        SHACLoss(policy, value, env, action_repeat=2)
+    with pytest.raises(ValueError, match="action_repeat=0"):
+        SHACLoss(policy, value, env, action_repeat=0)
+
+
 def test_policy_value_and_reward_share_the_target(model, scenes, starts):
     scene = scenes["pendulum"]
     loss = targeted_loss(model, scene, starts, torch.zeros(len(starts), 3).double(), steps=2)

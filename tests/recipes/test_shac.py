@@ -130,12 +130,12 @@ def test_a_policy_reads_the_target_of_an_episode(reward, tmp_path, call):
     code, _, errors = call(*SUITE, *options, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0 and "warning" not in errors.lower(), errors
     played = load_file(tmp_path / "rounds/001/played.safetensors")
-    assert played["target"].shape == (2, 3) and not torch.equal(*played["target"])
+    assert played["target"].shape == (4, 3) and not torch.equal(played["target"][0], played["target"][1])
     policy, state = load_pretrained(tmp_path / "policy.safetensors").policy, played["state"][:, 0]
     assert policy.in_keys == ["state", "target"]
     actions = [policy.act(state, target) for target in (played["target"], played["target"].flip(0))]
     assert (actions[0] - actions[1]).abs().max() > 1e-4
-    with pytest.raises(ValueError, match=r"need a target \[2, 3\], got None"):
+    with pytest.raises(ValueError, match=r"need a target \[4, 3\], got None"):
         policy.act(state)
 
 

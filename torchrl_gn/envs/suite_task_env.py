@@ -27,6 +27,8 @@ class SuiteTaskEnv(EnvBase):
         - ``state`` ``[M, N, 13]`` float64: as of :class:`~torchrl_gn.envs.SceneEnv`.
         - ``target`` ``[M, 3]`` float64, of tasks whose episodes have one: its place, metres, world frame.
         - ``action`` ``[M, A]`` float32.
+        - ``frames`` ``[M, k, N, 13]`` float64 and ``paid`` ``[M, k, 1]`` float32, with ``frames=True``: the states that
+          the ``k`` frames of a step end in, and their rewards. Of an episode that ends within, the last again, for 0.
         - ``done``, ``truncated``, ``terminated`` ``[M, 1]``: at the time limit, an episode is truncated; it is
           terminated where the task ends it, or the simulation becomes unstable, with the last good state kept.
 
@@ -34,6 +36,7 @@ class SuiteTaskEnv(EnvBase):
         scene: of :func:`~torchrl_gn.scenes.load_scene`, for example ``load_scene("suite:cheetah/run", timestep=0.02)``
             for two frames a step.
         num_envs: ``M`` episodes, stepped in turn in this process.
+        frames: whether to show the frames of a step, say for a model of one.
 
     Raises:
         ValueError: the scene is no task of the suite, or its control step is not a multiple of the suite's.
@@ -45,7 +48,7 @@ class SuiteTaskEnv(EnvBase):
         (2, torch.Size([2, 5, 1]))
     """
 
-    def __init__(self, scene: Scene, *, num_envs: int = 1, seed: int = 0) -> None:
+    def __init__(self, scene: Scene, *, num_envs: int = 1, frames: bool = False, seed: int = 0) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} must be at least 1.")
         if "suite" not in scene.origin:
@@ -56,7 +59,8 @@ class SuiteTaskEnv(EnvBase):
         self.episodes = [load_suite_task(domain, task, 0) for _ in range(num_envs)]
         self.action_repeat = _frames_of(scene, self.episodes[0].control_timestep())
         self._error = suite_modules()[2].PhysicsError
-        self._physics = np.zeros((num_envs, scene.physics_size))
+        self.frames, repeat = frames, self.action_repeat
+        self._physics = np.zeros((num_envs, repeat, scene.physics_size))  # of the last frames
         self._targets = np.zeros((num_envs, 3)) if has_target(scene.origin["suite"]) else None
         self._over = torch.ones(num_envs, 1, dtype=torch.bool)  # which must be reset before they go on
         count = self.batch_size
@@ -64,6 +68,10 @@ class SuiteTaskEnv(EnvBase):
         seen = {"state": Unbounded(shape=shape, dtype=torch.float64)}
         if self._targets is not None:
             seen["target"] = Unbounded(shape=torch.Size([*count, 3]), dtype=torch.float64)
+        if frames:
+            each = torch.Size([*count, repeat, scene.num_nodes, scene.state_size])
+            seen["frames"] = Unbounded(shape=each, dtype=torch.float64)
+            seen["paid"] = Unbounded(shape=torch.Size([*count, repeat, 1]), dtype=torch.float32)
         self.observation_spec = Composite(seen, shape=count)
         low, high = (torch.as_tensor(of).float().expand(num_envs, -1) for of in (scene.action_low, scene.action_high))
         self.action_spec = Bounded(low=low, high=high, shape=low.shape, dtype=torch.float32)
@@ -89,41 +97,46 @@ class SuiteTaskEnv(EnvBase):
                 self._physics[index] = full_physics(env)
                 if self._targets is not None:
                     self._targets[index] = episode_target(env)
-        return TensorDict(self._seen(), self.batch_size, device=self.device)
+        return TensorDict(self._seen(np.zeros((*self.batch_size, self.action_repeat))), self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = cast(Tensor, tensordict["action"])
         require_finite(action, f"{self}: 'action'")
         if bool(self._over.any()):
             raise RuntimeError(f"{self}: episode {int(self._over.int().argmax())} has ended; reset it before a step.")
-        paid = np.zeros((len(self.episodes), 1))
+        paid = np.zeros((len(self.episodes), self.action_repeat))
         ended = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("truncated", "terminated")}
         for index, (env, control) in enumerate(zip(self.episodes, action.double().numpy(), strict=True)):
-            try:
-                paid[index], discount = self._frames(env, control)
-                self._physics[index] = full_physics(env)
-            except self._error:
-                discount = 0.0
+            discount = self._play(env, control, self._physics[index], paid[index])
             if discount is not None:
                 ended["terminated" if discount == 0 else "truncated"][index] = True
-        entries = {**self._seen(), "reward": torch.from_numpy(paid).float(), **ended}
+        reward = torch.from_numpy(paid.sum(1, keepdims=True)).float()
+        entries = {**self._seen(paid), "reward": reward, **ended}
         self._over = ended["truncated"] | ended["terminated"]
         entries["done"] = self._over.clone()
         return TensorDict(entries, self.batch_size, device=self.device)
 
-    def _frames(self, env: Any, control: np.ndarray) -> tuple[float, float | None]:
-        """What the frames of a control step pay, and the discount if the episode has ended."""
-        paid = 0.0
-        for _ in range(self.action_repeat):
-            step = env.step(control)
-            paid += step.reward
+    def _play(self, env: Any, control: np.ndarray, physics: np.ndarray, paid: np.ndarray) -> float | None:
+        """Play a control step, writing what its frames end in and pay; return the discount if the episode has ended."""
+        physics[0] = physics[-1]
+        for frame in range(len(paid)):
+            try:
+                step = env.step(control)
+            except self._error:
+                physics[frame:] = physics[max(frame - 1, 0)]
+                return 0.0
+            physics[frame:], paid[frame] = full_physics(env), step.reward
             if step.last():
-                return paid, step.discount
-        return paid, None
+                return step.discount
+        return None
 
-    def _seen(self) -> dict[str, Tensor]:
-        seen = {"state": self.simulator.observe(torch.from_numpy(self._physics.copy()))}
-        return seen if self._targets is None else {**seen, "target": torch.from_numpy(self._targets.copy())}
+    def _seen(self, paid: np.ndarray) -> dict[str, Tensor]:
+        """What is seen after a step, of whose frames so much was paid."""
+        states = self.simulator.observe(torch.from_numpy(self._physics[:, 0 if self.frames else -1 :].copy()))
+        seen = {"state": states[:, -1]}
+        if self._targets is not None:
+            seen["target"] = torch.from_numpy(self._targets.copy())
+        return {**seen, "frames": states, "paid": torch.from_numpy(paid).float().unsqueeze(-1)} if self.frames else seen
 
     def __repr__(self) -> str:
         return f"SuiteTaskEnv({self.scene.name!r}, num_envs={len(self.episodes)})"

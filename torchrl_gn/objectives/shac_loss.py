@@ -52,7 +52,9 @@ class SHACLoss(LossModule):
         policy: its network and standard deviations are learned.
         value: gives the discount :math:`\gamma`.
         env: imagines the steps. No gradient reaches the weights of its model or reward.
-        steps: ``H``.
+        steps: ``H``, of actions.
+        action_repeat: steps of the model under each action, which pay the sum of their rewards: the control step of
+            policy and value is so many of the model's.
         lmbda: :math:`\lambda` of the value's targets.
         target_entropy: default: minus one for every component of an action.
         pessimism: needs an ensemble; negative: explore what its members disagree on.
@@ -71,13 +73,15 @@ class SHACLoss(LossModule):
         env: ModelEnv,
         *,
         steps: int = 16,
+        action_repeat: int = 1,
         lmbda: float = 0.95,
         target_entropy: float | None = None,
         pessimism: float = 0.0,
     ) -> None:
         super().__init__()
-        if steps < 1 or steps != int(steps):
-            raise ValueError(f"steps={steps} must be a whole number of at least 1.")
+        for name, count in (("steps", steps), ("action_repeat", action_repeat)):
+            if count < 1 or count != int(count):
+                raise ValueError(f"{name}={count} must be a whole number of at least 1.")
         if not 0 <= lmbda <= 1:
             raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
         if env.terminal is not None:
@@ -87,7 +91,11 @@ class SHACLoss(LossModule):
                 raise ValueError(
                     f"{type(network).__name__} is of scene {network.scene.name!r}, not {env.scene.name!r}."
                 )
-            env.scene.require_timestep(network.scene.timestep, f"{type(network).__name__}")
+            if abs(action_repeat * env.scene.timestep - network.scene.timestep) > 1e-9:
+                raise ValueError(
+                    f"{type(network).__name__} is for control steps of {network.scene.timestep:g} s, action_repeat="
+                    f"{action_repeat} of the model's {env.scene.timestep:g} s is another."
+                )
         check_pessimism(pessimism, env)
         wanted = getattr(env.reward, "target_shape", None)
         if not (policy.targeted == value.features.target == (wanted is not None)):
@@ -97,6 +105,7 @@ class SHACLoss(LossModule):
             )
         self.targeted = policy.targeted
         self.policy, self.value, self.steps, self._fitted = policy, value, int(steps), False
+        self.action_repeat = int(action_repeat)
         self.pessimism, self.members = pessimism, env.members
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
@@ -151,7 +160,7 @@ class SHACLoss(LossModule):
             renormalize(members, self.value.normalizer, returns, constant=1.0)  # until something is paid
 
     def _imagine(self, state: Tensor, target: Tensor | None = None) -> tuple[TensorDict, Tensor]:
-        """Steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of the entropy of its actions."""
+        """Control steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of its actions' entropy."""
         state = state.repeat(self.members, 1, 1)
         # Not reset(), which asks whether an episode has ended: it would wait for a device.
         start = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
@@ -170,18 +179,19 @@ class SHACLoss(LossModule):
                     if each.requires_grad:  # neither under no_grad, nor of a frozen policy
                         each.register_hook(_finite_rows)
                 entropies.append(-log_prob)
-                now = env.step(now.set("action", action))
-                steps.append(now.select("state", "action", ("next", "terminated")))
-                now = step_mdp(now, exclude_done=True)
+                for _ in range(self.action_repeat):
+                    now = env.step(now.set("action", action))
+                    steps.append(now.select("state", "action", ("next", "terminated")))
+                    now = step_mdp(now, exclude_done=True).set("action", action)
             played = cast(TensorDict, torch.stack(steps, 1))
             states = torch.cat((played["state"], cast(Tensor, now["state"]).unsqueeze(1)), 1)
             # The rewards of all steps at once: as many small operations as for one.
             trusted = ~played["next", "terminated"].squeeze(-1)
             imagined = imagined_steps(self.env, start, states, played["action"], trusted)
-        played["next"] = TensorDict(
-            {"state": states[:, 1:], "reward": imagined.rewards, "terminated": ~imagined.alive[:, 1:]}, played.shape
-        )
-        return played, torch.stack(entropies, 1)
+        each, rewards = self.action_repeat, imagined.rewards.unflatten(1, (self.steps, -1)).sum(2)
+        after = {"state": states[:, each::each], "reward": rewards, "terminated": ~imagined.alive[:, each::each]}
+        played = cast(TensorDict, played[:, ::each]).exclude("next")
+        return played.set("next", TensorDict(after, played.shape)), torch.stack(entropies, 1)
 
     def _value_loss(self, imagined: TensorDict, alive: Tensor, target: Tensor | None) -> Tensor:
         """Squared error of the value on its targets, in variances of its normaliser."""
