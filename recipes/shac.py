@@ -12,8 +12,9 @@ Results: docs/results/short-horizon-actor-critic.md.
 Writes config.yaml, metrics.json, table.md, the learning curve (curve.json and curve.png), a video of the last round's
 first judged episode (episode.gif), and the policy, averaged over rounds, and the last value and model
 (policy.safetensors, value.safetensors, checkpoint/; reward.safetensors, if it is learned): recipes/mpc.py takes the run
-folder of another system as policy=, value= and checkpoint=. Every round's own are in rounds/. With several systems, a graph network as the policy learns on all at
-once, and each has its own value, model and video. All options: recipes/config/shac.yaml.
+folder of another system as policy=, value= and checkpoint=. Every round's own are in rounds/. With several systems, a
+graph network as the policy learns on all at once, and each has its own value, model and video. All options:
+recipes/config/shac.yaml.
 """
 
 from __future__ import annotations

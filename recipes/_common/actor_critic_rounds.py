@@ -111,7 +111,7 @@ class Task:
         self.model = self.trained.bind(self.modelled)
         imagined = ModelEnv(self.model, self.reward)  # until the model has learned: learn_model() takes a snapshot
         options = {"steps": cfg.horizon, "lmbda": cfg.lmbda, "pessimism": cfg.pessimism}
-        options["action_repeat"] = self.model_steps
+        options |= {"action_repeat": self.model_steps, "outlier": cfg.outlier}
         self.loss = SHACLoss(policy, self.value, imagined, **options).to(self.device)
 
     @property

@@ -30,10 +30,10 @@ def starts(scenes) -> Tensor:
     return SceneEnv(scenes["pendulum"], seed=0).reset(TensorDict(batch_size=[32]))["state"]
 
 
-def make_loss(model, scene, starts: Tensor, *, native: bool = True, **options) -> SHACLoss:
+def make_loss(model, scene, starts: Tensor, *, native: bool = True, reward=None, **options) -> SHACLoss:
     torch.manual_seed(0)
     bound = model.bind(scene)
-    env = ModelEnv(specialize(bound) if native else bound, make_reward("balance", scene))
+    env = ModelEnv(specialize(bound) if native else bound, reward or make_reward("balance", scene))
     policy, value = StatePolicy(scene, hidden=(16,)), StateValue(scene, discount=0.9, hidden=(16,))
     loss = SHACLoss(policy, value, env, **options)
     spread = starts + 0.3 * torch.randn(starts.shape, dtype=starts.dtype)
@@ -322,3 +322,52 @@ def test_policy_value_and_reward_share_the_target(model, scenes, starts):
     ):
         with pytest.raises(ValueError, match="must all have a target, or none"):
             SHACLoss(policy, value, env)
+
+
+def scaled_speed(count: int, value: float):
+    """Scales ``[count, 1, 1]``, and a reward of so many times the pole's speed."""
+    scale = torch.full((count, 1, 1), value).double()
+    return scale, lambda state, action, after, task: scale * after[..., 1, 11:12]
+
+
+def gradient_of(loss: SHACLoss, starts: Tensor) -> Tensor:
+    loss.zero_grad()
+    torch.manual_seed(1)
+    loss(TensorDict({"state": starts}, [len(starts)]))["loss_actor"].backward()
+    return torch.cat([weight.grad.flatten() for weight in loss.policy.network.parameters()])
+
+
+def test_one_trajectory_does_not_make_the_gradient_of_a_batch(model, scenes, starts):
+    scale, reward = scaled_speed(len(starts), 1.0)
+    options = {"reward": reward, "steps": 4}
+    losses = {
+        limit: make_loss(model, scenes["pendulum"], starts, outlier=limit, **options) for limit in (2.0, math.inf)
+    }
+    found: dict[float, list[Tensor]] = {}
+    for limit, loss in losses.items():
+        loss.log_alpha.data.fill_(-30)
+        for weight in (1.0, 1e3, 1e6):
+            scale[0] = weight
+            found.setdefault(limit, []).append(gradient_of(loss, starts))
+    torch.testing.assert_close(found[2.0][1], found[2.0][2], rtol=1e-3, atol=1e-6)
+    assert found[2.0][1].norm() < 1.5 * found[2.0][0].norm()
+    assert found[math.inf][1].norm() > 10 * found[math.inf][0].norm()
+    scale[0] = 1.0
+    losses[math.inf].outlier = 1e9
+    torch.testing.assert_close(gradient_of(losses[math.inf], starts), found[math.inf][0])
+
+
+def test_trajectories_without_a_gradient_do_not_silence_the_others(model, scenes, starts):
+    scale, reward = scaled_speed(len(starts), 0.0)
+    loss = make_loss(model, scenes["pendulum"], starts, reward=reward, steps=3, outlier=1.0)
+    loss.log_alpha.data.fill_(-30)
+    scale[:5] = 1.0  # of 32: the median is 0
+    with torch.no_grad():
+        for member in loss.value.members:
+            for weight in member.parameters():
+                weight.zero_()
+    assert gradient_of(loss, starts).norm() > 1e-5
+    scale.zero_()
+    assert gradient_of(loss, starts).norm() < 1e-10  # of the entropy
+    with pytest.raises(ValueError, match="outlier=0"):
+        make_loss(model, scenes["pendulum"], starts, outlier=0)

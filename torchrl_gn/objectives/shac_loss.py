@@ -56,6 +56,9 @@ class SHACLoss(LossModule):
         action_repeat: steps of the model under each action, which pay the sum of their rewards: the control step of
             policy and value is so many of the model's.
         lmbda: :math:`\lambda` of the value's targets.
+        outlier: gradients in states and actions of one trajectory that are longer than so many times the batch's median
+            are shortened to it at every control step. In contacts they grow from step to step, in some trajectories a
+            thousandfold, and a batch's gradient is theirs alone. Infinite: they are not.
         target_entropy: default: minus one for every component of an action.
         pessimism: needs an ensemble; negative: explore what its members disagree on.
 
@@ -75,6 +78,7 @@ class SHACLoss(LossModule):
         steps: int = 16,
         action_repeat: int = 1,
         lmbda: float = 0.95,
+        outlier: float = 2.0,
         target_entropy: float | None = None,
         pessimism: float = 0.0,
     ) -> None:
@@ -82,6 +86,8 @@ class SHACLoss(LossModule):
         for name, count in (("steps", steps), ("action_repeat", action_repeat)):
             if count < 1 or count != int(count):
                 raise ValueError(f"{name}={count} must be a whole number of at least 1.")
+        if not outlier > 0:
+            raise ValueError(f"outlier={outlier} must be above 0.")
         if not 0 <= lmbda <= 1:
             raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
         if env.terminal is not None:
@@ -105,7 +111,7 @@ class SHACLoss(LossModule):
             )
         self.targeted = policy.targeted
         self.policy, self.value, self.steps, self._fitted = policy, value, int(steps), False
-        self.action_repeat = int(action_repeat)
+        self.action_repeat, self.outlier = int(action_repeat), float(outlier)
         self.pessimism, self.members = pessimism, env.members
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
@@ -177,7 +183,7 @@ class SHACLoss(LossModule):
                 action, log_prob = self.policy.sample(state := cast(Tensor, now["state"]), self.members, target)
                 for each in (state, action):
                     if each.requires_grad:  # neither under no_grad, nor of a frozen policy
-                        each.register_hook(_finite_rows)
+                        each.register_hook(self._calmed)
                 entropies.append(-log_prob)
                 for _ in range(self.action_repeat):
                     now = env.step(now.set("action", action))
@@ -192,6 +198,18 @@ class SHACLoss(LossModule):
         after = {"state": states[:, each::each], "reward": rewards, "terminated": ~imagined.alive[:, each::each]}
         played = cast(TensorDict, played[:, ::each]).exclude("next")
         return played.set("next", TensorDict(after, played.shape)), torch.stack(entropies, 1)
+
+    def _calmed(self, gradient: Tensor) -> Tensor:
+        """The gradient ``[B, ...]`` without what overflowed, and with outliers shortened, sample by sample."""
+        gradient = _finite_rows(gradient)
+        if self.outlier == math.inf:
+            return gradient
+        lengths = gradient.flatten(1).norm(dim=1)
+        # The median of those that are not 0, without waiting for a device.
+        middle = len(lengths) - 1 - (lengths > 0).sum() // 2
+        bound = self.outlier * lengths.sort().values.gather(0, middle.clamp(min=0).unsqueeze(0))
+        factor = (bound / torch.where(lengths > 0, lengths, 1.0)).clamp(max=1.0)
+        return gradient * factor.view(-1, *[1] * (gradient.ndim - 1))
 
     def _value_loss(self, imagined: TensorDict, alive: Tensor, target: Tensor | None) -> Tensor:
         """Squared error of the value on its targets, in variances of its normaliser."""
