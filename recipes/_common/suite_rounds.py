@@ -33,32 +33,32 @@ def suite_task(cfg: DictConfig, system: str, *, alone: bool = True) -> SuiteTask
         raise ValueError(f"target_squares={list(cfg.target_squares)}: {system} has starts of its own.")
     frame = load_scene(system)
     scene = load_scene(system, timestep=cfg.action_repeat * frame.timestep)
-    return SuiteTask(cfg, scene, frame, "" if alone else scene.name)
+    return SuiteTask(cfg, scene, frame if cfg.per_frame else scene, "" if alone else scene.name)
 
 
 class SuiteTask(Task):
     """A task of the suite, whose policy is judged by what dm_control pays.
 
-    The model and the reward are of one frame, ``frame``, the policy and value of the control steps of ``scene``: what a
-    body does in contact is predicted the worse the longer the step.
+    The policy and value are of the control steps of ``scene``, the model and the reward of those of ``modelled``: of
+    one frame, say, as what a body does in contact is predicted the worse the longer the step.
     """
 
-    def __init__(self, cfg: DictConfig, scene: Scene, frame: Scene, folder: str) -> None:
+    def __init__(self, cfg: DictConfig, scene: Scene, modelled: Scene, folder: str) -> None:
         self.learns_reward = cfg.reward == LEARNED
         if self.learns_reward:
-            target = has_target(frame.origin["suite"])
-            reward = StateReward(frame, hidden=cfg.hidden, canonicalizer=_hidden(frame), target=target)
+            target = has_target(modelled.origin["suite"])
+            reward = StateReward(modelled, hidden=cfg.hidden, canonicalizer=_hidden(modelled), target=target)
         else:
-            reward = reward_of(cfg, frame)
+            reward = reward_of(cfg, modelled)
         super().__init__(cfg, scene, reward, reward, folder)
-        self.modelled, self.model_steps = frame, cfg.action_repeat
+        self.modelled, self.model_steps = modelled, round(scene.timestep / modelled.timestep)
 
     def _invariances(self) -> Canonicalizer:
         return _hidden(self.scene)
 
     @cached_property
     def _played(self) -> SuiteTaskEnv:
-        return SuiteTaskEnv(self.scene, num_envs=self.cfg.episodes, frames=True)
+        return SuiteTaskEnv(self.scene, num_envs=self.cfg.episodes, frames=self.cfg.per_frame)
 
     @cached_property
     def _judged(self) -> SuiteTaskEnv:
@@ -73,7 +73,7 @@ class SuiteTask(Task):
 
     def play_at_random(self) -> TensorDict:
         first, found = self.cfg.first, []
-        env = SuiteTaskEnv(self.scene, frames=True, seed=self.cfg.seed)
+        env = SuiteTaskEnv(self.scene, frames=self.cfg.per_frame, seed=self.cfg.seed)
         controls = spline_controls(self.scene, first.trajectories, first.length, self.cfg.seed)
         for sequence in torch.from_numpy(controls).float():
             found.append(play(env, _replay(sequence), episodes=1, steps=first.length, explore=False))
@@ -85,12 +85,16 @@ class SuiteTask(Task):
         return self._windows(play(self._played, policy, **sizes, explore=True))
 
     def _windows(self, played: TensorDict) -> TensorDict:
-        """Trajectories of frames."""
+        """Trajectories of the model's steps."""
         played = unbroken(played)
-        state = torch.cat((played["state"][:, :1], played["next", "frames"].flatten(1, 2)), 1)
-        paid = played["next", "paid"].flatten(1, 2) if self.learns_reward else None
+        if self.cfg.per_frame:
+            state, paid = (played["next", name].flatten(1, 2) for name in ("frames", "paid"))
+        else:
+            state, paid = played["next", "state"], played["next", "reward"]
+        state = torch.cat((played["state"][:, :1], state), 1)
+        action = played["action"].repeat_interleave(self.model_steps, 1)
         target = played["target"][:, 0] if self.targeted else None
-        return windows(state, played["action"].repeat_interleave(self.model_steps, 1), paid, target)
+        return windows(state, action, paid if self.learns_reward else None, target)
 
     def judged(self, policy: BoundedPolicy) -> TensorDict:
         self._judged.set_seed(10_000)

@@ -140,11 +140,11 @@ def test_a_policy_reads_the_target_of_an_episode(reward, tmp_path, call):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reward", ["null", "learned"])
-def test_a_task_of_the_suite_is_paid_by_dm_control(reward, tmp_path, call):
+@pytest.mark.parametrize(("reward", "per_frame"), [("null", "true"), ("learned", "true"), ("learned", "false")])
+def test_a_task_of_the_suite_is_paid_by_dm_control(reward, per_frame, tmp_path, call):
     pytest.importorskip("dm_control.suite")
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
-    options = (f"reward={reward}", "reward_steps=3", "evaluate.steps=500")
+    options = (f"reward={reward}", f"per_frame={per_frame}", "reward_steps=3", "evaluate.steps=500")
     for folder, rounds in ((whole, 2), (resumed, 1), (resumed, 2)):
         code, output, errors = call(*SUITE, *options, f"rounds={rounds}", f"run_dir={folder}", recipe="shac")
         assert code == 0 and "warning" not in errors.lower(), errors
@@ -172,6 +172,8 @@ def test_a_task_of_the_suite_is_paid_by_dm_control(reward, tmp_path, call):
     assert abs(metrics[0]["return"] - np.mean(returns)) < 1e-2
     played = load_file(whole / "rounds/001/played.safetensors")
     assert ("reward" in played) == (reward == "learned")
+    assert len(played["action"]) == (4 if per_frame == "true" else 2)  # windows of 50 steps of the model
+    assert load_pretrained(whole).scene().timestep == (0.01 if per_frame == "true" else 0.02)
 
 
 @pytest.mark.parametrize(
