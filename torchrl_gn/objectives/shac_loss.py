@@ -58,7 +58,7 @@ class SHACLoss(LossModule):
         lmbda: :math:`\lambda` of the value's targets.
         outlier: gradients in states and actions of one trajectory that are longer than so many times the batch's median
             are shortened to it at every control step. In contacts they grow from step to step, in some trajectories a
-            thousandfold, and a batch's gradient is theirs alone. Infinite: they are not.
+            thousandfold, and a batch's gradient is theirs alone; but what is shortened is biased. Default: none are.
         target_entropy: default: minus one for every component of an action.
         pessimism: needs an ensemble; negative: explore what its members disagree on.
 
@@ -78,7 +78,7 @@ class SHACLoss(LossModule):
         steps: int = 16,
         action_repeat: int = 1,
         lmbda: float = 0.95,
-        outlier: float = 2.0,
+        outlier: float = math.inf,
         target_entropy: float | None = None,
         pessimism: float = 0.0,
     ) -> None:
