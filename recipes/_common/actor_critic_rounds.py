@@ -33,6 +33,7 @@ from torchrl_gn.training import fit, load_pretrained, plain_config, save_checkpo
 from torchrl_gn.training.tensor_files import write_tensors
 from torchrl_gn.training.workers import Workers
 
+JUDGED_STEPS = 500  # control steps of an episode
 _SCALED_BY = 5  # last rounds whose rewards the value is scaled by
 
 
@@ -194,7 +195,8 @@ class Task:
     def judged(self, policy: BoundedPolicy) -> TensorDict:
         """Episodes ``[M, T]`` without exploration, from the same starts every round; rewards of a frame."""
         env = SceneEnv(self.scene, self.judge, seed=10_000, start_states=self.judged_starts)
-        return play(env, policy, episodes=self.cfg.evaluate.episodes, steps=self.cfg.evaluate.steps, explore=False)
+        sizes = {"episodes": self.cfg.evaluate.episodes, "steps": self.cfg.evaluate.steps or JUDGED_STEPS}
+        return play(env, policy, **sizes, explore=False)
 
     @property
     def networks(self) -> dict[str, ForwardModel | Ensemble | StateValue | StateReward]:

@@ -33,6 +33,14 @@ def suite_task(cfg: DictConfig, system: str, *, alone: bool = True) -> SuiteTask
         raise ValueError(f"target_squares={list(cfg.target_squares)}: {system} has starts of its own.")
     frame = load_scene(system)
     scene = load_scene(system, timestep=cfg.action_repeat * frame.timestep)
+    longest = SuiteTaskEnv(scene).steps
+    for name, steps in (
+        ("steps", cfg.steps),
+        ("first.length", cfg.first.length),
+        ("evaluate.steps", cfg.evaluate.steps),
+    ):
+        if steps is not None and steps > longest:
+            raise ValueError(f"{name}={steps}: an episode of {system} has {longest} control steps.")
     return SuiteTask(cfg, scene, frame if cfg.per_frame else scene, "" if alone else scene.name)
 
 
@@ -98,7 +106,7 @@ class SuiteTask(Task):
 
     def judged(self, policy: BoundedPolicy) -> TensorDict:
         self._judged.set_seed(10_000)
-        sizes = {"episodes": self.cfg.evaluate.episodes, "steps": self.cfg.evaluate.steps}
+        sizes = {"episodes": self.cfg.evaluate.episodes, "steps": self.cfg.evaluate.steps or self._judged.steps}
         played = play(self._judged, policy, **sizes, explore=False)
         played["next", "reward"] = cast(Tensor, played["next", "reward"]) / self.cfg.action_repeat
         return played

@@ -60,7 +60,8 @@ def test_shows_the_frames_of_a_step() -> None:
 
 def test_episodes_end_at_the_time_limit_and_begin_anew() -> None:
     env = SuiteTaskEnv(load_scene("suite:pendulum/swingup", timestep=5.0), num_envs=2)
-    played = env.rollout(6, break_when_any_done=False)  # an episode takes 20 s
+    assert env.steps == 4  # an episode takes 20 s
+    played = env.rollout(6, break_when_any_done=False)
     assert played["next", "truncated"].squeeze(-1)[0].tolist() == [False, False, False, True, False, False]
     assert torch.equal(played["next", "truncated"], played["next", "done"]) and not played["next", "terminated"].any()
     assert not torch.equal(played["state"][:, 0], played["state"][:, 4])

@@ -130,12 +130,12 @@ def test_a_policy_reads_the_target_of_an_episode(reward, tmp_path, call):
     code, _, errors = call(*SUITE, *options, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0 and "warning" not in errors.lower(), errors
     played = load_file(tmp_path / "rounds/001/played.safetensors")
-    assert played["target"].shape == (4, 3) and not torch.equal(played["target"][0], played["target"][1])
+    assert played["target"].shape == (2, 3) and not torch.equal(played["target"][0], played["target"][1])
     policy, state = load_pretrained(tmp_path / "policy.safetensors").policy, played["state"][:, 0]
     assert policy.in_keys == ["state", "target"]
     actions = [policy.act(state, target) for target in (played["target"], played["target"].flip(0))]
     assert (actions[0] - actions[1]).abs().max() > 1e-4
-    with pytest.raises(ValueError, match=r"need a target \[4, 3\], got None"):
+    with pytest.raises(ValueError, match=r"need a target \[2, 3\], got None"):
         policy.act(state)
 
 
@@ -144,7 +144,7 @@ def test_a_policy_reads_the_target_of_an_episode(reward, tmp_path, call):
 def test_a_task_of_the_suite_is_paid_by_dm_control(reward, per_frame, tmp_path, call):
     pytest.importorskip("dm_control.suite")
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
-    options = (f"reward={reward}", f"per_frame={per_frame}", "reward_steps=3", "evaluate.steps=500")
+    options = (f"reward={reward}", f"per_frame={per_frame}", "reward_steps=3", "evaluate.steps=null")
     for folder, rounds in ((whole, 2), (resumed, 1), (resumed, 2)):
         code, output, errors = call(*SUITE, *options, f"rounds={rounds}", f"run_dir={folder}", recipe="shac")
         assert code == 0 and "warning" not in errors.lower(), errors
@@ -182,6 +182,8 @@ def test_a_task_of_the_suite_is_paid_by_dm_control(reward, per_frame, tmp_path, 
         (("timestep=0.02",), "timestep=0.02: suite:cartpole/swingup has its own"),
         (("judged_reward=run",), "judged_reward=run: suite:cartpole/swingup has its own"),
         (("target_squares=[1]",), "has starts of its own"),
+        (("action_repeat=4", "evaluate.steps=300"), "evaluate.steps=300: an episode of suite:cartpole/swingup has 250"),
+        (("action_repeat=25",), "steps=50: an episode of suite:cartpole/swingup has 40 control steps"),
         (("system=suite:dog/run",), "There is no scene of the suite's dog/run"),
         (("system=suite:humanoid_CMU/stand",), "is no task of the suite whose reward is known"),
         (("system=suite:reacher/easy", "policy=graph"), "policy=graph does not read the target"),

@@ -21,7 +21,7 @@ class SuiteTaskEnv(EnvBase):
     """Episodes of a task of the control suite: dm_control's starts, steps, rewards and time limit.
 
     One control step of the scene is :attr:`action_repeat` of the suite, its frames, under the same action; the reward
-    is the sum of what they pay.
+    is the sum of what they pay. An episode has :attr:`steps` control steps, whole ones.
 
     Entries:
         - ``state`` ``[M, N, 13]`` float64: as of :class:`~torchrl_gn.envs.SceneEnv`.
@@ -58,6 +58,7 @@ class SuiteTaskEnv(EnvBase):
         self.scene, self.simulator = scene, Simulator(scene)
         self.episodes = [load_suite_task(domain, task, 0) for _ in range(num_envs)]
         self.action_repeat = _frames_of(scene, self.episodes[0].control_timestep())
+        self.steps = int(self.episodes[0]._step_limit) // self.action_repeat
         self._error = suite_modules()[2].PhysicsError
         self.frames, repeat = frames, self.action_repeat
         self._physics = np.zeros((num_envs, repeat, scene.physics_size))  # of the last frames
