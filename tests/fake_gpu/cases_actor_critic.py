@@ -18,8 +18,10 @@ RECIPES = Path(__file__).parents[2] / "recipes"
 sys.path.append(str(RECIPES))  # as Python does for a script there
 
 from _common.actor_critic_rounds import ActorCritic, Round, Task  # noqa: E402
+from _common.suite_rounds import suite_task  # noqa: E402
 
 SMALL = {
+    **{"system": "cheetah", "timestep": 0.02, "reward": "forward", "reward_steps": 3},
     "first": {"trajectories": 4, "length": 50, "steps": 2},
     "model": {"hidden": 8, "latent": 8},
     "graph": {"hidden": [8], "latent": 8},
@@ -31,18 +33,25 @@ SMALL = {
 def learner(device: str, begun: Round | None = None, **options) -> ActorCritic:
     cfg = OmegaConf.merge(OmegaConf.load(RECIPES / "config/shac.yaml"), SMALL, {"device": device, **options})
     assert isinstance(cfg, DictConfig)
-    scene = gn.load_scene(cfg.system, timestep=cfg.timestep)
     torch.manual_seed(0)
-    reward = gn.make_reward(cfg.reward, scene)
-    made = ActorCritic(cfg, [Task(cfg, scene, reward, reward, "")], begun)
+    if cfg.system.startswith("suite:"):
+        task = suite_task(cfg, cfg.system)
+    else:
+        scene = gn.load_scene(cfg.system, timestep=cfg.timestep)
+        reward = gn.make_reward(cfg.reward, scene)
+        task = Task(cfg, scene, reward, reward, "")
+    made = ActorCritic(cfg, [task], begun)
     made.tasks[0].collect([] if begun is None else [begun])
     return made
 
 
 SWIMMER = {"system": "swimmer3", "reward": "near", "timestep": 0.1, "target_squares": [0.3, 2]}
+REACHER = {"system": "suite:reacher/easy", "reward": "learned", "timestep": None, "per_frame": True, "outlier": 2.0}
+TASKS = [{"reward": "run"}, {"policy": "graph"}, SWIMMER, REACHER]
+NAMES = ["run", "graph", "near", "learned"]
 
 
-@pytest.mark.parametrize("options", [{"reward": "run"}, {"policy": "graph"}, SWIMMER], ids=["run", "graph", "near"])
+@pytest.mark.parametrize("options", TASKS, ids=NAMES)
 def test_rounds_are_those_of_the_cpu(gpu, tmp_path, options):
     found = []
     for device in ("cpu", NAME):
@@ -67,7 +76,7 @@ def test_rounds_are_those_of_the_cpu(gpu, tmp_path, options):
     torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-2, atol=1e-2)
 
 
-@pytest.mark.parametrize("options", [{"reward": "run"}, {"policy": "graph"}, SWIMMER], ids=["run", "graph", "near"])
+@pytest.mark.parametrize("options", TASKS, ids=NAMES)
 def test_what_is_recorded_never_waits(gpu, monkeypatch, options):
     weights, numbers = [], []
     for recorded in (False, True):

@@ -206,7 +206,7 @@ class SHACLoss(LossModule):
             return gradient
         lengths = gradient.flatten(1).norm(dim=1)
         # The median of those that are not 0, without waiting for a device.
-        middle = len(lengths) - 1 - (lengths > 0).sum() // 2
+        middle = len(lengths) - 1 - torch.div((lengths > 0).sum(), 2, rounding_mode="floor")
         bound = self.outlier * lengths.sort().values.gather(0, middle.clamp(min=0).unsqueeze(0))
         factor = (bound / torch.where(lengths > 0, lengths, 1.0)).clamp(max=1.0)
         return gradient * factor.view(-1, *[1] * (gradient.ndim - 1))
