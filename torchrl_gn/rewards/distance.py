@@ -12,10 +12,21 @@ from torch import Tensor, nn
 from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.rewards.tolerance import tolerance
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.scenes.scene import Scene
 
 REACHED = 1e-9  # metres: a target is reached
+
+
+def length(vector: Tensor, least: float = 0.0) -> Tensor:
+    """Lengths ``[*B, 1]`` of vectors ``[*B, K]``; up to ``least`` they are 0, as is their gradient.
+
+    The root's gradient is finite but at 0.
+    """
+    square = vector.square().sum(-1, keepdim=True)
+    away = square > least**2
+    return torch.where(away, torch.where(away, square, 1.0).sqrt(), 0.0)
 
 
 class Distance(Reward):
@@ -58,12 +69,7 @@ class Distance(Reward):
         orientation = self.bodies.orientation(next_state).squeeze(-2)
         offset = cast(Tensor, self.offset).to(next_state.dtype)
         point = self.bodies.position(next_state).squeeze(-2) + quaternion.rotate(orientation, offset.expand_as(goal))
-        square = (point - goal).square().sum(-1, keepdim=True)
-        if self.power == 2:
-            return -square
-        # The root's gradient is finite but at 0, where it is set to 0.
-        away = square > REACHED**2
-        return -torch.where(away, torch.where(away, square, 1.0).sqrt(), 0.0)
+        return -(point - goal).square().sum(-1, keepdim=True) if self.power == 2 else -length(point - goal, REACHED)
 
 
 class Near(Distance):
@@ -119,5 +125,4 @@ def _check_sizes(radius: float, margin: float) -> None:
 def _long_tail(square: Tensor, radius: float, margin: float) -> Tensor:
     """The suite's tolerance at squared distances."""
     # Clamp before the root: its gradient stays finite at 0.
-    beyond = square.clamp(min=radius**2).sqrt() - radius
-    return 1 / (1 + (3 * beyond / margin).square())
+    return tolerance(square.clamp(min=radius**2).sqrt(), 0.0, radius, margin=margin, sigmoid="long_tail")

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.rewards.bodies import Bodies
+from torchrl_gn.rewards.distance import Near, length
 from torchrl_gn.rewards.reward import Reward
 from torchrl_gn.rewards.tolerance import tolerance
 from torchrl_gn.scenes.scene import Scene
@@ -55,7 +56,7 @@ class Place(Float64Buffers):
     """Position ``[*B, 3]``, metres, and velocity of a point that is fixed in a body, in the world's frame.
 
     Args:
-        body: name; ``"world"`` for a point that stays.
+        body: name.
         offset: ``[3]`` of the point in the body's frame.
     """
 
@@ -63,7 +64,7 @@ class Place(Float64Buffers):
 
     def __init__(self, scene: Scene, body: str, offset: np.ndarray) -> None:
         super().__init__()
-        self.bodies = None if body == "world" else Bodies(scene, [body])
+        self.bodies = Bodies(scene, [body])
         self.constants({"offset": np.array(offset, dtype=np.float64)})
 
     @classmethod
@@ -82,21 +83,17 @@ class Place(Float64Buffers):
         return cls(scene, body, scene.model.body(body).ipos)
 
     def forward(self, state: Tensor) -> Tensor:
-        offset = self.offset.to(state.dtype)
-        if self.bodies is None:
-            return offset.expand(*state.shape[:-2], 3)
         position, orientation = (each.squeeze(-2) for each in self.bodies.pose(state))
-        return position + quaternion.rotate(orientation, offset.expand_as(position))
+        return position + quaternion.rotate(orientation, self.offset.to(state.dtype).expand_as(position))
 
     def velocity(self, state: Tensor) -> Tensor:
-        assert self.bodies is not None
         orientation, spin = self.bodies.orientation(state).squeeze(-2), self.bodies.angular_velocity(state).squeeze(-2)
         arm = quaternion.rotate(orientation, self.offset.to(state.dtype).expand_as(spin))
         return self.bodies.linear_velocity(state).squeeze(-2) + torch.linalg.cross(spin, arm)
 
 
 class HingeRates(Float64Buffers):
-    """Rates ``[*B, K]``, rad/s, of hinges."""
+    """Rates ``[*B, K]``, rad/s, of hinges between different bodies."""
 
     axis: Tensor
 
@@ -106,15 +103,13 @@ class HingeRates(Float64Buffers):
         below = [int(model.joint(name).bodyid[0]) for name in joints]
         above = [int(model.body_parentid[body]) for body in below]
         self.moving = Bodies(scene, [model.body(body).name for body in below])
-        self.parents = [None if body == 0 else Bodies(scene, [model.body(body).name]) for body in above]
+        self.parents = Bodies(scene, [model.body(body).name for body in above])
         self.constants({"axis": np.stack([model.joint(name).axis for name in joints])})
 
     def forward(self, state: Tensor) -> Tensor:
         spin, orientation = self.moving.angular_velocity(state), self.moving.orientation(state)
-        still = torch.zeros_like(spin[..., :1, :])
-        parents = torch.cat([still if of is None else of.angular_velocity(state) for of in self.parents], -2)
         axis = quaternion.rotate(orientation, self.axis.to(state.dtype).expand_as(spin))
-        return ((spin - parents) * axis).sum(-1)
+        return ((spin - self.parents.angular_velocity(state)) * axis).sum(-1)
 
 
 class SuiteReward(Reward):
@@ -149,7 +144,7 @@ class Run(SuiteReward):
         self.velocity, self.speed = CenterOfMassVelocity(scene, body), float(speed)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        return (self.velocity(next_state)[..., :1] / self.speed).clamp(0.0, 1.0)
+        return _pace(self.velocity(next_state), self.speed)
 
 
 class RunUpright(SuiteReward):
@@ -173,8 +168,7 @@ class RunUpright(SuiteReward):
         stand = (3 * standing + (1 + self.upright(self.bodies, next_state)) / 2) / 4
         if self.speed == 0:
             return stand
-        moving = (self.velocity(next_state)[..., :1] / self.speed).clamp(0.0, 1.0)
-        return stand * (5 * moving + 1) / 6
+        return stand * (5 * _pace(self.velocity(next_state), self.speed) + 1) / 6
 
 
 class TipUp(SuiteReward):
@@ -186,7 +180,7 @@ class TipUp(SuiteReward):
         self.radius, self.margin = float(scene.model.site("target").size[0]), 0.0 if sparse else 1.0
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        away = _length(self.target(next_state) - self.tip(next_state))
+        away = length(self.target(next_state) - self.tip(next_state))
         return tolerance(away, 0.0, self.radius, margin=self.margin)
 
 
@@ -231,22 +225,25 @@ class Hop(SuiteReward):
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         height = (self.torso(next_state) - self.foot(next_state))[..., 2:]
         standing = tolerance(height, 0.6, 2.0)
-        return standing * (self.small(action) if self.speed == 0 else _fast(self.velocity(next_state), self.speed, 0.5))
+        return standing * (self.small(action) if self.speed == 0 else _pace(self.velocity(next_state), self.speed))
 
 
 class Walk(SuiteReward):
     """The suite's ``quadruped walk`` (``speed=0.5``) and ``run`` (5): upright, and forward in the torso's frame."""
 
+    ahead: Tensor
+
     def __init__(self, scene: Scene, *, speed: float) -> None:
         super().__init__(scene, speed=speed)
         self.torso, self.speed = Bodies(scene, ["torso"]), speed
-        site = scene.model.site("torso")  # of the velocimeter
-        self.place = Place.of_site(scene, "torso")
-        self.forward_axis = Place(scene, "torso", np.array(_axes(site.quat)[:, 0]))
+        self.place = Place.of_site(scene, "torso")  # of the velocimeter
+        ahead = torch.from_numpy(_axes(scene.model.site("torso").quat)[:, 0].copy())
+        self.register_buffer("ahead", ahead, persistent=False)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        ahead = self.forward_axis(next_state) - self.torso.position(next_state).squeeze(-2)
-        speed = (self.place.velocity(next_state) * ahead).sum(-1, keepdim=True)
+        velocity, orientation = self.place.velocity(next_state), self.torso.orientation(next_state).squeeze(-2)
+        ahead = quaternion.rotate(orientation, self.ahead.to(velocity.dtype).expand_as(velocity))
+        speed = (velocity * ahead).sum(-1, keepdim=True)
         upright = (1 + self.upright(self.torso, next_state)) / 2
         moving = tolerance(speed, self.speed, _ANY, margin=self.speed, sigmoid="linear", at_margin=0.5)
         return upright.clamp(0.0, 1.0) * moving
@@ -270,7 +267,7 @@ class HeadUp(SuiteReward):
         if self.speed == 0:
             moving = tolerance(velocity, margin=2).mean(-1, keepdim=True)
         else:
-            moving = (1 + 5 * (_length(velocity) / self.speed).clamp(max=1.0)) / 6
+            moving = (1 + 5 * (length(velocity) / self.speed).clamp(max=1.0)) / 6
         return self.small(action) * standing * upright * moving
 
 
@@ -321,7 +318,7 @@ class MassAtTarget(SuiteReward):
         self.size = float(scene.model.geom("target").size[0])
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        away = _length(self.target(next_state) - self.mass(next_state))
+        away = length(self.target(next_state) - self.mass(next_state))
         return tolerance(away, 0.0, self.size, margin=self.size) * self.small(action)
 
 
@@ -340,7 +337,7 @@ class PlaceAtTarget(SuiteReward):
 
     def away(self, state: Tensor, task: Tensor | None) -> Tensor:
         """Distance ``[*B, 1]``."""
-        return _length((self.require_task(task, state) - self.place(state))[..., self.axes])
+        return length((self.require_task(task, state) - self.place(state))[..., self.axes])
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         return tolerance(self.away(next_state, task), 0.0, self.radius)
@@ -359,36 +356,23 @@ class SwimUpright(PlaceAtTarget):
         return (7 * near + (1 + self.upright(self.torso, next_state)) / 2) / 8
 
 
-class NoseAtTarget(PlaceAtTarget):
-    """The suite's ``swimmer``: the nose near the episode's target."""
-
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(scene, Place.of_geom(scene, "nose"), (0, 1), float(scene.model.geom("target").size[0]))
-
-    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        away = self.away(next_state, task)
-        return tolerance(away, 0.0, self.radius, margin=5 * self.radius, sigmoid="long_tail")
-
-
 def _reacher(scene: Scene, target: float) -> Reward:
     finger = Place.of_geom(scene, "finger")
     return PlaceAtTarget(scene, finger, (0, 1), target + float(scene.model.geom("finger").size[0]))
+
+
+def _swimmer(scene: Scene) -> Reward:
+    nose, radius = scene.model.geom("nose"), float(scene.model.geom("target").size[0])
+    return Near(scene, "head", offset=nose.pos, radius=radius, margin=5 * radius)
 
 
 def _turned(scene: Scene, target: float) -> Reward:
     return PlaceAtTarget(scene, Place.of_site(scene, "tip"), (0, 2), target)
 
 
-def _length(vector: Tensor) -> Tensor:
-    """Lengths ``[*B, 1]`` whose gradient is 0 at 0, where the root's is infinite."""
-    square = vector.square().sum(-1, keepdim=True)
-    away = square > 0
-    return torch.where(away, torch.where(away, square, 1.0).sqrt(), 0.0)
-
-
-def _fast(velocity: Tensor, speed: float, at_margin: float) -> Tensor:
-    """The suite's reward ``[*B, 1]`` for a speed along x."""
-    return tolerance(velocity[..., :1], speed, _ANY, margin=speed / 2, sigmoid="linear", at_margin=at_margin)
+def _pace(velocity: Tensor, speed: float) -> Tensor:
+    """Share ``[*B, 1]`` of a speed along x, within 0 and 1: the suite's linear tolerance with half of it as margin."""
+    return (velocity[..., :1] / speed).clamp(0.0, 1.0)
 
 
 def _axes(orientation: np.ndarray) -> np.ndarray:
@@ -425,8 +409,8 @@ _REWARDS: dict[str, Callable[[Scene], Reward]] = {
     "quadruped/walk": lambda scene: Walk(scene, speed=0.5),
     "reacher/easy": lambda scene: _reacher(scene, 0.05),
     "reacher/hard": lambda scene: _reacher(scene, 0.015),
-    "swimmer/swimmer15": NoseAtTarget,
-    "swimmer/swimmer6": NoseAtTarget,
+    "swimmer/swimmer15": _swimmer,
+    "swimmer/swimmer6": _swimmer,
     "walker/run": lambda scene: RunUpright(scene, "torso"),
     "walker/stand": lambda scene: RunUpright(scene, "torso", speed=0.0),
     "walker/walk": lambda scene: RunUpright(scene, "torso", speed=1.0),
