@@ -63,17 +63,13 @@ class StateReward(Reward):
         if self.target_shape is not None:
             target = self.require_task(task, next_state).expand(*next_state.shape[:-2], 3)
         inputs = self.inputs(state, action, next_state, target)
-        return self.normalizer.inverse(self.normalized(inputs)).to(next_state.dtype)
+        return self.normalizer.inverse(self.network(inputs)).to(next_state.dtype)
 
     def inputs(self, state: Tensor, action: Tensor, next_state: Tensor, target: Tensor | None = None) -> Tensor:
         """What the network reads ``[*B, F]`` of a step."""
         dtype = next(self.network.parameters()).dtype
         before, after = (self.features(each, dtype, target) for each in (state, next_state))
         return torch.cat((before, after, (action / self.scale.to(action.dtype)).to(dtype)), -1)
-
-    def normalized(self, inputs: Tensor) -> Tensor:
-        """Rewards ``[*B, 1]``, in standard deviations from the mean."""
-        return self.network(inputs)
 
     def description(self) -> dict[str, Any]:
         """JSON-able values from which :meth:`from_description` rebuilds the network."""

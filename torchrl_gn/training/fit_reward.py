@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import cast
 
 import torch
@@ -13,6 +12,7 @@ from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.layer_norm_mlp import renormalize
 from torchrl_gn.planners.state_reward import StateReward
+from torchrl_gn.training.fit_batches import fit_batches
 from torchrl_gn.training.optimizers import make_optimizer
 
 
@@ -57,13 +57,6 @@ def fit_reward(
     normalized = reward.normalizer(paid, inputs.dtype)
     optimizer = make_optimizer(reward.network, "adam", lr=lr)
     generator = torch.Generator(inputs.device).manual_seed(seed)
-    recent = []
-    for step in range(steps):
-        batch = torch.randint(len(inputs), (batch_size,), generator=generator, device=inputs.device)
-        loss = (reward.normalized(inputs[batch]) - normalized[batch]).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step(step, step / steps)
-        if step >= steps - max(1, steps // 10):
-            recent.append(loss.detach())
-    return float(torch.stack(recent).mean()) if recent else math.nan
+    sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
+    losses = fit_batches(reward.network, inputs, normalized, optimizer, **sizes)
+    return float(losses[-max(1, steps // 10) :].mean())

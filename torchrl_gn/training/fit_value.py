@@ -16,6 +16,7 @@ from torchrl.objectives.value import TDLambdaEstimator
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.training.fit_batches import fit_batches
 from torchrl_gn.training.optimizers import make_optimizer
 
 Episodes = TensorDictBase | Sequence[TensorDictBase]
@@ -86,22 +87,15 @@ def fit_value(
     estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
     optimizer = make_optimizer(value.members, "adam", lr=lr)
     generator = torch.Generator(features.device).manual_seed(seed)
-    history = ValueHistory()
+    sizes, history = {"steps": steps, "batch_size": batch_size, "generator": generator}, ValueHistory()
     targets = torch.empty(0)
     for iteration in range(iterations):
         targets = _targets(value, estimator, parts)
         if not value.fitted:
             value.normalizer.update(targets)
-        normalized, losses = value.normalizer(targets), []
-        for step in range(steps):
-            batch = torch.randint(len(features), (batch_size,), generator=generator, device=features.device)
-            loss = (value.normalized(features[batch]) - normalized[batch]).square().mean()
-            done = iteration * steps + step
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step(done, done / (iterations * steps))
-            losses.append(loss.detach())
-        history.losses.append(float(torch.stack(losses).mean()))
+        plan = {**sizes, "done": iteration * steps, "total": iterations * steps}
+        losses = fit_batches(value.normalized, features, value.normalizer(targets), optimizer, **plan)
+        history.losses.append(float(losses.mean()))
     with torch.no_grad():
         left = (targets - value.of_features(features)).var() / targets.var()
     history.explained = 1 - float(left)
@@ -140,18 +134,10 @@ def fit_policy(
     scaled = torch.where(varied, (action - policy.middle) / policy.half_range, 0.0).to(features.dtype)
     optimizer = make_optimizer(policy.network, "adam", lr=lr)
     generator = torch.Generator(features.device).manual_seed(seed)
-    history, recent = ImitationHistory(), []
-    for step in range(steps):
-        batch = torch.randint(len(features), (batch_size,), generator=generator, device=features.device)
-        loss = (policy.scaled(features[batch]) - scaled[batch]).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step(step, step / steps)
-        recent.append(loss.detach())
-        if 10 * (step + 1) // steps > 10 * step // steps:
-            history.losses.append(float(torch.stack(recent).mean()))
-            recent.clear()
-    return history
+    sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
+    losses = fit_batches(policy.scaled, features, scaled, optimizer, **sizes)
+    tenth = 10 * torch.arange(steps, device=losses.device) // steps
+    return ImitationHistory([float(losses[tenth == of].mean()) for of in tenth.unique()])
 
 
 def _check_counts(**counts: int) -> None:
