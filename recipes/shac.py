@@ -4,10 +4,10 @@
 
 Round by round: the policy and a value learn in the model, from states that were played (SHACLoss); the policy plays in
 MuJoCo, with exploration; the model learns from all that was played, and so does the reward, unless it is known. Tasks
-of the control suite are played by dm_control, and what it pays is the return; their model is of one frame, the policy
-acts every action_repeat frames. Other systems have a reward that is known, and differentiable. For a policy from the
-suite's observations see recipes/svg.py. Finished rounds are kept: the same run_dir goes on, with more rounds too.
-Results: docs/results/short-horizon-actor-critic.md.
+of the control suite are played by dm_control, and what it pays is the return; the policy acts every action_repeat
+frames, and with per_frame=true their model is of one. Other systems have a reward that is known, and differentiable.
+For a policy from the suite's observations see recipes/svg.py. Finished rounds are kept: the same run_dir goes on, with
+more rounds too. Results: docs/results/short-horizon-actor-critic.md.
 
 Writes config.yaml, metrics.json, table.md, the learning curve (curve.json and curve.png), a video of the last round's
 first judged episode (episode.gif), and the policy, averaged over rounds, and the last value and model

@@ -65,21 +65,34 @@ class Task:
 
     Args:
         folder: of its files in a run and in a round.
+        modelled: the scene with the control step of the model, of which an action is as many as fill it. Default: its.
+        invariances: of the task; default: those of scene and reward.
     """
 
     model: BoundPredictor | BoundEnsemble
     value: StateValue
     loss: SHACLoss
 
-    def __init__(self, cfg: DictConfig, scene: Scene, reward: Reward, judge: Reward, folder: str) -> None:
+    def __init__(
+        self,
+        cfg: DictConfig,
+        scene: Scene,
+        reward: Reward,
+        judge: Reward,
+        folder: str,
+        *,
+        modelled: Scene | None = None,
+        invariances: Canonicalizer | None = None,
+    ) -> None:
         self.targeted = reward.target_shape is not None
         if self.targeted and "suite" not in scene.origin:
             raise ValueError(f"A policy of states does not know the target of {reward}.")
         self.cfg, self.scene, self.reward, self.judge, self.folder = cfg, scene, reward, judge, folder
-        self.modelled, self.model_steps = scene, 1  # scene of the model, and its steps under an action
+        self.modelled = modelled or scene
+        self.model_steps = round(scene.timestep / self.modelled.timestep)  # under an action
         self.device = Workers().device(cfg.device)
         self.squares = TargetSquares(scene, cfg.target_squares) if cfg.target_squares else None
-        self.invariances = self._invariances()
+        self.invariances = invariances or task_invariances(scene, reward)
         self.data: list[TensorDict] = []
         self.judged_starts = None if self.squares is None else self.squares.start_states
         if (suite_seed := cfg.evaluate.suite_seed) is not None:
@@ -87,9 +100,6 @@ class Task:
                 raise ValueError("evaluate.suite_seed= is for a target: give target_squares= too.")
             states = self.squares.suite_states(cfg.evaluate.episodes, suite_seed)
             self.judged_starts = lambda n, _: states[:n]
-
-    def _invariances(self) -> Canonicalizer:
-        return task_invariances(self.scene, self.reward)
 
     def collect(self, done: list[Round]) -> None:
         """Trajectories of random control, and those that finished rounds played."""

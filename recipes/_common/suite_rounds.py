@@ -33,14 +33,6 @@ def suite_task(cfg: DictConfig, system: str, *, alone: bool = True) -> SuiteTask
         raise ValueError(f"target_squares={list(cfg.target_squares)}: {system} has starts of its own.")
     frame = load_scene(system)
     scene = load_scene(system, timestep=cfg.action_repeat * frame.timestep)
-    longest = SuiteTaskEnv(scene).steps
-    for name, steps in (
-        ("steps", cfg.steps),
-        ("first.length", cfg.first.length),
-        ("evaluate.steps", cfg.evaluate.steps),
-    ):
-        if steps is not None and steps > longest:
-            raise ValueError(f"{name}={steps}: an episode of {system} has {longest} control steps.")
     return SuiteTask(cfg, scene, frame if cfg.per_frame else scene, "" if alone else scene.name)
 
 
@@ -52,17 +44,18 @@ class SuiteTask(Task):
     """
 
     def __init__(self, cfg: DictConfig, scene: Scene, modelled: Scene, folder: str) -> None:
-        self.learns_reward = cfg.reward == LEARNED
+        self.learns_reward, name = cfg.reward == LEARNED, scene.origin["suite"]
+        recenter, yaw = hidden_by_task(*name.split("/"))
+        hidden = Canonicalizer(recenter=recenter, yaw=yaw)
         if self.learns_reward:
-            target = has_target(modelled.origin["suite"])
-            reward = StateReward(modelled, hidden=cfg.hidden, canonicalizer=_hidden(modelled), target=target)
+            reward = StateReward(modelled, hidden=cfg.hidden, canonicalizer=hidden, target=has_target(name))
         else:
             reward = reward_of(cfg, modelled)
-        super().__init__(cfg, scene, reward, reward, folder)
-        self.modelled, self.model_steps = modelled, round(scene.timestep / modelled.timestep)
-
-    def _invariances(self) -> Canonicalizer:
-        return _hidden(self.scene)
+        super().__init__(cfg, scene, reward, reward, folder, modelled=modelled, invariances=hidden)
+        given = {"steps": cfg.steps, "first.length": cfg.first.length, "evaluate.steps": cfg.evaluate.steps}
+        for option, steps in given.items():
+            if steps is not None and steps > (longest := self._judged.steps):
+                raise ValueError(f"{option}={steps}: an episode of suite:{name} has {longest} control steps.")
 
     @cached_property
     def _played(self) -> SuiteTaskEnv:
@@ -126,8 +119,3 @@ def _replay(actions: Tensor) -> Callable[[TensorDictBase], TensorDictBase]:
     """A policy that gives ``actions`` ``[T, A]`` one after another."""
     rest = iter(actions.unsqueeze(1))
     return lambda tensordict: tensordict.set("action", next(rest))
-
-
-def _hidden(scene: Scene) -> Canonicalizer:
-    recenter, yaw = hidden_by_task(*scene.origin["suite"].split("/"))
-    return Canonicalizer(recenter=recenter, yaw=yaw)

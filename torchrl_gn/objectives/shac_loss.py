@@ -188,7 +188,7 @@ class SHACLoss(LossModule):
                 for _ in range(self.action_repeat):
                     now = env.step(now.set("action", action))
                     steps.append(now.select("state", "action", ("next", "terminated")))
-                    now = step_mdp(now, exclude_done=True).set("action", action)
+                    now = step_mdp(now, exclude_done=True)
             played = cast(TensorDict, torch.stack(steps, 1))
             states = torch.cat((played["state"], cast(Tensor, now["state"]).unsqueeze(1)), 1)
             # The rewards of all steps at once: as many small operations as for one.

@@ -20,7 +20,7 @@ from torchrl_gn.scenes.mjcf_text import inlined, model_assets, read_text, reads_
 from torchrl_gn.scenes.scaled import variant_of
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
 from torchrl_gn.scenes.stored_mjcf import checked, is_among, model_files, packed, require_stored, unpacked
-from torchrl_gn.scenes.suite_tasks import load_suite_task, suite_model_file, suite_name
+from torchrl_gn.scenes.suite_tasks import suite_model_file, suite_name
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
 from torchrl_gn.scenes.urdf import add_motors, is_urdf, with_local_meshes
 from torchrl_gn.scenes.variants import build_system, make_variant
@@ -183,12 +183,10 @@ def _rebuilt(description: dict) -> Scene:
 
 def _suite_scene(domain: str, task: str, *, name: str | None, timestep: float | None) -> Scene:
     """The scene of a task of the control suite."""
-    if timestep is None:
-        timestep = load_suite_task(domain, task, 0).control_timestep()
-    with suite_model_file(domain, task) as path:
+    with suite_model_file(domain, task) as (path, step):
         spec, origin = _read_mjcf(path)
         origin["suite"] = f"{domain}/{task}"
-        return build_scene(spec, name=name or f"{domain}-{task}", timestep=timestep, origin=origin)
+        return build_scene(spec, name=name or f"{domain}-{task}", timestep=timestep or step, origin=origin)
 
 
 def _unknown(name: str) -> str:

@@ -86,29 +86,31 @@ def _without_advice() -> Iterator[None]:
 
 
 @contextmanager
-def suite_model_file(domain: str, task: str) -> Iterator[Path]:
-    """The MJCF file, with those beside it, of the model that a task simulates; it is removed at the end.
+def suite_model_file(domain: str, task: str) -> Iterator[tuple[Path, float]]:
+    """The MJCF file, with those beside it, of the model that a task simulates, and the task's control step, seconds.
+
+    The file is removed at the end.
 
     ValueError for an unknown task, one whose model is no file, or one whose episodes differ in their physics.
     """
-    text, assets = _mjcf(domain, task)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, f"{domain}.xml")
-        for name, content in {**assets, path.name: text}.items():
-            file = Path(folder, name)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(content.encode() if isinstance(content, str) else content)
-        yield path
-
-
-def _mjcf(domain: str, task: str) -> tuple[bytes | str, Mapping[str, bytes | str]]:
-    """Text of the model of a task, and the files that it reads."""
     if _NO_SCENES.fullmatch(f"{domain}/{task}"):
         raise ValueError(
             f"There is no scene of the suite's {domain}/{task}: its model is drawn at random, or needs meshes or a"
             " terrain that a scene does not hold. suite_env(domain, task) plays it, for policies of observations."
         )
     env = load_suite_task(domain, task, 0)
+    text, assets = _mjcf(env, domain, task)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f"{domain}.xml")
+        for name, content in {**assets, path.name: text}.items():
+            file = Path(folder, name)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content.encode() if isinstance(content, str) else content)
+        yield path, env.control_timestep()
+
+
+def _mjcf(env: Any, domain: str, task: str) -> tuple[bytes | str, Mapping[str, bytes | str]]:
+    """Text of the model of a task, and the files that it reads."""
     module = importlib.import_module(f"dm_control.suite.{domain}")
     if domain == "quadruped":  # of whose models only the size of the drawn floor differs in walk and run
         text, assets = module.make_model(), module.common.ASSETS
