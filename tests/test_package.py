@@ -22,7 +22,7 @@ PACKAGE = Path(torchrl_gn.__file__).parent
 # A folder imports from itself and from those before it: the data flow is the reading order.
 ORDER = (
     "maths", "scenes", "data", "networks", "dynamics", "identification", "policies", "rewards",
-    "drawing", "envs", "planners", "objectives", "evaluation", "training",
+    "drawing", "envs", "planners", "objectives", "evaluation", "training", "actor_critic",
 )  # fmt: skip
 # Earlier folders that a folder does not import either.
 APART = {
@@ -33,6 +33,7 @@ APART = {
     "rewards": {"data", "networks", "dynamics", "identification", "policies"},
     "drawing": {"data", "networks", "dynamics", "identification", "policies", "rewards"},
     "objectives": {"data", "rewards", "drawing"},
+    "actor_critic": {"maths", "networks", "identification", "policies", "drawing", "evaluation"},
 }
 ALLOWED = {folder: {*ORDER[:index], folder} - APART.get(folder, set()) for index, folder in enumerate(ORDER)}
 # Modules beside the folders, which import none of them.

@@ -37,6 +37,7 @@ PARTS = {
     "planners": "planning.md",
     "evaluation": "evaluation.md",
     "training": "training.md",
+    "actor_critic": "policies.md#an-actor-critic-of-your-own",
 }
 """Public parts of the package, and the page that explains each."""
 

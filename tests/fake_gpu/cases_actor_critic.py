@@ -8,79 +8,89 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 import torchrl_gn as gn
+from torchrl_gn.actor_critic import (
+    ActorCritic,
+    ActorCriticOptions,
+    ActorCriticTask,
+    FirstTrajectories,
+    JudgedEpisodes,
+    SuiteActorCriticTask,
+    TargetSquares,
+)
 
 from .device import NAME, without_waits
 
-RECIPES = Path(__file__).parents[2] / "recipes"
-sys.path.append(str(RECIPES))  # as Python does for a script there
+sys.path.append(str(Path(__file__).parents[2] / "recipes"))  # as Python does for a script there
 
-from _common.actor_critic_rounds import ActorCritic, Round, Task  # noqa: E402
-from _common.suite_rounds import suite_task  # noqa: E402
+from _common.rounds import Rounds
 
 SMALL = {
-    **{"system": "cheetah", "timestep": 0.02, "reward": "forward", "reward_steps": 3},
-    "first": {"trajectories": 4, "length": 50, "steps": 2},
+    "first": FirstTrajectories(trajectories=4, length=50, steps=2),
     "model": {"hidden": 8, "latent": 8},
     "graph": {"hidden": [8], "latent": 8},
-    "evaluate": {"episodes": 2, "steps": 5},
+    "evaluate": JudgedEpisodes(episodes=2, steps=5),
     **{"updates": 3, "batch_size": 8, "horizon": 3, "hidden": [8], "episodes": 2, "steps": 50, "model_steps": 2},
+    "reward_steps": 3,
 }
 
 
-def learner(device: str, begun: Round | None = None, **options) -> ActorCritic:
-    cfg = OmegaConf.merge(OmegaConf.load(RECIPES / "config/shac.yaml"), SMALL, {"device": device, **options})
-    assert isinstance(cfg, DictConfig)
+def options_of(device: str, **others) -> ActorCriticOptions:
+    return ActorCriticOptions(**{**SMALL, "device": device, **others})
+
+
+def make_task(system: str, options: ActorCriticOptions) -> ActorCriticTask:
     torch.manual_seed(0)
-    if cfg.system.startswith("suite:"):
-        task = suite_task(cfg, cfg.system)
-    else:
-        scene = gn.load_scene(cfg.system, timestep=cfg.timestep)
-        reward = gn.make_reward(cfg.reward, scene)
-        task = Task(cfg, scene, reward, reward, "")
-    made = ActorCritic(cfg, [task], begun)
-    made.tasks[0].collect([] if begun is None else [begun])
-    return made
+    if system.startswith("suite:"):
+        return SuiteActorCriticTask(system, options)
+    scene = gn.load_scene(system, timestep=0.1 if system == "swimmer3" else 0.02)
+    if system == "swimmer3":
+        squares = TargetSquares(scene, [0.3, 2])
+        return ActorCriticTask(scene, options, gn.make_reward("near", scene), squares=squares)
+    return ActorCriticTask(scene, options, gn.make_reward("forward" if options.policy == "graph" else "run", scene))
 
 
-SWIMMER = {"system": "swimmer3", "reward": "near", "timestep": 0.1, "target_squares": [0.3, 2]}
-REACHER = {"system": "suite:reacher/easy", "reward": "learned", "timestep": None, "per_frame": True, "outlier": 2.0}
-TASKS = [{"reward": "run"}, {"policy": "graph"}, SWIMMER, REACHER]
+TASKS = [
+    ("cheetah", {}),
+    ("cheetah", {"policy": "graph"}),
+    ("swimmer3", {}),
+    ("suite:reacher/easy", {"per_frame": True, "outlier": 2.0}),
+]
 NAMES = ["run", "graph", "near", "learned"]
 
 
-@pytest.mark.parametrize("options", TASKS, ids=NAMES)
-def test_rounds_are_those_of_the_cpu(gpu, tmp_path, options):
+@pytest.mark.parametrize(("system", "others"), TASKS, ids=NAMES)
+def test_rounds_are_those_of_the_cpu(gpu, tmp_path, system, others):
     found = []
     for device in ("cpu", NAME):
-        made, kept, losses = learner(device, **options), Round(tmp_path / device, 0), []
-        (task,) = made.tasks
+        options, losses = options_of(device, **others), []
         for index in range(2):
+            task = make_task(system, options)
+            kept = Rounds(tmp_path / device, [task], {})
+            made = kept.begin(options)  # the second from files
+            assert kept.finished == index
+            kept.collect()
             torch.manual_seed(index)
             losses.append(made.learn(index))
-            played = task.play(made.playing().for_scene(task.scene), seed=index)
+            played = task.play(made.playing(), seed=index)
             assert played["state"].is_cpu and len(played)
-            if index == 0:
-                made.save(kept)
-                task.add(played, kept)
-                kept.numbers.write_text("{}")
-                made = learner(device, kept, **options)  # goes on from files
-                (task,) = made.tasks
+            kept.save(made, [played], {})
         assert {each.device.type for each in [*made.policy.parameters(), task.loss.log_alpha]} == {device}
-        judged = task.judged(made.averaged(tmp_path / device, 1))
+        judged = task.judged(made.averaged(kept.policies(made.averaged_rounds(1))))
         numbers = {f"{name} {index}": of[name] for index, of in enumerate(losses) for name in of}
         found.append((numbers, judged["next", "reward"]))
     assert found[1][0] == pytest.approx(found[0][0], rel=1e-2, abs=1e-3)
     torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-2, atol=1e-2)
 
 
-@pytest.mark.parametrize("options", TASKS, ids=NAMES)
-def test_what_is_recorded_never_waits(gpu, monkeypatch, options):
+@pytest.mark.parametrize(("system", "others"), TASKS, ids=NAMES)
+def test_what_is_recorded_never_waits(gpu, monkeypatch, system, others):
     weights, numbers = [], []
     for recorded in (False, True):
-        made = learner(NAME, **options)
+        options = options_of(NAME, **others)
+        made = ActorCritic([make_task(system, options)], options)
+        made.tasks[0].collect()
         torch.manual_seed(0)
         made.learn(0)
         optimizer, draw = made.optimizer, made.tasks[0].starts()

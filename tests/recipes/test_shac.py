@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from torchrl_gn.actor_critic import ActorCriticOptions, FirstTrajectories, JudgedEpisodes
 from torchrl_gn.atomic import read_json, write_json
 from torchrl_gn.data import Simulator
 from torchrl_gn.scenes.suite_tasks import full_physics, load_suite_task
@@ -25,6 +27,22 @@ SMALL = (
 SMALL += ("updates=3", "batch_size=8", "horizon=3", "hidden=[8]", "episodes=2", "steps=50", "model_steps=3")
 FORWARD = ("system=pendulum", "data.train=4", "data.validation=2", "data.test=2", "model.hidden=8", "minutes=1")
 SMALL += ("model={hidden:8,latent:8}", "evaluate.episodes=2", "evaluate.steps=20")
+
+
+OWN = {"system", "zero_shot", "timestep", "action_bounds", "wide_starts", "mocap_actions", "motors", "reward"}
+OWN |= {"judged_reward", "target_squares", "rounds", "threads", "logger", "run_dir"}
+"""Options of the recipe that its trainer does not read."""
+
+
+def test_its_defaults_are_those_of_the_library(load, compose):
+    config = compose("shac")
+    assert load("shac").options_of(config) == ActorCriticOptions()
+    assert {each.name for each in fields(ActorCriticOptions)} == set(config) - OWN
+    assert {each.name for each in fields(FirstTrajectories)} == set(config.first)
+    assert {each.name for each in fields(JudgedEpisodes)} == set(config.evaluate) - {"suite_seed"}
+    changed = compose("shac", "horizon=3", "first.steps=7", "evaluate.steps=9", "hidden=[8]")
+    wanted = {"first": FirstTrajectories(steps=7), "evaluate": JudgedEpisodes(steps=9)}
+    assert load("shac").options_of(changed) == ActorCriticOptions(horizon=3, hidden=(8,), **wanted)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A short-horizon actor-critic round by round: the networks' optimiser, and what the policy plays."""
+"""The optimiser of a short-horizon actor-critic."""
 
 from __future__ import annotations
 
@@ -6,88 +6,21 @@ import gc
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
-import mujoco
-import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_gn.data import sample_start_states
-from torchrl_gn.envs import SceneEnv, SuiteTaskEnv, observation_env
-from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.scenes import ObservationGraph, Scene
 from torchrl_gn.training.nested_state import require_like
 from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
 from torchrl_gn.training.recorded_update import UpdateGraph, clip_on_device
 
-WINDOW = 50  # control steps of a trajectory that the model learns from
 _BETAS = (0.7, 0.95)  # SHAC's: gradients change fast with the policy
 _MAX_NORM = 1.0
 _KEPT = {"reward": "imagined_reward", "loss_value": "loss_value", "entropy": "entropy"}
-
-
-class TargetSquares:
-    """Targets anywhere in a square around the start, one of several sizes. The target is the origin: the scene moves.
-
-    ValueError if the scene cannot: it needs a root that slides along x and y, in physics that are the same everywhere.
-
-    Args:
-        half_sides: of the squares, metres, equally likely.
-    """
-
-    def __init__(self, scene: Scene, half_sides: Sequence[float]) -> None:
-        model, self.scene = scene.model, scene
-        self.half_sides = np.array([float(each) for each in half_sides])
-        self._sizes = torch.from_numpy(self.half_sides)  # where states are
-        if not (self.half_sides > 0).all():
-            raise ValueError(f"target_squares={list(half_sides)} must be positive half sides, metres.")
-        slides = [
-            np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (np.abs(model.jnt_axis) == axis).all(1))
-            for axis in np.eye(3)[:2]
-        ]
-        if not (scene.translation_invariant[:2].all() and all(len(found) for found in slides)):
-            raise ValueError(f"target_squares= needs a scene that slides freely along x and y, not {scene.name!r}.")
-        self.where = [1 + model.jnt_qposadr[found[0]] for found in slides]  # in a MuJoCo state, after the time
-
-    def start_states(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Full MuJoCo states ``[n, S]``."""
-        states = sample_start_states(self.scene, n, rng)
-        size = rng.choice(self.half_sides, (n, 1))
-        states[:, self.where] = rng.uniform(-size, size, (n, 2))
-        return states
-
-    def suite_states(self, n: int, seed: int) -> np.ndarray:
-        """Full MuJoCo states ``[n, S]`` of the suite's own starts and targets, as recipes/svg.py judges by.
-
-        ValueError if the scene is no swimmer of the suite.
-        """
-        scene, links = self.scene, self.scene.num_nodes - 1
-        if scene.name != f"swimmer{links}":
-            raise ValueError(f"evaluate.suite_seed= is for the suite's swimmers, not {scene.name!r}.")
-        env = observation_env(ObservationGraph.swimmer(links), "swimmer", scene.name, num_envs=n)
-        env.set_seed(seed)
-        env.reset()
-        states = np.zeros((n, scene.physics_size))
-        for state, each in zip(states, cast(Any, env).base_env._envs, strict=True):
-            physics = each._env.physics
-            state[1 : 1 + scene.model.nq] = physics.data.qpos
-            state[self.where] -= physics.named.model.geom_pos["target", ["x", "y"]]
-        return states
-
-    def move(self, state: Tensor) -> Tensor:
-        """States ``[B, N, 13]`` with the first body somewhere else in a square around the target."""
-        device, count = state.device, len(state)
-        self._sizes = self._sizes.to(device)
-        sizes = self._sizes[torch.randint(len(self._sizes), (count, 1, 1), device=device)]
-        place = sizes * (2 * torch.rand(count, 1, 2, dtype=torch.float64, device=device) - 1)
-        moved = state.clone()
-        moved[:, 1:, :2] += place.to(state) - state[:, 1:2, :2]
-        return moved
 
 
 class ActorCriticOptimizer:
@@ -97,6 +30,7 @@ class ActorCriticOptimizer:
 
     Args:
         losses: of every task, whose policies share their weights.
+        policy_lr, value_lr, alpha_lr: learning rates of the policy, of the values, and of the entropies' weights.
     """
 
     def __init__(self, losses: Sequence[SHACLoss], *, policy_lr: float, value_lr: float, alpha_lr: float) -> None:
@@ -119,7 +53,9 @@ class ActorCriticOptimizer:
     ) -> dict[str, float]:
         """Update from the states ``[batch_size]`` that every task's ``starts`` draws; means of the last quarter.
 
-        They have ``state`` ``[batch_size, N, 13]`` and, where episodes have one, ``target`` ``[batch_size, 3]``.
+        They have ``state`` ``[batch_size, N, 13]`` and, where episodes have one, ``target`` ``[batch_size, 3]``. The
+        means are ``imagined_reward`` (of a step), ``loss_value`` and ``entropy``. FloatingPointError if a gradient is
+        not finite; that update changes nothing.
         """
         kept: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
@@ -183,61 +119,13 @@ class ActorCriticOptimizer:
         return torch.stack([*norms, *(value.double() for of in found for value in of.values())])
 
     def state_dict(self) -> dict[str, Any]:
+        """State to resume from, without the networks."""
         return {"adam": self.optimizer.state_dict(), "log_alphas": [alpha.detach() for alpha in self.alphas]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume from what :meth:`state_dict` returned; ValueError if it is of other networks, or forged."""
         require_like(self.state_dict()["log_alphas"], state["log_alphas"], "training.log_alphas")
         load_optimizer(self.optimizer, state["adam"])
         with torch.no_grad():
             for alpha, kept in zip(self.alphas, state["log_alphas"], strict=True):
                 alpha.copy_(kept)
-
-
-def play(
-    env: SceneEnv | SuiteTaskEnv,
-    policy: Callable[[TensorDictBase], TensorDictBase],
-    *,
-    episodes: int,
-    steps: int,
-    explore: bool,
-) -> TensorDict:
-    """Episodes ``[M, T]`` in MuJoCo, from new starts."""
-    kind = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
-    with torch.no_grad(), set_exploration_type(kind):
-        env = cast(SceneEnv, for_learning(env))
-        start = env.reset(TensorDict(batch_size=[episodes]))
-        return cast(
-            TensorDict, env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
-        )
-
-
-def windows(state: Tensor, action: Tensor, reward: Tensor | None = None, target: Tensor | None = None) -> TensorDict:
-    """Cut trajectories into those of :data:`WINDOW` steps.
-
-    Args:
-        state: ``[K, T + 1, N, 13]``.
-        action: ``[K, T, A]``.
-        reward: ``[K, T, 1]`` that was paid, if it is to be learned.
-        target: ``[K, 3]`` of the episodes, if they have one.
-    """
-    first = range(0, action.shape[1] - WINDOW + 1, WINDOW)
-    parts = {
-        "state": torch.cat([state[:, at : at + WINDOW + 1] for at in first]),
-        "action": torch.cat([action[:, at : at + WINDOW].float() for at in first]),
-    }
-    if reward is not None:
-        parts["reward"] = torch.cat([reward[:, at : at + WINDOW] for at in first])
-    if target is not None:
-        parts["target"] = target.repeat(len(first), 1)
-    return TensorDict(parts, [len(parts["action"])])
-
-
-def played_windows(played: TensorDict) -> TensorDict:
-    """Trajectories of :func:`play`, without the episodes whose simulation became unstable."""
-    played = unbroken(played)
-    return windows(torch.cat((played["state"], played["next", "state"][:, -1:]), 1), played["action"])
-
-
-def unbroken(played: TensorDict) -> TensorDict:
-    """Episodes whose simulation did not become unstable."""
-    return played[~cast(Tensor, played["next", "terminated"]).flatten(1).any(1)]

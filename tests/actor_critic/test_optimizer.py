@@ -6,19 +6,12 @@ import copy
 
 import pytest
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 import torchrl_gn as gn
+from torchrl_gn.actor_critic import ActorCritic, ActorCriticTask, optimizer
 from torchrl_gn.training.recorded_update import UpdateGraph
 
-from .conftest import ROOT
-
 pytestmark = pytest.mark.slow
-SMALL = {
-    "first": {"trajectories": 4, "length": 50, "steps": 2},
-    "model": {"hidden": 8, "latent": 8},
-    **{"horizon": 3, "hidden": [8], "action_repeat": 1, "timestep": None, "model_steps": 1, "value_lr": 1e-2},
-}
 
 
 class Played(UpdateGraph):
@@ -49,23 +42,19 @@ class Played(UpdateGraph):
         ),
     ]
 )
-def learners(request, monkeypatch):
+def learners(request, monkeypatch, small):
     """Two that learn alike: the second without a graph."""
-    from _common import actor_critic
-    from _common.actor_critic_rounds import ActorCritic, Task
-
-    cfg = OmegaConf.merge(OmegaConf.load(ROOT / "recipes/config/shac.yaml"), SMALL, {"device": request.param})
-    assert isinstance(cfg, DictConfig)
+    options = small(device=request.param, value_lr=1e-2)
     scene, made = gn.load_scene("pendulum"), []
     reward = gn.make_reward("balance", scene)
     for _ in range(2):
         torch.manual_seed(0)
-        task = Task(cfg, scene, reward, reward, "")
-        made.append(ActorCritic(cfg, [task], None))
-        task.collect([])
+        task = ActorCriticTask(scene, options, reward)
+        made.append(ActorCritic([task], options))
+        task.collect()
         task.learn_model(0)
     if request.param == "cpu":
-        monkeypatch.setattr(actor_critic, "UpdateGraph", Played)
+        monkeypatch.setattr(optimizer, "UpdateGraph", Played)
         made[0].optimizer._by_torch = 2
     made[1].optimizer._by_torch = 10**6
     return made

@@ -1,0 +1,101 @@
+"""Tasks of an actor-critic: what they draw, what they take up again, and one that plays elsewhere."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import torchrl_gn as gn
+from torchrl_gn.actor_critic import WINDOW, ActorCritic, ActorCriticTask, TargetSquares, windows
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return gn.load_scene("pendulum")
+
+
+@pytest.fixture(scope="module")
+def reward(pendulum):
+    return gn.make_reward("balance", pendulum)
+
+
+class Replayed(ActorCriticTask):
+    """A task whose trajectories were recorded elsewhere, under one constant action each."""
+
+    def play_at_random(self):
+        return self.recorded(0.0)
+
+    def play(self, policy, seed):
+        return self.recorded(float(seed))
+
+    def recorded(self, action):
+        state = gn.collect_trajectories(self.scene, 2, steps=WINDOW, seed=3)["state"]
+        return windows(state, torch.full((2, WINDOW, 1), action))
+
+
+def test_a_subclass_plays_elsewhere(pendulum, reward, small):
+    torch.manual_seed(0)
+    task = Replayed(pendulum, options := small(), reward)
+    learner = ActorCritic([task], options)
+    task.collect()
+    before = torch.cat([each.detach().flatten().clone() for each in learner.policy.parameters()])
+    learner.learn(0)
+    task.add(task.play(learner.playing(), seed=2))
+    learner.learn(1)
+    assert [float(data["action"].unique()) for data in task.data] == [0.0, 2.0]
+    assert task.newest is task.data[1]
+    after = torch.cat([each.detach().flatten() for each in learner.policy.parameters()])
+    assert bool(after.isfinite().all()) and not torch.equal(before, after)
+
+
+def test_draws_half_from_the_newest(pendulum, reward, small):
+    task = ActorCriticTask(pendulum, small(), reward)
+    task.collect()
+    marked = task.newest.clone()
+    marked["state"].fill_(7.0)
+    task.add(marked)
+    drawn = task.starts()(1001)["state"]
+    newest = (drawn == 7.0).flatten(1).all(1)
+    assert drawn.shape == (1001, *task.newest["state"].shape[2:])
+    assert bool(newest[501:].all())  # the last 500; of the first 501, drawn from all, about half
+    assert 150 < int(newest[:501].sum()) < 350
+
+
+def test_a_round_that_left_nothing_is_passed_over(pendulum, reward, small):
+    task = ActorCriticTask(pendulum, small(), reward)
+    task.collect()
+    task.add(task.data[0][:0])
+    assert task.newest is task.data[0]
+
+
+def test_learning_needs_trajectories(pendulum, reward, small):
+    task = ActorCriticTask(pendulum, options := small(), reward)
+    learner = ActorCritic([task], options)
+    with pytest.raises(RuntimeError, match="no trajectories of 'pendulum' to learn from: call collect"):
+        learner.learn(0)
+
+
+def test_refuses_a_target_that_a_policy_cannot_know(small):
+    swimmer = gn.load_scene("swimmer3")
+    with pytest.raises(ValueError, match="does not know the target"):
+        ActorCriticTask(swimmer, small(), gn.make_reward("reach", swimmer))
+
+
+def test_targets_lie_in_the_squares():
+    squares = TargetSquares(gn.load_scene("swimmer3"), [0.1, 2.0])
+    state = gn.SceneEnv(squares.scene, seed=0).reset().unsqueeze(0)["state"].repeat(2000, 1, 1)
+    moved = squares.move(state)
+    place, shift = moved[:, 1, :2], moved[:, 1:, :2] - state[:, 1:, :2]
+    torch.testing.assert_close(shift, shift[:, :1].expand_as(shift))  # as one
+    assert torch.equal(moved[..., 2:], state[..., 2:]) and torch.equal(moved[:, 0], state[:, 0])
+    near = (place.abs() <= 0.1).all(1).double().mean()
+    assert place.abs().max() <= 2 and abs(near - (0.5 + 0.5 * 0.05**2)) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "sides", "message"),
+    [("swimmer3", [0.3, -1], "must be positive half sides"), ("pendulum", [0.3], "slides freely along x and y, not")],
+)
+def test_refuses_squares(name, sides, message):
+    with pytest.raises(ValueError, match=message):
+        TargetSquares(gn.load_scene(name), sides)

@@ -1,0 +1,124 @@
+"""Options of a short-horizon actor-critic, checked before anything is played."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from torchrl_gn.actor_critic.trajectories import WINDOW
+from torchrl_gn.planners.plan import check_count
+from torchrl_gn.planners.state_features import check_hidden
+
+PolicyKind = Literal["mlp", "graph"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstTrajectories:
+    """Trajectories of random control, before the first round. ValueError if an option is out of range."""
+
+    trajectories: int = 5  # number of them
+    length: int = 500  # control steps of each, at least 50
+    steps: int = 1000  # training steps of the model on them
+
+    def __post_init__(self) -> None:
+        for name in ("trajectories", "steps"):
+            check_count(f"first.{name}", getattr(self, name), 1)
+        check_count("first.length", self.length, WINDOW)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedEpisodes:
+    """Episodes without exploration, from the same starts every round. ValueError if an option is out of range."""
+
+    episodes: int = 5  # number of them
+    steps: int | None = None  # control steps of each; None: a whole episode of the suite, elsewhere 500
+
+    def __post_init__(self) -> None:
+        check_count("evaluate.episodes", self.episodes, 1)
+        if self.steps is not None:
+            check_count("evaluate.steps", self.steps, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticOptions:
+    """Options of :class:`ActorCritic` and its tasks; the defaults learn the suite's cheetah run in 25 rounds.
+
+    Raises:
+        ValueError: an option is out of range; the message names it.
+
+    Example:
+        >>> ActorCriticOptions(horizon=8).steps
+        500
+        >>> ActorCriticOptions(steps=70)
+        Traceback (most recent call last):
+        ...
+        ValueError: steps=70 must be a multiple of 50.
+    """
+
+    first: FirstTrajectories = field(default_factory=FirstTrajectories)  # random control before the first round
+    episodes: int = 2  # episodes of a task that a round plays, with exploration
+    steps: int = 500  # control steps of each, a multiple of 50
+    evaluate: JudgedEpisodes = field(default_factory=JudgedEpisodes)  # episodes that the policy is judged by
+    action_repeat: int = 2  # frames of a control step, in tasks of the suite
+    per_frame: bool = False  # whether the model of a task of the suite is of one frame, or else of a control step
+
+    horizon: int = 16  # control steps that the policy's gradient goes through the model
+    outlier: float = math.inf  # gradients of a trajectory are shortened to so many times the batch's median
+    discount: float = 0.99  # discount of a control step
+    lmbda: float = 0.95  # lambda of the value's TD(lambda) targets
+    updates: int = 100  # updates of policy and value in a round
+    batch_size: int = 128  # imagined trajectories of an update, half from the states of the last round
+    pessimism: float = 0.0  # standard deviations of the members' returns that the policy's return is less by
+    policy_lr: float = 1e-3  # learning rate of the policy
+    value_lr: float = 1e-3  # learning rate of the value
+    alpha_lr: float = 5e-3  # learning rate of the entropy's weight
+    average: int = 10  # rounds whose policies are averaged to be judged, a quarter of all at most
+
+    policy: PolicyKind = "mlp"  # "mlp", or "graph": a graph network, for several scenes
+    hidden: Sequence[int] = (128, 128)  # hidden sizes of value, learned reward and a policy of kind "mlp"
+    graph: Mapping[str, Any] = field(
+        default_factory=lambda: {"hidden": [32, 32], "latent": 32}
+    )  # options of a policy of kind "graph", see GraphStatePolicy
+    model: Mapping[str, Any] = field(
+        default_factory=lambda: {"hidden": 64, "latent": 64}
+    )  # options of ForwardModel.for_scene
+    members: int = 1  # models of an ensemble; each imagines its share of the batch
+
+    model_steps: int = 300  # training steps of every model in a round, on all trajectories
+    model_lr: float = 3e-3  # highest learning rate of the model after the first round
+    reward_steps: int = 300  # training steps of a learned reward in a round, thrice as many in the first
+
+    seed: int = 0  # seed of random control and of the batches of model and reward; the rest draws from torch's own
+    device: str = "cpu"  # device of the networks, or "cuda"; MuJoCo plays on the processor
+
+    def __post_init__(self) -> None:
+        counts = ("episodes", "steps", "action_repeat", "horizon", "updates", "average", "members")
+        for name in (*counts, "model_steps", "reward_steps"):
+            check_count(name, getattr(self, name), 1)
+        check_count("seed", self.seed, 0)
+        check_count("batch_size", self.batch_size, self.members)
+        if self.steps % WINDOW:
+            raise ValueError(f"steps={self.steps} must be a multiple of {WINDOW}.")
+        for name in ("policy_lr", "value_lr", "alpha_lr", "model_lr"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}={getattr(self, name)} must be positive and finite.")
+        if not 0 < self.discount <= 1:
+            raise ValueError(f"discount={self.discount} must be above 0 and at most 1.")
+        if not 0 <= self.lmbda <= 1:
+            raise ValueError(f"lmbda={self.lmbda} must be from 0 to 1.")
+        if not self.outlier > 0:
+            raise ValueError(f"outlier={self.outlier} must be above 0.")
+        if not math.isfinite(self.pessimism):
+            raise ValueError(f"pessimism={self.pessimism} must be finite.")
+        if self.pessimism and self.members == 1:
+            raise ValueError(f"pessimism={self.pessimism} needs an ensemble: give members=3, say.")
+        if self.policy not in get_args(PolicyKind):
+            raise ValueError(f"policy={self.policy} must be {' or '.join(get_args(PolicyKind))}.")
+        if not isinstance(self.hidden, Sequence):
+            raise ValueError(f"hidden={self.hidden} must be a list of sizes.")
+        # Copies that no caller changes; lists and tuples are equal.
+        object.__setattr__(self, "hidden", tuple(check_hidden(self.hidden)))
+        for name in ("graph", "model"):
+            object.__setattr__(self, name, dict(getattr(self, name)))

@@ -1,0 +1,138 @@
+"""A task of the control suite for an actor-critic: played by dm_control, its reward known or learned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_gn.actor_critic.options import ActorCriticOptions
+from torchrl_gn.actor_critic.task import JUDGED_SEED, ActorCriticTask
+from torchrl_gn.actor_critic.trajectories import play, unbroken, windows
+from torchrl_gn.data import spline_controls
+from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.envs import SuiteTaskEnv
+from torchrl_gn.planners import BoundedPolicy, StateReward
+from torchrl_gn.rewards import make_reward
+from torchrl_gn.scenes import has_target, hidden_by_task, load_scene, suite_name
+from torchrl_gn.training import fit_reward
+
+LEARNED = "learned"
+
+
+class SuiteActorCriticTask(ActorCriticTask):
+    """A task of the suite, whose policy is judged by what dm_control pays.
+
+    The policy and value are of ``action_repeat`` frames of the suite, the model and the reward too, or with
+    ``per_frame`` of one frame, as what a body does in contact is predicted the worse the longer the step. Trajectories
+    have ``reward`` ``[K, 50, 1]``, what was paid, if it is learned.
+
+    Args:
+        system: such as ``"suite:cheetah/run"``.
+        reward: ``"learned"`` from what was paid, or what :func:`~torchrl_gn.rewards.make_reward` takes: None for the
+            task's own, known exactly.
+
+    Raises:
+        ValueError: there is no such task, its reward is not known, or episodes are longer than its own.
+        ImportError: dm_control is missing.
+
+    Example:
+        >>> task = SuiteActorCriticTask("suite:cheetah/run", ActorCriticOptions(per_frame=True))
+        >>> task.scene.timestep, task.modelled.timestep, task.network_names
+        (0.02, 0.01, ('value', 'model', 'reward'))
+    """
+
+    def __init__(
+        self,
+        system: str,
+        options: ActorCriticOptions,
+        *,
+        reward: str | Sequence[Mapping[str, Any]] | None = LEARNED,
+    ) -> None:
+        if suite_name(system) is None:
+            raise ValueError(f"system={system!r} is no task of the suite: give 'suite:cheetah/run', say.")
+        frame = load_scene(system)
+        scene = load_scene(system, timestep=options.action_repeat * frame.timestep)
+        modelled, name = frame if options.per_frame else scene, scene.origin["suite"]
+        recenter, yaw = hidden_by_task(*name.split("/"))
+        hidden = Canonicalizer(recenter=recenter, yaw=yaw)
+        self.learns_reward = reward == LEARNED
+        if self.learns_reward:
+            self.network_names = (*self.network_names, "reward")
+            given = {"hidden": options.hidden, "canonicalizer": hidden, "target": has_target(name)}
+            paid = StateReward(modelled, **given)
+        else:
+            paid = make_reward(reward, modelled)
+        super().__init__(scene, options, paid, modelled=modelled, invariances=hidden)
+        lengths = {"steps": options.steps, "first.length": options.first.length}
+        for option, steps in {**lengths, "evaluate.steps": options.evaluate.steps}.items():
+            if steps is not None and steps > (longest := self._judged.steps):
+                raise ValueError(f"{option}={steps}: an episode of suite:{name} has {longest} control steps.")
+
+    @cached_property
+    def _played(self) -> SuiteTaskEnv:
+        return SuiteTaskEnv(self.scene, num_envs=self.options.episodes, frames=self.options.per_frame)
+
+    @cached_property
+    def _judged(self) -> SuiteTaskEnv:
+        return SuiteTaskEnv(self.scene, num_envs=self.options.evaluate.episodes)
+
+    def begin(self, policy: BoundedPolicy, networks: Mapping[str, nn.Module] | None = None) -> None:
+        if self.learns_reward:
+            if networks is not None and "reward" in networks:
+                self.reward = cast(StateReward, networks["reward"])
+            cast(StateReward, self.reward).to(self.device)
+        super().begin(policy, networks)
+
+    @property
+    def networks(self) -> dict[str, nn.Module]:
+        learned = {"reward": cast(StateReward, self.reward)} if self.learns_reward else {}
+        return {**super().networks, **learned}
+
+    def play_at_random(self) -> TensorDict:
+        first, found = self.options.first, []
+        env = SuiteTaskEnv(self.scene, frames=self.options.per_frame, seed=self.options.seed)
+        controls = spline_controls(self.scene, first.trajectories, first.length, self.options.seed)
+        for sequence in torch.from_numpy(controls).float():
+            found.append(play(env, _replay(sequence), episodes=1, steps=first.length, explore=False))
+        return self._windows(cast(TensorDict, torch.cat(found)))
+
+    def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
+        self._played.set_seed(seed)
+        sizes = {"episodes": self.options.episodes, "steps": self.options.steps}
+        return self._windows(play(self._played, policy.for_scene(self.scene), **sizes, explore=True))
+
+    def judged(self, policy: BoundedPolicy) -> TensorDict:
+        self._judged.set_seed(JUDGED_SEED)
+        evaluate = self.options.evaluate
+        sizes = {"episodes": evaluate.episodes, "steps": evaluate.steps or self._judged.steps}
+        played = play(self._judged, policy.for_scene(self.scene), **sizes, explore=False)
+        played["next", "reward"] = cast(Tensor, played["next", "reward"]) / self.options.action_repeat
+        return played
+
+    def _windows(self, played: TensorDict) -> TensorDict:
+        """Trajectories of the model's steps."""
+        played = unbroken(played)
+        if self.options.per_frame:
+            state, paid = (played["next", name].flatten(1, 2) for name in ("frames", "paid"))
+        else:
+            state, paid = played["next", "state"], played["next", "reward"]
+        state = torch.cat((played["state"][:, :1], state), 1)
+        action = played["action"].repeat_interleave(self.model_steps, 1)
+        target = played["target"][:, 0] if self.targeted else None
+        return windows(state, action, paid if self.learns_reward else None, target)
+
+    def learn_reward(self, data: TensorDict, index: int) -> None:
+        if self.learns_reward:
+            steps = self.options.reward_steps * (3 if index == 0 else 1)
+            fit_reward(cast(StateReward, self.reward), data, steps=steps, seed=self.options.seed + index)
+
+
+def _replay(actions: Tensor) -> Callable[[TensorDictBase], TensorDictBase]:
+    """A policy that gives ``actions`` ``[T, A]`` one after another."""
+    rest = iter(actions.unsqueeze(1))
+    return lambda tensordict: tensordict.set("action", next(rest))

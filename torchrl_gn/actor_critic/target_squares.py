@@ -1,0 +1,82 @@
+"""Targets of swimmers, in squares around the start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.data import sample_start_states
+from torchrl_gn.envs import observation_env
+from torchrl_gn.scenes import ObservationGraph, Scene
+
+
+class TargetSquares:
+    """Targets anywhere in a square around the start, one of several sizes. The target is the origin: the scene moves.
+
+    Args:
+        scene: with a root that slides along x and y, in physics that are the same everywhere: a swimmer, say.
+        half_sides: of the squares, metres, equally likely.
+
+    Raises:
+        ValueError: a half side is not positive, or the scene cannot move so.
+
+    Example:
+        >>> from torchrl_gn.scenes import load_scene
+        >>> squares = TargetSquares(load_scene("swimmer6"), [0.3, 2.0])
+        >>> squares.start_states(5, np.random.default_rng(0)).shape == (5, squares.scene.physics_size)
+        True
+    """
+
+    def __init__(self, scene: Scene, half_sides: Sequence[float]) -> None:
+        model, self.scene = scene.model, scene
+        self.half_sides = np.array([float(each) for each in half_sides])
+        self._sizes = torch.from_numpy(self.half_sides)  # where states are
+        if not (self.half_sides > 0).all():
+            raise ValueError(f"half_sides={list(half_sides)} must be positive half sides of squares, metres.")
+        slides = [
+            np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (np.abs(model.jnt_axis) == axis).all(1))
+            for axis in np.eye(3)[:2]
+        ]
+        if not (scene.translation_invariant[:2].all() and all(len(found) for found in slides)):
+            raise ValueError(f"Target squares need a scene that slides freely along x and y, not {scene.name!r}.")
+        self.where = [1 + model.jnt_qposadr[found[0]] for found in slides]  # in a MuJoCo state, after the time
+
+    def start_states(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Full MuJoCo states ``[n, S]``, for :class:`~torchrl_gn.envs.SceneEnv`."""
+        states = sample_start_states(self.scene, n, rng)
+        size = rng.choice(self.half_sides, (n, 1))
+        states[:, self.where] = rng.uniform(-size, size, (n, 2))
+        return states
+
+    def suite_states(self, n: int, seed: int) -> np.ndarray:
+        """Full MuJoCo states ``[n, S]`` of the suite's own starts and targets, as recipes/svg.py judges by.
+
+        ValueError if the scene is no swimmer of the suite.
+        """
+        scene, links = self.scene, self.scene.num_nodes - 1
+        if scene.name != f"swimmer{links}":
+            raise ValueError(f"The suite has starts and targets of swimmers alone, not of {scene.name!r}.")
+        env = observation_env(ObservationGraph.swimmer(links), "swimmer", scene.name, num_envs=n)
+        env.set_seed(seed)
+        env.reset()
+        states = np.zeros((n, scene.physics_size))
+        for state, each in zip(states, cast(Any, env).base_env._envs, strict=True):
+            physics = each._env.physics
+            state[1 : 1 + scene.model.nq] = physics.data.qpos
+            state[self.where] -= physics.named.model.geom_pos["target", ["x", "y"]]
+        return states
+
+    def move(self, state: Tensor) -> Tensor:
+        """States ``[B, N, 13]`` with the first body somewhere else in a square around the target."""
+        device, count = state.device, len(state)
+        self._sizes = self._sizes.to(device)
+        sizes = self._sizes[torch.randint(len(self._sizes), (count, 1, 1), device=device)]
+        place = sizes * (2 * torch.rand(count, 1, 2, dtype=torch.float64, device=device) - 1)
+        moved = state.clone()
+        moved[:, 1:, :2] += place.to(state) - state[:, 1:2, :2]
+        return moved

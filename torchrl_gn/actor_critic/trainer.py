@@ -1,0 +1,123 @@
+"""A short-horizon actor-critic: how a policy learns on its tasks, from one round to the next."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import nn
+
+from torchrl_gn.actor_critic.optimizer import ActorCriticOptimizer
+from torchrl_gn.actor_critic.options import ActorCriticOptions
+from torchrl_gn.actor_critic.task import ActorCriticTask
+from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy
+
+
+class ActorCritic:
+    """A policy that learns in models of its tasks (:class:`~torchrl_gn.objectives.SHACLoss`), round by round.
+
+    In a round :meth:`learn` trains every task's model, and its reward if that is learned, on all trajectories, and
+    then policy and values in them; the caller plays :meth:`playing`, with exploration, and adds what was played.
+    Weights and imagined noise are drawn by torch's global generator, ``torch.manual_seed``.
+
+    Args:
+        tasks: one; or several, with a policy of kind ``"graph"``, which learns on all at once.
+        policy: to go on with. Default: a new one, of ``options``.
+        networks: of every task, to go on with, as of :attr:`ActorCriticTask.networks`. Default: new ones.
+
+    Raises:
+        ValueError: the kind of policy does not suit the tasks, or networks do not fit together.
+
+    Example:
+        >>> from torchrl_gn.actor_critic import FirstTrajectories, SuiteActorCriticTask
+        >>> small = {"model": {"hidden": 8, "latent": 8}, "hidden": [8], "horizon": 3, "batch_size": 8, "steps": 50}
+        >>> small |= {"updates": 2, "model_steps": 2, "reward_steps": 2}
+        >>> first = FirstTrajectories(trajectories=2, length=50, steps=2)
+        >>> options = ActorCriticOptions(first=first, **small)
+        >>> task = SuiteActorCriticTask("suite:cheetah/run", options)
+        >>> learner = ActorCritic([task], options)
+        >>> task.collect()
+        >>> for index in range(2):
+        ...     losses = learner.learn(index)
+        ...     played = task.play(learner.playing(), seed=index)
+        ...     task.add(played)
+        >>> sorted(losses), len(task.data)
+        (['entropy', 'imagined_reward', 'loss_value'], 3)
+    """
+
+    policy: BoundedPolicy
+
+    def __init__(
+        self,
+        tasks: Sequence[ActorCriticTask],
+        options: ActorCriticOptions,
+        policy: BoundedPolicy | None = None,
+        networks: Sequence[Mapping[str, nn.Module]] | None = None,
+    ) -> None:
+        if not tasks:
+            raise ValueError("tasks= must have at least one.")
+        self.tasks, self.options = list(tasks), options
+        self.policy = self._new_policy() if policy is None else policy
+        self.policy.to(self.tasks[0].device)
+        for task, begun in zip(self.tasks, networks or [None] * len(self.tasks), strict=True):
+            task.begin(self.policy.for_scene(task.scene), begun)
+        rates = {"policy_lr": options.policy_lr, "value_lr": options.value_lr, "alpha_lr": options.alpha_lr}
+        self.optimizer = ActorCriticOptimizer([task.loss for task in self.tasks], **rates)
+
+    def _new_policy(self) -> BoundedPolicy:
+        first, options = self.tasks[0], self.options
+        if options.policy == "graph":
+            if any(task.targeted for task in self.tasks):
+                raise ValueError("policy=graph does not read the target that episodes of this task have: policy=mlp.")
+            return GraphStatePolicy(first.scene, canonicalizer=first.invariances, **options.graph)
+        if len(self.tasks) > 1:
+            raise ValueError(f"policy={options.policy} must be graph to learn on several systems.")
+        given = {"hidden": options.hidden, "canonicalizer": first.invariances, "target": first.targeted}
+        return StatePolicy(first.scene, **given)
+
+    def learn(self, index: int) -> dict[str, float]:
+        """Train the models, then policy and values in them: round ``index``, from 0.
+
+        Returns:
+            Means over tasks and the last quarter of the updates: ``imagined_reward`` of a step, ``loss_value`` in
+            variances of the value, and ``entropy`` of actions in units of half their range.
+
+        Raises:
+            RuntimeError: a task has no trajectories.
+            FloatingPointError: a loss or a gradient is not finite; that step changes nothing.
+        """
+        for task in self.tasks:
+            task.learn_model(index)
+        batches = [task.starts() for task in self.tasks]
+        sizes = {"updates": self.options.updates, "batch_size": self.options.batch_size // self.options.members}
+        return self.optimizer.learn(batches, **sizes, desc=f"policy, round {index}")
+
+    def playing(self) -> BoundedPolicy:
+        """A copy of the policy on the processor, where MuJoCo is."""
+        return copy.deepcopy(self.policy).cpu()
+
+    def averaged_rounds(self, index: int) -> range:
+        """Rounds before ``index`` whose policies are averaged with its own: a quarter of all, or ``average``."""
+        return range(index + 1 - min(self.options.average, 1 + index // 4), index)
+
+    def averaged(self, before: Sequence[BoundedPolicy]) -> BoundedPolicy:
+        """:meth:`playing` with mean weights of it and of earlier rounds' policies: steadier than one.
+
+        Args:
+            before: on the processor, of the rounds :meth:`averaged_rounds`, say.
+        """
+        policy = self.playing()
+        with torch.no_grad():
+            for mean, *weights in zip(policy.parameters(), *(each.parameters() for each in before), strict=True):
+                mean.copy_(torch.stack([mean, *weights]).mean(0))
+        return policy
+
+    def state_dict(self) -> dict[str, Any]:
+        """State to resume from, without the networks."""
+        return self.optimizer.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume from what :meth:`state_dict` returned; ValueError if it is of other networks, or forged."""
+        self.optimizer.load_state_dict(state)
