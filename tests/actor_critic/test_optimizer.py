@@ -111,3 +111,20 @@ def test_its_optimiser_goes_on_anywhere(learners):
     learners[1].optimizer.load_state_dict(learners[0].optimizer.state_dict())
     assert not any(group["capturable"] for group in learners[1].optimizer.optimizer.param_groups)
     update(learners[1], 3)
+
+
+def test_values_learn_on_while_the_policy_waits(small):
+    scene, found = gn.load_scene("pendulum"), {}
+    for steps in (0, 20):
+        torch.manual_seed(0)
+        options = small(value_steps=steps, value_lr=1e-2)
+        task = ActorCriticTask(scene, options, gn.make_reward("balance", scene))
+        learner = ActorCritic([task], options)
+        task.collect()
+        task.learn_model(0)
+        update(learner, 0)
+        torch.manual_seed(1)
+        loss = task.loss(task.starts()(64))["loss_value"]
+        found[steps] = [each.detach().clone() for each in learner.policy.parameters()], float(loss.detach())
+    torch.testing.assert_close(found[0][0], found[20][0], rtol=0, atol=0)
+    assert found[20][1] < 0.7 * found[0][1]

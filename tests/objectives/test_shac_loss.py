@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
@@ -74,6 +75,45 @@ def test_the_gradient_is_the_plain_models(model, scenes, starts):
     assert all(bool((gradient != 0).any()) for gradient in found[0])
     for native, plain in zip(*found, strict=True):
         torch.testing.assert_close(native, plain, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
+def test_every_action_maximises_the_return_of_its_own_step(model, scenes, starts, monkeypatch, share):
+    monkeypatch.setattr(torch, "randn_like", torch.zeros_like)  # actions without noise
+    loss = make_loss(model, scenes["pendulum"], starts, native=False, steps=4, policy_lmbda=share, outlier=math.inf)
+    loss.log_alpha.data.fill_(-30)
+    found = gradient_of(loss, starts)
+    policy, value, reward = loss.policy, loss.value, loss.env.reward
+    later = copy.deepcopy(policy).requires_grad_(False)
+    step, state, total = model.bind(scenes["pendulum"]), starts, torch.zeros(())
+    for k in range(4):
+        states, rewards = [state.detach()], []
+        for index in range(k, 4):
+            action = (policy if index == k else later).act(states[-1])
+            states.append(step(states[-1], action))
+            rewards.append(reward(states[-2], action, states[-1], None))
+        returns = value(states[-1])
+        for paid, reached in zip(reversed(rewards), reversed(states[1:]), strict=True):
+            returns = paid + 0.9 * ((1 - share) * value(reached) + share * returns)
+        total = total - (returns / value.normalizer.std).mean()
+        state = states[1]
+    weights = list(policy.network.parameters())
+    wanted = torch.cat([each.flatten() for each in torch.autograd.grad(total, weights)])
+    torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-6)
+
+
+def test_the_value_learns_on_from_what_was_imagined(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts, steps=4)
+    out = loss(TensorDict({"state": starts}, [32]))
+    imagined = out["imagined"].flatten()
+    assert imagined.shape == (128,) and not any(each.requires_grad for each in imagined.values())
+    torch.testing.assert_close(loss.value_loss(imagined), out["loss_value"])
+    adam = torch.optim.Adam(loss.value.parameters(), lr=1e-2)
+    for _ in range(20):
+        adam.zero_grad()
+        loss.value_loss(imagined[torch.randint(128, (64,))]).backward()
+        adam.step()
+    assert loss.value_loss(imagined) < 0.5 * out["loss_value"]
 
 
 def test_each_loss_reaches_its_own_weights(model, scenes, starts):
@@ -173,11 +213,15 @@ def test_a_policy_learns_to_swing(model, scenes, starts):
     loss = make_loss(model, scenes["pendulum"], starts, steps=16)
     adam = torch.optim.Adam(loss.parameters(), lr=1e-2)
     rewards = []
-    for _ in range(60):
+    for _ in range(100):
         out = loss(TensorDict({"state": starts}, [32]))
         adam.zero_grad()
         (out["loss_actor"] + out["loss_value"] + out["loss_alpha"]).backward()
         adam.step()
+        for _ in range(8):  # else the value does not keep up with the policy
+            adam.zero_grad()
+            loss.value_loss(out["imagined"]).backward()
+            adam.step()
         rewards.append(float(out["reward"]))
     assert sum(rewards[-5:]) / 5 > sum(rewards[:5]) / 5 + 0.02
 
@@ -203,6 +247,8 @@ def test_refuses_what_does_not_fit(model, scenes, starts):
         SHACLoss(loss.policy, loss.value, loss.env, steps=0)
     with pytest.raises(ValueError, match=r"lmbda=2\.0 must be"):
         SHACLoss(loss.policy, loss.value, loss.env, lmbda=2.0)
+    with pytest.raises(ValueError, match=r"policy_lmbda=-0\.1 must be"):
+        SHACLoss(loss.policy, loss.value, loss.env, policy_lmbda=-0.1)
     with pytest.raises(ValueError, match="leave its terminal= out"):
         SHACLoss(loss.policy, loss.value, ModelEnv(loss.env.world_model, loss.env.reward, terminal=loss.value))
     with pytest.raises(ValueError, match="StatePolicy is of scene 'cartpole'"):

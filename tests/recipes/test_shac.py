@@ -148,7 +148,7 @@ def test_a_policy_reads_the_target_of_an_episode(reward, tmp_path, call):
     code, _, errors = call(*SUITE, *options, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0 and "warning" not in errors.lower(), errors
     played = load_file(tmp_path / "rounds/001/played.safetensors")
-    assert played["target"].shape == (2, 3) and not torch.equal(played["target"][0], played["target"][1])
+    assert played["target"].shape == (2 * 2, 3) and not torch.equal(played["target"][0], played["target"][1])
     policy, state = load_pretrained(tmp_path / "policy.safetensors").policy, played["state"][:, 0]
     assert policy.in_keys == ["state", "target"]
     actions = [policy.act(state, target) for target in (played["target"], played["target"].flip(0))]

@@ -26,15 +26,19 @@ _KEPT = {"reward": "imagined_reward", "loss_value": "loss_value", "entropy": "en
 class ActorCriticOptimizer:
     """Updates policy, values and entropies' weights by Adam, each kind with its own rate and clipped gradients.
 
-    On an NVIDIA GPU the third update is recorded as a CUDA graph, which all after it replay.
+    The policy climbs the values, which must keep up with it: they take further steps on what was imagined. On an NVIDIA
+    GPU the third update is recorded as a CUDA graph, which all after it replay.
 
     Args:
         losses: of every task, whose policies share their weights.
         policy_lr, value_lr, alpha_lr: learning rates of the policy, of the values, and of the entropies' weights.
+        value_steps: of the values in every update, after the one together with the policy, each on a random half.
     """
 
-    def __init__(self, losses: Sequence[SHACLoss], *, policy_lr: float, value_lr: float, alpha_lr: float) -> None:
-        self.losses = list(losses)
+    def __init__(
+        self, losses: Sequence[SHACLoss], *, policy_lr: float, value_lr: float, alpha_lr: float, value_steps: int
+    ) -> None:
+        self.losses, self.value_steps = list(losses), value_steps
         self.policy = list(self.losses[0].policy.parameters())
         self.values = [list(loss.value.parameters()) for loss in self.losses]
         self.alphas = [loss.log_alpha for loss in self.losses]
@@ -55,7 +59,7 @@ class ActorCriticOptimizer:
 
         They have ``state`` ``[batch_size, N, 13]`` and, where episodes have one, ``target`` ``[batch_size, 3]``. The
         means are ``imagined_reward`` (of a step), ``loss_value`` and ``entropy``. FloatingPointError if a gradient is
-        not finite; that update changes nothing.
+        not finite; that step changes nothing.
         """
         kept: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
@@ -73,26 +77,39 @@ class ActorCriticOptimizer:
             self._record([draw() for draw in draws])
         if self._graph is None:
             self._by_torch -= 1
-            self.optimizer.zero_grad()
-            found = [self._backward(loss, draw()) for loss, draw in zip(self.losses, draws, strict=True)]
-            for group in self.clipped:
-                clip_gradients(group, _MAX_NORM, when)
-            self.optimizer.step()
-            return found
+            return self._steps([draw() for draw in draws], lambda group: clip_gradients(group, _MAX_NORM, when))
         for static, draw in zip(self._states, draws, strict=True):
             static.copy_(draw())
         numbers = self._graph()
-        norms, rest = numbers[: len(self.clipped)], iter(torch.tensor(numbers[len(self.clipped) :]))
+        count = len(self.losses) * len(_KEPT)
+        rest, norms = iter(torch.tensor(numbers[:count])), numbers[count:]
         if not all(map(math.isfinite, norms)):
             self._graph.undo()
             raise FloatingPointError(f"The gradient is not finite at {when}; lower the learning rate.")
         return [{name: next(rest) for name in _KEPT} for _ in self.losses]
 
-    def _backward(self, loss: SHACLoss, starts: TensorDict) -> dict[str, Tensor]:
-        """Add the gradient of a loss from states ``[B]``."""
-        out = loss(starts)
-        (out["loss_actor"] / len(self.losses) + out["loss_value"] + out["loss_alpha"]).backward()
-        return {name: out[name].detach() for name in _KEPT}
+    def _steps(
+        self, states: Sequence[TensorDict], clip: Callable[[Sequence[Tensor]], object]
+    ) -> list[dict[str, Tensor]]:
+        """Update from states ``[B]`` of every loss, with gradients that ``clip`` clips; numbers of each."""
+        self.optimizer.zero_grad()
+        found = [loss(each) for loss, each in zip(self.losses, states, strict=True)]
+        for out in found:
+            (out["loss_actor"] / len(self.losses) + out["loss_value"] + out["loss_alpha"]).backward()
+        self._step(self.clipped, clip)
+        imagined = [out["imagined"].flatten() for out in found]
+        for _ in range(self.value_steps):
+            self.optimizer.zero_grad()  # the policy, without a gradient, stays
+            for loss, steps in zip(self.losses, imagined, strict=True):
+                rows = torch.randint(len(steps), (-(-len(steps) // 2),), device=loss.log_alpha.device)
+                loss.value_loss(steps[rows]).backward()
+            self._step(self.values, clip)
+        return [{name: out[name].detach() for name in _KEPT} for out in found]
+
+    def _step(self, groups: Sequence[Sequence[Tensor]], clip: Callable[[Sequence[Tensor]], object]) -> None:
+        for group in groups:
+            clip(group)
+        self.optimizer.step()
 
     def _record(self, states: list[TensorDict]) -> None:
         """Record the update of as many states."""
@@ -100,9 +117,8 @@ class ActorCriticOptimizer:
         gc.collect()  # what earlier updates left of their gradients belongs to another stream
         self._set_capturable(True)
         self.optimizer.zero_grad()
-        self._graph = UpdateGraph.or_none(
-            self._on_device, [each for of in self.clipped for each in of], [self.optimizer]
-        )
+        parameters = [each for of in self.clipped for each in of]
+        self._graph = UpdateGraph.or_none(self._on_device, parameters, [self.optimizer])
         if self._graph is None:
             self._by_torch = math.inf
             self._set_capturable(False)
@@ -112,11 +128,10 @@ class ActorCriticOptimizer:
             group["capturable"] = value
 
     def _on_device(self) -> Tensor:
-        """The update without waiting for the device: norms of the gradients that are clipped, and numbers of losses."""
-        found = [self._backward(loss, state) for loss, state in zip(self.losses, self._states, strict=True)]
-        norms = [clip_on_device(group, _MAX_NORM) for group in self.clipped]
-        self.optimizer.step()
-        return torch.stack([*norms, *(value.double() for of in found for value in of.values())])
+        """The update without waiting for the device: numbers of the losses, and norms of the gradients it clips."""
+        norms: list[Tensor] = []
+        found = self._steps(self._states, lambda group: norms.append(clip_on_device(group, _MAX_NORM)))
+        return torch.stack([*(value.double() for of in found for value in of.values()), *norms])
 
     def state_dict(self) -> dict[str, Any]:
         """State to resume from, without the networks."""

@@ -18,8 +18,8 @@ PolicyKind = Literal["mlp", "graph"]
 class FirstTrajectories:
     """Trajectories of random control, before the first round. ValueError if an option is out of range."""
 
-    trajectories: int = 5  # number of them
-    length: int = 500  # control steps of each, at least 50
+    trajectories: int = 25  # number of them
+    length: int = 100  # control steps of each, at least 50
     steps: int = 1000  # training steps of the model on them
 
     def __post_init__(self) -> None:
@@ -58,17 +58,19 @@ class ActorCriticOptions:
     """
 
     first: FirstTrajectories = field(default_factory=FirstTrajectories)  # random control before the first round
-    episodes: int = 2  # episodes of a task that a round plays, with exploration
-    steps: int = 500  # control steps of each, a multiple of 50
+    episodes: int = 5  # episodes of a task that a round plays, with exploration
+    steps: int = 200  # control steps of each, a multiple of 50
     evaluate: JudgedEpisodes = field(default_factory=JudgedEpisodes)  # episodes that the policy is judged by
     action_repeat: int = 2  # frames of a control step, in tasks of the suite
-    per_frame: bool = False  # whether the model of a task of the suite is of one frame, or else of a control step
+    per_frame: bool = True  # whether the model of a task of the suite is of one frame, or else of a control step
 
-    horizon: int = 16  # control steps that the policy's gradient goes through the model
-    outlier: float = math.inf  # gradients of a trajectory are shortened to so many times the batch's median
+    horizon: int = 8  # control steps that are imagined
+    policy_lmbda: float = 0.6  # lambda of the policy's returns: 1 goes through the model to the last step
+    outlier: float = 3.0  # gradients of a trajectory are shortened to so many times the batch's median
     discount: float = 0.99  # discount of a control step
     lmbda: float = 0.95  # lambda of the value's TD(lambda) targets
     updates: int = 100  # updates of policy and value in a round
+    value_steps: int = 6  # further steps of the value in an update
     batch_size: int = 128  # imagined trajectories of an update, half from the states of the last round
     pessimism: float = 0.0  # standard deviations of the members' returns that the policy's return is less by
     policy_lr: float = 1e-3  # learning rate of the policy
@@ -97,7 +99,8 @@ class ActorCriticOptions:
         counts = ("episodes", "steps", "action_repeat", "horizon", "updates", "average", "members")
         for name in (*counts, "model_steps", "reward_steps"):
             check_count(name, getattr(self, name), 1)
-        check_count("seed", self.seed, 0)
+        for name in ("seed", "value_steps"):
+            check_count(name, getattr(self, name), 0)
         check_count("batch_size", self.batch_size, self.members)
         if self.steps % WINDOW:
             raise ValueError(f"steps={self.steps} must be a multiple of {WINDOW}.")
@@ -106,8 +109,9 @@ class ActorCriticOptions:
                 raise ValueError(f"{name}={getattr(self, name)} must be positive and finite.")
         if not 0 < self.discount <= 1:
             raise ValueError(f"discount={self.discount} must be above 0 and at most 1.")
-        if not 0 <= self.lmbda <= 1:
-            raise ValueError(f"lmbda={self.lmbda} must be from 0 to 1.")
+        for name in ("lmbda", "policy_lmbda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}={getattr(self, name)} must be from 0 to 1.")
         if not self.outlier > 0:
             raise ValueError(f"outlier={self.outlier} must be above 0.")
         if not math.isfinite(self.pessimism):

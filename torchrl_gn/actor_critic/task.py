@@ -125,7 +125,7 @@ class ActorCriticTask:
         self.model = self.trained.bind(self.modelled)
         imagined = ModelEnv(self.model, self.reward)  # until the model has learned: learn_model() takes a snapshot
         given = {"steps": options.horizon, "lmbda": options.lmbda, "pessimism": options.pessimism}
-        given |= {"action_repeat": self.model_steps, "outlier": options.outlier}
+        given |= {"action_repeat": self.model_steps, "policy_lmbda": options.policy_lmbda, "outlier": options.outlier}
         self.loss = SHACLoss(policy, self.value, imagined, **given).to(self.device)
 
     def _new_model(self) -> ForwardModel | Ensemble:

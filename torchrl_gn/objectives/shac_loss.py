@@ -29,24 +29,27 @@ from torchrl_gn.planners.plan import check_pessimism
 class SHACLoss(LossModule):
     r"""Losses of a short-horizon actor-critic (SHAC, Xu et al. 2022) through a learned model.
 
-    From states of played episodes the policy acts for ``H`` steps in the model. It maximises
+    From states of played episodes the policy acts for ``H`` steps in the model, :math:`a_k \sim \pi(\cdot | s_k)`,
+    :math:`s_{k+1} = g(s_k, a_k)`. Each action maximises the return from its own step on,
 
     .. math::
-        \mathbb{E}\Big[\sum_{k=0}^{H-1} \gamma^k r_k + \gamma^H V(s_H)\Big] + \alpha \mathcal{H}(\pi),
-        \quad a_k \sim \pi(\cdot | s_k), \quad s_{k+1} = g(s_k, a_k)
+        G_k = r_k + \gamma \big((1 - \lambda_\pi) V(s_{k+1}) + \lambda_\pi G_{k+1}\big), \quad G_H = V(s_H),
 
-    with reparameterised actions, differentiated through model, reward and value: the paper's SVG(:math:`H`), on states
-    and with V instead of Q. The value regresses on TD(:math:`\lambda`) targets of the same imagined steps. The weight
+    and the entropy :math:`\alpha \mathcal{H}(\pi)`, with reparameterised actions, differentiated through model, reward
+    and value: the paper's SVG(:math:`H`), on states and with V instead of Q. With :math:`\lambda_\pi = 1`, as in SHAC,
+    the gradient goes through all steps; behind contacts it is mostly noise, and the value, which is smooth, is the
+    better guide beyond the next few. The value regresses on TD(:math:`\lambda`) targets of the same steps. The weight
     :math:`\alpha` is learned, so that the entropy of actions, in units of half their range, stays at
-    ``target_entropy`` (as in SAC). Where the model diverges the episode ends, at what it costs a
-    learner (:class:`~torchrl_gn.envs.SceneEnv`). Steps after the end of an episode do not count.
+    ``target_entropy`` (as in SAC). Where the model diverges the episode ends, at what it costs a learner
+    (:class:`~torchrl_gn.envs.SceneEnv`). Steps after the end of an episode do not count.
 
     In an ensemble every state is imagined from by every one of its ``K`` members, with the same noise of the actions:
     ``K B`` trajectories. The policy maximises the mean of their returns less ``pessimism`` standard deviations.
 
     Reads ``state`` ``[B, N, 13]`` and, for a policy and value with a target, ``target`` ``[B, 3]``. Writes
-    ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to weights of its own; and ``reward``, the
-    mean of imagined steps, and ``entropy``.
+    ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to weights of its own; ``reward``, the mean
+    of imagined steps, and ``entropy``; and ``imagined`` ``[K B, H]``, for further steps of the value by
+    :meth:`value_loss`.
 
     Args:
         policy: its network and standard deviations are learned.
@@ -56,9 +59,10 @@ class SHACLoss(LossModule):
         action_repeat: steps of the model under each action, which pay the sum of their rewards: the control step of
             policy and value is so many of the model's.
         lmbda: :math:`\lambda` of the value's targets.
+        policy_lmbda: :math:`\lambda_\pi` of the policy's returns.
         outlier: gradients in states and actions of one trajectory that are longer than so many times the batch's median
             are shortened to it at every control step. In contacts they grow from step to step, in some trajectories a
-            thousandfold, and a batch's gradient is theirs alone; but what is shortened is biased. Default: none are.
+            thousandfold, and a batch's gradient is theirs alone; but what is shortened is biased. ``inf``: none are.
         target_entropy: default: minus one for every component of an action.
         pessimism: needs an ensemble; negative: explore what its members disagree on.
 
@@ -75,10 +79,11 @@ class SHACLoss(LossModule):
         value: StateValue,
         env: ModelEnv,
         *,
-        steps: int = 16,
+        steps: int = 8,
         action_repeat: int = 1,
         lmbda: float = 0.95,
-        outlier: float = math.inf,
+        policy_lmbda: float = 0.6,
+        outlier: float = 3.0,
         target_entropy: float | None = None,
         pessimism: float = 0.0,
     ) -> None:
@@ -88,8 +93,9 @@ class SHACLoss(LossModule):
                 raise ValueError(f"{name}={count} must be a whole number of at least 1.")
         if not outlier > 0:
             raise ValueError(f"outlier={outlier} must be above 0.")
-        if not 0 <= lmbda <= 1:
-            raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
+        for name, share in (("lmbda", lmbda), ("policy_lmbda", policy_lmbda)):
+            if not 0 <= share <= 1:
+                raise ValueError(f"{name}={share} must be from 0 to 1.")
         if env.terminal is not None:
             raise ValueError(f"{env} adds a value to its rewards: leave its terminal= out, this loss has value=.")
         for network in (policy, value):
@@ -111,7 +117,7 @@ class SHACLoss(LossModule):
             )
         self.targeted = policy.targeted
         self.policy, self.value, self.steps, self._fitted = policy, value, int(steps), False
-        self.action_repeat, self.outlier = int(action_repeat), float(outlier)
+        self.action_repeat, self.policy_lmbda, self.outlier = int(action_repeat), float(policy_lmbda), float(outlier)
         self.pessimism, self.members = pessimism, env.members
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
@@ -130,27 +136,52 @@ class SHACLoss(LossModule):
             self._fitted = True  # asking waits for a device
         target = targets[0].repeat(self.members, 1) if targets else None
         imagined, entropies = self._imagine(state, target)
-        final = imagined["next", "state"][:, -1]
+        reward, alive = imagined["next", "reward"], alive_of(imagined["next", "terminated"])
+        states = torch.cat((imagined["state"], imagined["next", "state"][:, -1:]), 1)
+        place = None if target is None else target.unsqueeze(1).expand(*states.shape[:2], 3)
+        features = self.value.features(states, next(self.value.members.parameters()).dtype, place)
         with frozen(self.value):
-            last = self.value(final, target)
-        reward, ended = imagined["next", "reward"], imagined["next", "terminated"]
-        alive = alive_of(ended).to(reward.dtype)
+            values = self.value.of_features(features[:, 1:]).to(reward.dtype)
+        alive = alive.to(reward.dtype)
         counted = alive[:, :-1] / alive[:, :-1].mean()
         entropy = (counted.squeeze(-1) * entropies).mean()
-        discount = self.value.discount ** torch.arange(self.steps + 1, dtype=reward.dtype, device=reward.device)
-        weight = alive * discount.unsqueeze(-1)
-        total = (weight[:, :-1] * reward).sum(1) + weight[:, -1] * last.to(reward.dtype)
-        total = lower_bound(total.unflatten(0, (self.members, -1)), self.pessimism)
+        returns = self._returns(reward, values, alive)
+        returns = lower_bound(returns.unflatten(0, (self.members, -1)), self.pessimism)
         alpha, scale = self.log_alpha.exp(), self.value.normalizer.std.to(reward.dtype)
+        learned = self._value_batch(imagined, features.detach(), alive[:, :-1])
         return TensorDict(
             {
-                "loss_actor": -(total / scale).mean() - alpha.detach() * entropy,
-                "loss_value": self._value_loss(imagined, alive[:, :-1], target),
+                "loss_actor": -(returns / scale).mean() - alpha.detach() * entropy,
+                "loss_value": self.value_loss(learned),
                 "loss_alpha": alpha * (entropy.detach() - self.target_entropy),
                 "reward": (counted * reward.detach()).mean(),
                 "entropy": entropy.detach(),
+                "imagined": learned,
             }
         )
+
+    def value_loss(self, imagined: TensorDictBase) -> Tensor:
+        """Squared error of the value on its targets, in variances of its normaliser.
+
+        Args:
+            imagined: ``[*B]`` of the steps that the loss wrote: ``features`` ``[*B, F]``, ``target`` ``[*B, 1]`` and
+                ``weight`` ``[*B, 1]``.
+        """
+        error = self.value.normalized(cast(Tensor, imagined["features"])) - imagined["target"]
+        return (imagined["weight"] * error.square()).mean()
+
+    def _returns(self, reward: Tensor, values: Tensor, alive: Tensor) -> Tensor:
+        """Discounted returns ``[K B, 1]`` from the first step, whose gradient is that of every action's own return.
+
+        What a later return owes to earlier actions is taken off where the policy reads the state (:meth:`_imagine`).
+        """
+        discount, share = self.value.discount, self.policy_lmbda
+        later = discount * alive[:, 1:] * values
+        own = alive[:, :-1] * reward + (1 - share) * later
+        learned = own.sum(1) + share * later[:, -1]
+        weight = discount ** torch.arange(self.steps, dtype=reward.dtype, device=reward.device).unsqueeze(-1)
+        total = (weight * alive[:, :-1] * reward).sum(1) + weight[-1] * later[:, -1]
+        return total.detach() + learned - learned.detach()
 
     @without_autocast
     def fit_normalizers(self, state: Tensor, reward: Tensor | None = None, target: Tensor | None = None) -> None:
@@ -170,7 +201,8 @@ class SHACLoss(LossModule):
         state = state.repeat(self.members, 1, 1)
         # Not reset(), which asks whether an episode has ended: it would wait for a device.
         start = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
-        env, now, steps, entropies = self.env.of_states(), start.copy(), [], []
+        env, now = self.env.of_states(), start.copy()
+        states, actions, ended, entropies = [], [], [], []
         if target is not None:
             start["task"] = cast(Any, self.env.reward).task_of(state, target)
         with ExitStack() as stack:
@@ -180,24 +212,29 @@ class SHACLoss(LossModule):
             stack.enter_context(self.policy.prepared())
             stack.enter_context(set_exploration_type(ExplorationType.RANDOM))
             for _ in range(self.steps):
-                action, log_prob = self.policy.sample(state := cast(Tensor, now["state"]), self.members, target)
+                states.append(reached := cast(Tensor, now["state"]))
+                # All that follows reaches earlier actions through this; what they are paid and valued by does not.
+                state = _Scaled.apply(reached, self.policy_lmbda * self.value.discount)
+                now = now.set("state", state)
+                action, log_prob = self.policy.sample(cast(Tensor, state), self.members, target)
                 for each in (state, action):
                     if each.requires_grad:  # neither under no_grad, nor of a frozen policy
                         each.register_hook(self._calmed)
                 entropies.append(-log_prob)
-                for _ in range(self.action_repeat):
+                for frame in range(self.action_repeat):
+                    states += [now["state"]] if frame else []
                     now = env.step(now.set("action", action))
-                    steps.append(now.select("state", "action", ("next", "terminated")))
+                    actions.append(action)
+                    ended.append(now["next", "terminated"].squeeze(-1))
                     now = step_mdp(now, exclude_done=True)
-            played = cast(TensorDict, torch.stack(steps, 1))
-            states = torch.cat((played["state"], cast(Tensor, now["state"]).unsqueeze(1)), 1)
+            states.append(now["state"])
+            states, actions = torch.stack(states, 1), torch.stack(actions, 1)
             # The rewards of all steps at once: as many small operations as for one.
-            trusted = ~played["next", "terminated"].squeeze(-1)
-            imagined = imagined_steps(self.env, start, states, played["action"], trusted)
+            imagined = imagined_steps(self.env, start, states, actions, ~torch.stack(ended, 1))
         each, rewards = self.action_repeat, imagined.rewards.unflatten(1, (self.steps, -1)).sum(2)
         after = {"state": states[:, each::each], "reward": rewards, "terminated": ~imagined.alive[:, each::each]}
-        played = cast(TensorDict, played[:, ::each]).exclude("next")
-        return played.set("next", TensorDict(after, played.shape)), torch.stack(entropies, 1)
+        entries = {"state": states[:, :-1:each], "action": actions[:, ::each], "next": after}
+        return TensorDict(entries, [len(states), self.steps]), torch.stack(entropies, 1)
 
     def _calmed(self, gradient: Tensor) -> Tensor:
         """The gradient ``[B, ...]`` without what overflowed, and with outliers shortened, sample by sample."""
@@ -211,26 +248,31 @@ class SHACLoss(LossModule):
         factor = (bound / torch.where(lengths > 0, lengths, 1.0)).clamp(max=1.0)
         return gradient * factor.view(-1, *[1] * (gradient.ndim - 1))
 
-    def _value_loss(self, imagined: TensorDict, alive: Tensor, target: Tensor | None) -> Tensor:
-        """Squared error of the value on its targets, in variances of its normaliser."""
-        dtype = next(self.value.members.parameters()).dtype
-        with torch.no_grad():
-            states = torch.cat((imagined["state"], imagined["next", "state"][:, -1:]), 1)
-            place = None if target is None else target.unsqueeze(1).expand(*states.shape[:2], 3)
-            features = self.value.features(states, dtype, place)
-            here, there = features[:, :-1], features[:, 1:]
-            done = imagined["next", "terminated"].clone()
-            done[:, -1] = True  # imagination ends
-            after = {
-                "features": there,
-                "reward": imagined["next", "reward"].to(dtype),
-                "terminated": imagined["next", "terminated"],
-                "done": done,
-            }
-            batch = TensorDict({"features": here, "next": after}, imagined.shape)
-            self._estimator.vectorized = here.is_cpu  # which looks for ends: it would wait for a device
-            targets = self.value.normalizer(cast(Tensor, self._estimator.value_estimate(batch)))
-        return (alive * (self.value.normalized(here) - targets).square()).mean()
+    @torch.no_grad()
+    def _value_batch(self, imagined: TensorDict, features: Tensor, alive: Tensor) -> TensorDict:
+        """What :meth:`value_loss` reads, of features ``[K B, H + 1, F]`` of the imagined steps' states."""
+        reward, terminated = imagined["next", "reward"].to(features.dtype), imagined["next", "terminated"]
+        done = terminated.clone()
+        done[:, -1] = True  # imagination ends
+        after = {"features": features[:, 1:], "reward": reward, "terminated": terminated, "done": done}
+        batch = TensorDict({"features": features[:, :-1], "next": after}, imagined.shape)
+        self._estimator.vectorized = features.is_cpu  # which looks for ends: it would wait for a device
+        targets = self.value.normalizer(cast(Tensor, self._estimator.value_estimate(batch)))
+        entries = {"features": features[:, :-1], "target": targets, "weight": alive}
+        return TensorDict(entries, imagined.shape)
+
+
+class _Scaled(torch.autograd.Function):
+    """A tensor as it is, whose gradient is scaled."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, scale: float) -> Tensor:
+        ctx.scale = scale
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None]:
+        return ctx.scale * gradients[0], None
 
 
 def _finite_rows(gradient: Tensor) -> Tensor:
