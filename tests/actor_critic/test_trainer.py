@@ -79,9 +79,9 @@ def test_averages_weights(small):
     mean = (weights(learner.policy) + weights(earlier[0]) + weights(earlier[1])) / 3
     torch.testing.assert_close(weights(learner.averaged(earlier)), mean)
     assert torch.equal(weights(learner.averaged([])), weights(learner.policy))
-    # A quarter of the rounds so far, at most three, the last of which is the learner's own.
-    assert [[*learner.averaged_rounds(index)] for index in (0, 3, 4, 7, 8, 100)] == [
-        [], [], [3], [6], [6, 7], [98, 99],
+    # An eighth of the rounds so far, at most three, the last of which is the learner's own.
+    assert [[*learner.averaged_rounds(index)] for index in (0, 7, 8, 15, 16, 100)] == [
+        [], [], [7], [14], [14, 15], [98, 99],
     ]  # fmt: skip
 
 

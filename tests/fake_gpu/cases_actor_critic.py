@@ -105,7 +105,7 @@ def test_what_is_recorded_never_waits(gpu, monkeypatch, system, others):
             with without_waits():
                 found = optimizer._on_device()
             monkeypatch.undo()
-            numbers.append(found[len(optimizer.clipped) :].tolist())
+            numbers.append(found[:3].tolist())
         else:
             numbers.append(
                 [float(each) for each in optimizer._update([partial(torch.clone, states)], "now")[0].values()]

@@ -76,7 +76,7 @@ class ActorCriticOptions:
     policy_lr: float = 1e-3  # learning rate of the policy
     value_lr: float = 1e-3  # learning rate of the value
     alpha_lr: float = 5e-3  # learning rate of the entropy's weight
-    average: int = 10  # rounds whose policies are averaged to be judged, a quarter of all at most
+    average: int = 10  # rounds whose policies are averaged to be judged, an eighth of all at most
 
     policy: PolicyKind = "mlp"  # "mlp", or "graph": a graph network, for several scenes
     hidden: Sequence[int] = (128, 128)  # hidden sizes of value, learned reward and a policy of kind "mlp"

@@ -100,8 +100,8 @@ class ActorCritic:
         return copy.deepcopy(self.policy).cpu()
 
     def averaged_rounds(self, index: int) -> range:
-        """Rounds before ``index`` whose policies are averaged with its own: a quarter of all, or ``average``."""
-        return range(index + 1 - min(self.options.average, 1 + index // 4), index)
+        """Rounds before ``index`` whose policies are averaged with its own: an eighth of all, or ``average``."""
+        return range(index + 1 - min(self.options.average, 1 + index // 8), index)
 
     def averaged(self, before: Sequence[BoundedPolicy]) -> BoundedPolicy:
         """:meth:`playing` with mean weights of it and of earlier rounds' policies: steadier than one.
