@@ -8,7 +8,8 @@ Every claim has a JSON file: what is claimed, the verdict, tables, commands, see
 is a string; a number of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, or the
 sum of a list of them, that may be multiplied ("times": 1000) and divided ("over": another metric); or a list of cells,
 shown with slashes between. Text quotes numbers that the claim's "values" name, as {NAME}. "figure" draws numbers of a
-table (recipes/_common/report_figures.py) into docs/images/results. README's table is "headlines" of index.json.
+table (recipes/_common/report_figures.py) into docs/images/results. Learning curves of tasks, beside those of peers,
+are of runs added as=TASK-SEED (recipes/_common/report_curves.py). README's table is "headlines" of index.json.
 `check=true` writes nothing and fails if a page or figure differs from what its data give.
 
 `add=` puts the metrics of a finished run, with its command, date, processor and versions, beside the claim `to` as

@@ -28,7 +28,7 @@ def read_claims(folder: Path) -> dict[str, dict[str, Any]]:
         ValueError: if the index and the files of ``folder`` name different claims.
     """
     order = read(folder, INDEX)["order"]
-    there = {file.stem for file in folder.glob("*.json") if not file.name.endswith(f".{METRICS_FILE}")}
+    there = {file.stem for file in folder.glob("*.json") if "." not in file.stem}  # others are a claim's runs and peers
     if set(order) != there - {INDEX, DROPPED} or len(order) != len(set(order)):
         raise ValueError(f"{INDEX}.json and {folder} differ: {sorted(set(order) ^ (there - {INDEX, DROPPED}))}.")
     return {name: read(folder, name) for name in order}

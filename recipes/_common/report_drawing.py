@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from _common.report_curve_drawing import curves_canvas, curves_palette
 from _common.report_figures import DIGEST, Points, ReportFigure, numbers
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.drawing.canvas import INK, MUTED, TRUTH, clean, new_figure, series_color
@@ -28,6 +29,8 @@ _Bar = tuple[float, float, float]  # its place, its number and where what is dra
 
 def draw_figure(figure: ReportFigure, file: Path) -> Path:
     """Draw a figure into a PNG that keeps its digest, and return the file."""
+    if figure.options["kind"] == "curves":
+        return _save(curves_canvas(figure, _WIDE), file, figure.digest, curves_palette())
     options, panels = figure.options, list(figure.panels.values())
     count, lines = len(panels), options["kind"] == "lines"
     columns = min(3, count)
@@ -52,14 +55,20 @@ def draw_figure(figure: ReportFigure, file: Path) -> Path:
     return _save(canvas, file, figure.digest)
 
 
-def _save(canvas: Figure, file: Path, digest: str) -> Path:
-    """Write a PNG of few colours, a third of the size, with its digest."""
+def _save(canvas: Figure, file: Path, digest: str, palette: Sequence[int] = ()) -> Path:
+    """Write a PNG of few colours, a third of the size, with its digest; of those of a palette, if it is given."""
     from PIL import Image, PngImagePlugin  # matplotlib needs it, so it is there
 
     canvas.savefig(drawn := io.BytesIO(), dpi=150)
     texts = PngImagePlugin.PngInfo()
     texts.add_text(DIGEST, digest)
-    few = Image.open(drawn).convert("RGB").quantize(_COLORS, Image.Quantize.MAXCOVERAGE)
+    image = Image.open(drawn).convert("RGB")
+    if palette:
+        colors = Image.new("P", (1, 1))
+        colors.putpalette(palette)
+        few = image.quantize(palette=colors, dither=Image.Dither.NONE)
+    else:
+        few = image.quantize(_COLORS, Image.Quantize.MAXCOVERAGE)
     with atomic_path(file) as temporary:
         few.save(temporary, optimize=True, pnginfo=texts)
     return file

@@ -2,7 +2,8 @@
 
 A claim's ``figure`` names what is drawn:
 
-- ``kind``: ``dots`` or ``bars`` along a horizontal axis, or ``lines``;
+- ``kind``: ``dots`` or ``bars`` along a horizontal axis, or ``lines``; or ``curves``, a panel a task of the claim's
+  learning curves (recipes/_common/report_curves.py) to so many ``frames``, with ``axis``, ``along`` and ``alt`` alone;
 - ``table`` (its index, default 0) and ``rows`` (their indices, default all);
 - ``row``: a row's label, in which ``{column}`` stands for a cell, cut at ``until``; or ``labels``, one a row. Rows of
   the same label are drawn as one, a dot each;
@@ -32,14 +33,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from _common.report_curves import curve_panels
 from _common.report_data import read_claims
 from _common.report_pages import shown
 
-KINDS = ("dots", "bars", "lines")
+KINDS = ("dots", "bars", "lines", "curves")
 DIGEST = "Digest"  # key of the PNG's text
 _DRAWING = 2  # raise it when report_drawing.py changes: every figure is then drawn anew
+_CURVE_DRAWING = 1  # likewise of report_curve_drawing.py
 _KEYS = {"kind", "table", "rows", "row", "until", "labels", "y", "panel", "between", "transpose", "ours", "log", "at"}
 _KEYS |= {"from", "axis", "along", "alt", "share"}
+_CURVE_KEYS = {"kind", "frames", "axis", "along", "alt"}
 _NUMBER = re.compile(r"(?<![\w.])-?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?", re.ASCII)
 
 Points = dict[str, dict[str, list[tuple[float, float]]]]  # (value, half-range), by row, by series
@@ -47,16 +51,17 @@ Points = dict[str, dict[str, list[tuple[float, float]]]]  # (value, half-range),
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """What a figure shows: its options and its points, by panel."""
+    """What a figure shows: its options and its points, or curves, by panel."""
 
     options: Mapping[str, Any]
-    panels: Mapping[str, Points]
+    panels: Mapping[str, Any]
 
     @property
     def digest(self) -> str:
         """Digest of all that is drawn."""
         options = {key: value for key, value in self.options.items() if key != "alt"}
-        text = json.dumps([_DRAWING, options, self.panels], sort_keys=False)
+        drawing = _CURVE_DRAWING if options["kind"] == "curves" else _DRAWING
+        text = json.dumps([drawing, options, self.panels], sort_keys=False)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -80,25 +85,28 @@ def read_figures(data: Path) -> dict[str, ReportFigure]:
     for name, claim in read_claims(data).items():
         if "figure" in claim:
             try:
-                figures[name] = read_figure(claim, data)
+                figures[name] = read_figure(name, claim, data)
             except (KeyError, IndexError, ValueError) as error:
                 raise ValueError(f"{name}.json, figure: {error}") from error
     return figures
 
 
-def read_figure(claim: Mapping[str, Any], data: Path) -> ReportFigure:
+def read_figure(name: str, claim: Mapping[str, Any], data: Path) -> ReportFigure:
     """Return a claim's figure.
 
     Raises:
         ValueError: if an option is unknown, or a cell lacks the number that is asked for or holds one that diverged.
     """
     options = claim["figure"]
-    if unknown := set(options) - _KEYS:
-        raise ValueError(f"unknown options {sorted(unknown)}; use some of {sorted(_KEYS)}.")
     if options["kind"] not in KINDS:
         raise ValueError(f"kind={options['kind']!r} must be one of {KINDS}.")
+    keys = _CURVE_KEYS if options["kind"] == "curves" else _KEYS
+    if unknown := set(options) - keys:
+        raise ValueError(f"unknown options {sorted(unknown)}; use some of {sorted(keys)}.")
     if not options["alt"] or not options["axis"]:
         raise ValueError("alt and axis must say what is seen.")
+    if options["kind"] == "curves":
+        return ReportFigure(options, curve_panels(data, name))
     table = claim["tables"][options.get("table", 0)]
     columns = [_plain(column) for column in table["columns"]]
     rows = [[_plain(shown(cell, data)) for cell in row] for row in table["rows"]]

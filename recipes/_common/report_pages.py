@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from _common.report_curves import ahead, curve_files, curve_table, peer_table
 from _common.report_data import DROPPED, INDEX, read, read_claims, read_run
 
 VERDICTS = ("holds", "in part", "does not hold")
@@ -81,6 +82,7 @@ def _claim_page(name: str, claim: Mapping[str, Any], data: Path) -> str:
         alt = _filled(claim["figure"]["alt"], claim, data)
         parts.append(f"![{alt}](../images/results/{name}.png)")
     for table in claim["tables"]:
+        table = _with_rows(table, name, data)
         rows = [[shown(cell, data) for cell in row] for row in table["rows"]]
         parts += [_filled(table["title"], claim, data), _table(table["columns"], rows)]
     if "command" in claim:
@@ -88,9 +90,16 @@ def _claim_page(name: str, claim: Mapping[str, Any], data: Path) -> str:
     facts = {key: claim[key] for key in ("seeds", "time", "machine") if key in claim}
     said = [f"{key.capitalize()}: {value}." for key, value in facts.items()]
     other = "Versions" if "machine" in claim else "Machine and versions"
-    parts.append(" ".join([*said, f"{other}: [index](README.md).", f"Source: {_source(claim)}."]))
+    parts.append(" ".join([*said, f"{other}: [index](README.md).", f"Source: {_source(name, claim, data)}."]))
     parts.append("\n".join(f"- {_filled(sentence, claim, data)}" for sentence in claim["text"]))
     return "\n\n".join([*parts, _MADE.format(file=f"data/{name}.json")])
+
+
+def _with_rows(table: Mapping[str, Any], name: str, data: Path) -> Mapping[str, Any]:
+    """A table with its columns and rows, which may be made of the claim's learning curves or their peers."""
+    if "curves" in table:
+        return {**table, **curve_table(data, name, table["curves"])}
+    return {**table, **peer_table(data, name)} if "peers" in table else table
 
 
 def _dropped_page(dropped: Mapping[str, Any]) -> str:
@@ -120,9 +129,14 @@ def _lines(rows: Sequence[Sequence[str]]) -> str:
 
 
 def shown(cell: Any, data: Path) -> str:
-    """A cell's text: of a string itself, of ``{"metric", "of", "format"}`` a run's number, of a list its parts."""
+    """A cell's text: of a string itself, of ``{"metric", "of", "format"}`` a run's number, of a list its parts.
+
+    Of ``{"ahead", "of"}`` it is on how many tasks of a claim's curves ours are ahead of peers at so many frames.
+    """
     if isinstance(cell, list):
         return " / ".join(shown(each, data) for each in cell)
+    if isinstance(cell, Mapping) and "ahead" in cell:
+        return ahead(data, cell["of"], cell["ahead"])
     return _number(cell, data) if isinstance(cell, Mapping) else str(cell)
 
 
@@ -152,10 +166,13 @@ def _filled(text: str, claim: Mapping[str, Any], data: Path) -> str:
     return re.sub(r"\{(\w+)\}", lambda match: shown(values[match[1]], data), text)
 
 
-def _source(claim: Mapping[str, Any]) -> str:
+def _source(name: str, claim: Mapping[str, Any], data: Path) -> str:
     """Where the numbers are from: the runs that the claim quotes, and what its tables say themselves."""
     files = list(dict.fromkeys(_quoted([claim["tables"], claim.get("values", {})])))
     runs = [f"[{file.split('.')[1]}](data/{file})" for file in files]
+    if any("curves" in table for table in claim["tables"]):
+        for task, files in curve_files(data, name).items():
+            runs.append(" ".join([task, ", ".join(f"[{seed}](data/{file})" for seed, file in files.items())]))
     return ", ".join(runs + sorted({table["source"] for table in claim["tables"] if "source" in table}))
 
 

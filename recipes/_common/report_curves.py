@@ -1,0 +1,180 @@
+"""Learning curves of a claim's tasks beside peers' published means, for its figure and tables.
+
+The curves of CLAIM are of runs of recipes/shac.py that were added as TASK-SEED (CLAIM.TASK-SEED.metrics.json). A file
+CLAIM.peers.json has the peers: ``sources``, where each one's means are from and of how many seeds, and ``returns``, by
+task and peer, pairs of frames and mean return. ``"curves": [frames, ...]`` of a table lists ours at these frames, and
+the best peer and our minutes at the last; ``"peers": true`` lists the sources.
+"""
+
+from __future__ import annotations
+
+import re
+import statistics
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict
+
+from _common.interquartile import interquartile_interval
+from _common.report_data import read, read_run
+from torchrl_gn.training.run_folder import METRICS_FILE
+
+NONE = "-"  # a cell of what was not run
+LEAST_BAND = 3  # seeds from which on an interval is drawn in place of single seeds
+_TASK_SEED = re.compile(r"(.+)-(\d+)")
+
+Line = Sequence[tuple[float, float]]  # frames and return
+
+
+class CurvePanel(TypedDict):
+    """Lines of a task's panel."""
+
+    seeds: list[Line]
+    mean: Line
+    band: list[tuple[float, float, float]]  # frames, low and high
+    peers: dict[str, Line]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Rounds of a run: frames so far, the median return of the last five rounds, and processor minutes so far."""
+
+    frames: Sequence[int]
+    returns: Sequence[float]
+    minutes: Sequence[float]
+
+    def round_at(self, frames: float) -> int | None:
+        """The last round at or before ``frames``; None before the first, and where a longer run has a later one."""
+        index = bisect_right(self.frames, frames) - 1
+        length = self.frames[-1] - self.frames[-2] if len(self.frames) > 1 else 1
+        return index if 0 <= index and frames < self.frames[-1] + length else None
+
+
+def curve_of(metrics: Mapping[str, Any]) -> Curve:
+    """The curve in the metrics of a run of recipes/shac.py."""
+    rounds = [f"round {index}" for index in range(len(metrics)) if f"round {index}/frames" in metrics]
+    names = "frames", "median_return_of_last_five", "minutes"
+    return Curve(*([metrics[f"{each}/{name}"] for each in rounds] for name in names))
+
+
+def curve_files(data: Path, claim: str) -> dict[str, dict[int, str]]:
+    """Names of the files of a claim's runs, by task and seed, in order.
+
+    Raises:
+        ValueError: if a run is not named as a task and a seed, or there is none.
+    """
+    files: dict[str, dict[int, str]] = {}
+    for file in data.glob(f"{claim}.*.{METRICS_FILE}"):
+        name = file.name.removeprefix(f"{claim}.").removesuffix(f".{METRICS_FILE}")
+        if not (match := _TASK_SEED.fullmatch(name)):
+            raise ValueError(f"{file.name} must name a task and a seed; add it as=cheetah-run-0, say.")
+        files.setdefault(match[1], {})[int(match[2])] = file.name
+    if not files:
+        raise ValueError(f"There is no run of {claim}; add one: report.py add=RUN to={claim} as=cheetah-run-0.")
+    return {task: dict(sorted(files[task].items())) for task in sorted(files)}
+
+
+def read_curves(data: Path, claim: str) -> dict[str, list[Curve]]:
+    """The claim's curves by task, one a seed."""
+    files = curve_files(data, claim)
+    return {task: [curve_of(read_run(data, file)["metrics"]) for file in of.values()] for task, of in files.items()}
+
+
+def read_peers(data: Path, claim: str) -> dict[str, Any]:
+    """Peers' ``sources`` and ``returns``."""
+    return read(data, f"{claim}.peers")
+
+
+def curve_table(data: Path, claim: str, frames: Sequence[int]) -> dict[str, Any]:
+    """Columns and rows of a table of the claim's curves at ``frames``, the last of which peers are compared at."""
+    at = f"{frames[-1]:,}"
+    columns = ["task", "seeds", *(f"at {each:,}" for each in frames), f"best peer at {at}", f"minutes for {at}"]
+    peers = read_peers(data, claim)["returns"]
+    rows = [_row(task, curves, peers.get(task, {}), frames) for task, curves in read_curves(data, claim).items()]
+    return {"columns": columns, "rows": rows}
+
+
+def _row(task: str, curves: Sequence[Curve], peers: Mapping[str, Line], frames: Sequence[int]) -> list[str]:
+    returns = [mean_at(curves, each) for each in frames]
+    best = best_peer(peers, frames[-1])
+    cells = [NONE if value is None else f"{value:.0f}" for value in returns]
+    peer = f"{best[0]} {best[1]:.0f}" if best else NONE
+    if returns[-1] is not None and best is not None:
+        if returns[-1] > best[1]:
+            cells[-1] = f"**{cells[-1]}**"
+        else:
+            peer = f"**{peer}**"
+    minutes = mean_at(curves, frames[-1], "minutes")
+    return [titled(task), str(len(curves)), *cells, peer, NONE if minutes is None else f"{minutes:.0f}"]
+
+
+def peer_table(data: Path, claim: str) -> dict[str, Any]:
+    """Columns and rows of a table of where the peers' means are from."""
+    rows = []
+    for name, source in read_peers(data, claim)["sources"].items():
+        place = f"https://github.com/{source['repository']}/blob/{source['commit']}/{source['path']}"
+        file = f"[{source['path']}]({place})"
+        rows.append([name, source["paper"], str(source["seeds"]), source["repository"], file, source["commit"][:7]])
+    return {"columns": ["peer", "paper", "seeds", "repository", "file", "commit"], "rows": rows}
+
+
+def ahead(data: Path, claim: str, frames: int) -> str:
+    """On how many of the tasks that were run so far our mean is above every peer's at ``frames``."""
+    peers, compared, won = read_peers(data, claim)["returns"], 0, 0
+    for task, curves in read_curves(data, claim).items():
+        ours, best = mean_at(curves, frames), best_peer(peers.get(task, {}), frames)
+        if ours is not None and best is not None:
+            compared += 1
+            won += ours > best[1]
+    return f"{won} of {compared}"
+
+
+def curve_panels(data: Path, claim: str) -> dict[str, CurvePanel]:
+    """What the claim's figure shows, by task."""
+    peers = read_peers(data, claim)["returns"]
+    curves = read_curves(data, claim)
+    return {titled(task): curve_panel(of, peers.get(task, {})) for task, of in curves.items()}
+
+
+def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Iterable[Sequence[float]]]) -> CurvePanel:
+    """A task's panel: seeds, their mean while all run, and an interval of three seeds or more."""
+    seeds = [list(zip(curve.frames, curve.returns, strict=True)) for curve in curves]
+    frames = sorted({at for curve in curves for at in curve.frames})
+    means = [(at, mean) for at in frames if (mean := mean_at(curves, at)) is not None]
+    band: list[tuple[float, float, float]] = []
+    if len(curves) >= LEAST_BAND:
+        band = [(at, *interquartile_interval([[each] for each in _values(curves, at)])) for at, _ in means]
+    lines: dict[str, Line] = {name: [(at, value) for at, value in line] for name, line in peers.items()}
+    return {
+        "seeds": [] if band else [_rounded(each) for each in seeds],
+        "mean": _rounded(means),
+        "band": [(at, round(low, 1), round(high, 1)) for at, low, high in band],
+        "peers": lines,
+    }
+
+
+def mean_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> float | None:
+    """Mean over seeds of ``returns`` or ``minutes`` at ``frames``; None if a seed was not run as far."""
+    values = _values(curves, frames, what)
+    return statistics.fmean(values) if len(values) == len(curves) else None
+
+
+def best_peer(peers: Mapping[str, Line], frames: int) -> tuple[str, float] | None:
+    """Name and mean of the peer with the highest return at exactly ``frames``."""
+    found = [(name, value) for name, line in peers.items() for at, value in line if at == frames]
+    return max(found, key=lambda peer: peer[1], default=None)
+
+
+def titled(task: str) -> str:
+    """A task's name in words."""
+    return re.sub("[-_]", " ", task)
+
+
+def _values(curves: Sequence[Curve], frames: float, what: str = "returns") -> list[float]:
+    rounds = [(curve, curve.round_at(frames)) for curve in curves]
+    return [getattr(curve, what)[index] for curve, index in rounds if index is not None]
+
+
+def _rounded(line: Line) -> Line:
+    return [(at, round(value, 1)) for at, value in line]

@@ -1,0 +1,170 @@
+"""Learning curves of the report: ours by task and seed, beside peers'."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from _common.report_curves import Curve, ahead, best_peer, curve_files, curve_of, curve_panel, curve_table, mean_at
+from _common.report_drawing import draw_figure
+from _common.report_figures import read_figures, stale_figures
+from _common.report_pages import make_pages
+
+from .conftest import ROOT
+
+PEERS = {
+    "sources": {
+        "A": {"paper": "A et al.", "seeds": 10, "repository": "a/a", "path": "a.csv", "commit": "1234567890"},
+        "B": {"paper": "B et al.", "seeds": 3, "repository": "b/b", "path": "b", "commit": "abcdefghij"},
+    },
+    "returns": {
+        "cheetah-run": {"A": [[0, 1.0], [30, 60.0]], "B": [[0, 2.0], [30, 50.5], [60, 900.0]]},
+        "finger-turn_easy": {"A": [[30, 600.0]]},
+    },
+}
+CLAIM = {
+    "title": "The suite",
+    "of": "ours",
+    "short": "more return",
+    "claim": "More return.",
+    "verdict": "in part",
+    "headline": "{ahead} tasks",
+    "values": {"ahead": {"ahead": 30, "of": "suite"}},
+    "figure": {"kind": "curves", "frames": 40, "axis": "return", "along": "frames, thousands", "alt": "Curves"},
+    "tables": [{"title": "Returns.", "curves": [10, 30]}, {"title": "Peers.", "peers": True, "source": "published"}],
+    "text": ["Ahead on {ahead}."],
+}
+
+
+def run_of(frames, returns) -> dict:
+    """A run's file, of rounds whose minutes are a tenth of their frames."""
+    metrics = {"frames": frames[-1], "median_return_of_last_five": returns[-1]}
+    for index, (at, value) in enumerate(zip(frames, returns, strict=True)):
+        metrics |= {f"round {index}/frames": at, f"round {index}/median_return_of_last_five": value}
+        metrics |= {f"round {index}/minutes": at / 10, f"round {index}/return": -1}
+    return {"run": {}, "metrics": metrics}
+
+
+@pytest.fixture
+def data(tmp_path) -> Path:
+    """Data of a report with runs of two tasks, one of which ends early."""
+    folder = tmp_path / "results" / "data"
+    folder.mkdir(parents=True)
+    index = {"title": "All", "intro": [], "machine": "A.", "versions": "B.", "notes": [], "order": ["suite"]}
+    files = {
+        "index": index,
+        "tried-and-dropped": {"title": "Dropped", "intro": "None.", "tables": []},
+        "suite": CLAIM,
+        "suite.peers": PEERS,
+        "suite.cheetah-run-0.metrics": run_of([10, 20, 30], [40, 50, 60]),
+        "suite.cheetah-run-1.metrics": run_of([10, 20, 30], [50, 80, 100]),
+        "suite.finger-turn_easy-10.metrics": run_of([8, 16], [100, 200]),
+    }
+    for name, values in files.items():
+        (folder / f"{name}.json").write_text(json.dumps(values))
+    return folder
+
+
+def test_a_curve_goes_on_until_its_next_round_would_end():
+    curve = Curve([10, 20, 30], [1, 2, 3], [0, 0, 0])
+    assert [curve.round_at(at) for at in (9, 10, 19, 20, 30, 39, 40)] == [None, 0, 0, 1, 2, 2, None]
+    single = Curve([10], [1], [0])
+    assert [single.round_at(at) for at in (9, 10, 11)] == [None, 0, None]
+
+
+def test_curves_are_medians_of_rounds():
+    assert curve_of(run_of([10, 20], [4, 6])["metrics"]) == Curve([10, 20], [4, 6], [1, 2])
+
+
+def test_means_are_of_seeds_that_all_run():
+    curves = [Curve([10, 20, 30], [1, 2, 3], [1, 2, 3]), Curve([10, 20], [3, 6], [3, 6])]
+    assert [mean_at(curves, at) for at in (9, 10, 20, 29, 30)] == [None, 2, 4, 4, None]
+    assert mean_at(curves, 20, "minutes") == 4
+
+
+def test_the_best_peer_is_one_judged_at_these_frames():
+    peers = {"A": [(0, 1.0), (30, 60.0)], "B": [(30, 50.0), (60, 900.0)]}
+    assert best_peer(peers, 30) == ("A", 60) and best_peer(peers, 60) == ("B", 900) and best_peer(peers, 31) is None
+
+
+def test_tables_list_tasks_beside_the_best_peer(data):
+    table = curve_table(data, "suite", [10, 30])
+    assert table["columns"] == ["task", "seeds", "at 10", "at 30", "best peer at 30", "minutes for 30"]
+    assert table["rows"] == [
+        ["cheetah run", "2", "45", "**80**", "A 60", "3"],
+        ["finger turn easy", "1", "100", "-", "A 600", "-"],
+    ]
+    assert ahead(data, "suite", 30) == "1 of 1"
+
+
+def test_the_higher_one_is_bold(data):
+    (data / "suite.cheetah-run-1.metrics.json").write_text(json.dumps(run_of([10, 20, 30], [1, 1, 1])))
+    assert curve_table(data, "suite", [30])["rows"][0] == ["cheetah run", "2", "30", "**A 60**", "3"]
+    assert ahead(data, "suite", 30) == "0 of 1"
+
+
+def test_pages_name_runs_and_sources(data):
+    page = make_pages(data)["suite.md"]
+    assert "| cheetah run | 2 | 45 | **80** | A 60 | 3 |" in page
+    assert "| B | B et al. | 3 | b/b | [b](https://github.com/b/b/blob/abcdefghij/b) | abcdefg |" in page
+    files = "[0](data/suite.cheetah-run-0.metrics.json), [1](data/suite.cheetah-run-1.metrics.json)"
+    assert f"Source: cheetah-run {files}, finger-turn_easy [10](" in page
+    assert "- Ahead on 1 of 1." in page and "| 1 of 1 tasks |" in make_pages(data)["README.md"]
+
+
+def test_panels_show_single_seeds_or_an_interval():
+    two = [Curve([10, 20], [0, 100], [0, 0]), Curve([10, 20, 30], [100, 200, 300], [0, 0, 0])]
+    panel = curve_panel(two, {"A": [[0, 1.0]]})
+    assert panel["mean"] == [(10, 50), (20, 150)] and panel["band"] == []
+    assert panel["seeds"] == [[(10, 0), (20, 100)], [(10, 100), (20, 200), (30, 300)]]
+    assert panel["peers"] == {"A": [(0, 1)]}
+    three = curve_panel([*two, Curve([10, 20], [50, 150], [0, 0])], {})
+    assert three["seeds"] == [] and three["band"] == [(10, 0, 100), (20, 100, 200)]
+
+
+@pytest.mark.parametrize("name", ["suite.cheetah.metrics", "suite.cheetah-run-a.metrics"])
+def test_runs_are_named_by_task_and_seed(data, name):
+    (data / f"{name}.json").write_text(json.dumps(run_of([1], [1])))
+    with pytest.raises(ValueError, match="must name a task and a seed; add it as=cheetah-run-0"):
+        curve_files(data, "suite")
+
+
+def test_a_claim_needs_runs(data):
+    for file in data.glob("*.metrics.json"):
+        file.unlink()
+    with pytest.raises(ValueError, match="There is no run of suite; add one"):
+        make_pages(data)
+
+
+@pytest.mark.parametrize("panels", [1, 2, 4, 5, 9])
+def test_figures_are_drawn_and_become_stale(data, panels):
+    for task in range(panels - 2):
+        for seed in range(3):
+            (data / f"suite.task-{task}-{seed}.metrics.json").write_text(json.dumps(run_of([9, 18], [seed, 300])))
+    if panels == 1:
+        (data / "suite.finger-turn_easy-10.metrics.json").unlink()
+    images, figures = data.parent / "images", read_figures(data)
+    assert len(figures["suite"].panels) == panels and stale_figures(figures, images) == ["suite.png"]
+    draw_figure(figures["suite"], images / "suite.png")
+    assert stale_figures(figures, images) == []
+    (data / "suite.cheetah-run-1.metrics.json").write_text(json.dumps(run_of([10, 20, 30], [50, 80, 101])))
+    assert stale_figures(read_figures(data), images) == ["suite.png"]
+
+
+def test_figures_of_curves_take_no_options_of_tables(data):
+    claim = CLAIM | {"figure": CLAIM["figure"] | {"y": ["return"]}}
+    (data / "suite.json").write_text(json.dumps(claim))
+    with pytest.raises(ValueError, match=r"suite.json, figure: unknown options \['y'\]"):
+        read_figures(data)
+
+
+def test_committed_peers_name_their_sources():
+    for file in (ROOT / "docs" / "results" / "data").glob("*.peers.json"):
+        peers = json.loads(file.read_text())
+        for source in peers["sources"].values():
+            assert source["seeds"] and source["paper"] and source["repository"] and len(source["commit"]) == 40
+        for lines in peers["returns"].values():
+            assert lines.keys() <= peers["sources"].keys()
+            assert all(line == sorted(line) and len(line) <= 15 for line in lines.values())
