@@ -11,7 +11,7 @@ _CUT = 0.25  # share of the scores that is left out at each end, rounded down to
 
 def interquartile_mean(scores: ArrayLike) -> float:
     """Mean of the middle half of all scores, of any shape; of three or fewer, of all."""
-    return float(trim_mean(np.asarray(scores), _CUT, axis=None))
+    return float(trim_mean(np.ravel(scores), _CUT))
 
 
 def interquartile_interval(

@@ -63,9 +63,9 @@ class ActorCritic:
         self.policy.to(self.tasks[0].device)
         for task, begun in zip(self.tasks, networks or [None] * len(self.tasks), strict=True):
             task.begin(self.policy.for_scene(task.scene), begun)
-        given = {"policy_lr": options.policy_lr, "value_lr": options.value_lr, "alpha_lr": options.alpha_lr}
-        given |= {"value_steps": options.value_steps}
-        self.optimizer = ActorCriticOptimizer([task.loss for task in self.tasks], **given)
+        rates = {"policy_lr": options.policy_lr, "value_lr": options.value_lr, "alpha_lr": options.alpha_lr}
+        losses = [task.loss for task in self.tasks]
+        self.optimizer = ActorCriticOptimizer(losses, value_steps=options.value_steps, **rates)
 
     def _new_policy(self) -> BoundedPolicy:
         first, options = self.tasks[0], self.options
