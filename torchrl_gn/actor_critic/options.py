@@ -50,7 +50,7 @@ class ActorCriticOptions:
 
     Example:
         >>> ActorCriticOptions(horizon=8).steps
-        500
+        200
         >>> ActorCriticOptions(steps=70)
         Traceback (most recent call last):
         ...
