@@ -63,12 +63,12 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     one = load_file(whole / "rounds/001/policy.safetensors")
     assert any(not torch.equal(one[name], first[name]) for name in first if name.startswith("model.network"))
 
-    # Of three rounds the last alone is kept, of six the mean of the last two.
+    # Of three rounds the last alone is kept, of nine the mean of the last two.
     last = load_file(whole / "rounds/002/policy.safetensors")
     assert torch.equal(first["model.log_std"], last["model.log_std"])
-    code, _, errors = call(*SMALL, "rounds=6", f"run_dir={whole}", recipe="shac")
+    code, _, errors = call(*SMALL, "rounds=9", f"run_dir={whole}", recipe="shac")
     assert code == 0, errors
-    two = [load_file(whole / f"rounds/{index:03}/policy.safetensors")["model.log_std"] for index in (4, 5)]
+    two = [load_file(whole / f"rounds/{index:03}/policy.safetensors")["model.log_std"] for index in (7, 8)]
     torch.testing.assert_close(load_file(whole / "policy.safetensors")["model.log_std"], (two[0] + two[1]) / 2)
 
     # The networks are what the planning recipe takes.
@@ -153,7 +153,7 @@ def test_a_policy_reads_the_target_of_an_episode(reward, tmp_path, call):
     assert policy.in_keys == ["state", "target"]
     actions = [policy.act(state, target) for target in (played["target"], played["target"].flip(0))]
     assert (actions[0] - actions[1]).abs().max() > 1e-4
-    with pytest.raises(ValueError, match=r"need a target \[2, 3\], got None"):
+    with pytest.raises(ValueError, match=r"need a target \[4, 3\], got None"):
         policy.act(state)
 
 
