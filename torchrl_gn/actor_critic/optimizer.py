@@ -72,7 +72,7 @@ class ActorCriticOptimizer:
         return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in kept.items()}
 
     def _update(self, draws: Sequence[Callable[[], TensorDict]], when: str) -> list[dict[str, Tensor]]:
-        """Update from the states that are drawn for every loss; numbers of each. FloatingPointError changes nothing."""
+        """Update from the states that are drawn for every loss; numbers of each. See :meth:`learn` for errors."""
         if self._graph is None and self._by_torch < 1:
             self._record([draw() for draw in draws])
         if self._graph is None:

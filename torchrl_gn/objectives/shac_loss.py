@@ -202,7 +202,7 @@ class SHACLoss(LossModule):
         # Not reset(), which asks whether an episode has ended: it would wait for a device.
         start = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
         env, now = self.env.of_states(), start.copy()
-        states, actions, ended, entropies = [], [], [], []
+        states, actions, ended, entropies = [cast(Tensor, now["state"])], [], [], []
         if target is not None:
             start["task"] = cast(Any, self.env.reward).task_of(state, target)
         with ExitStack() as stack:
@@ -212,22 +212,20 @@ class SHACLoss(LossModule):
             stack.enter_context(self.policy.prepared())
             stack.enter_context(set_exploration_type(ExplorationType.RANDOM))
             for _ in range(self.steps):
-                states.append(reached := cast(Tensor, now["state"]))
                 # All that follows reaches earlier actions through this; what they are paid and valued by does not.
-                state = _Scaled.apply(reached, self.policy_lmbda * self.value.discount)
+                state = _Scaled.apply(states[-1], self.policy_lmbda * self.value.discount)
                 now = now.set("state", state)
                 action, log_prob = self.policy.sample(cast(Tensor, state), self.members, target)
                 for each in (state, action):
                     if each.requires_grad:  # neither under no_grad, nor of a frozen policy
                         each.register_hook(self._calmed)
                 entropies.append(-log_prob)
-                for frame in range(self.action_repeat):
-                    states += [now["state"]] if frame else []
+                for _ in range(self.action_repeat):
                     now = env.step(now.set("action", action))
                     actions.append(action)
                     ended.append(now["next", "terminated"].squeeze(-1))
                     now = step_mdp(now, exclude_done=True)
-            states.append(now["state"])
+                    states.append(cast(Tensor, now["state"]))
             states, actions = torch.stack(states, 1), torch.stack(actions, 1)
             # The rewards of all steps at once: as many small operations as for one.
             imagined = imagined_steps(self.env, start, states, actions, ~torch.stack(ended, 1))
