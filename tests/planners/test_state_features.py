@@ -8,6 +8,7 @@ import torch
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.planners import StateFeatures, StatePolicy, StateValue
+from torchrl_gn.rewards.suite import Place
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, save_checkpoint
 
@@ -29,9 +30,11 @@ def test_where_bodies_are_from_the_target_counts() -> None:
     torch.testing.assert_close(features(moved, target=target + both), before)
     assert (features(moved, target=target) - before).abs().max() > 0.1
     assert (features(state, target=target + both) - before).abs().max() > 0.1
-    assert features.size == before.shape[-1] == StateFeatures(scene).size + 3
-    higher = target + torch.tensor([0.0, 0.0, 0.5])
-    assert (features(state, target=higher) - before)[:, :-1].abs().max() == 0  # its height is a feature of its own
+    own = StateFeatures(scene).size
+    assert features.size == before.shape[-1] == own + 3 + 4 * len(features.nodes)
+    higher = features(state, target=target + torch.tensor([0.0, 0.0, 0.5]))
+    assert (higher - before)[:, : own + 2].abs().max() == 0  # its height is a feature of its own
+    assert (higher - before)[:, own + 2].abs().min() > 0.1
 
 
 def test_a_target_where_nothing_may_be_shifted_is_a_feature() -> None:
@@ -39,11 +42,44 @@ def test_a_target_where_nothing_may_be_shifted_is_a_feature() -> None:
     features, state = StateFeatures(scene, target=True), states_of(scene)
     target = torch.randn(6, 3, generator=torch.Generator().manual_seed(0)).double()
     features.fit(state, target)
-    found = features(state, target=target)
-    torch.testing.assert_close(found[:, -3:], features.normalizer(torch.cat((0 * found[:, :-3], target), 1))[:, -3:])
+    found, own = features(state, target=target), StateFeatures(scene).size
+    given = torch.zeros(6, features.size, dtype=torch.float64)
+    given[:, own : own + 3] = target
+    torch.testing.assert_close(found[:, own : own + 3], features.normalizer(given)[:, own : own + 3])
     plain = StateFeatures(scene)
     plain.fit(state)
-    torch.testing.assert_close(found[:, :-3], plain(state))
+    torch.testing.assert_close(found[:, :own], plain(state))
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("suite:reacher/hard", lambda scene: Place.of_geom(scene, "finger")),  # welded to the hand
+        ("suite:finger/turn_hard", lambda scene: Place.of_site(scene, "tip")),
+        ("suite:fish/swim", lambda scene: Place.of_geom(scene, "mouth")),
+    ],
+)
+def test_a_target_is_seen_from_the_place_that_is_paid(name: str, place) -> None:
+    scene = load_scene(name)
+    yaw = Canonicalizer(recenter=False, yaw=True)
+    state, target = states_of(scene), torch.rand(6, 3, generator=torch.Generator().manual_seed(0)).double()
+    away = place(scene)(state) - target
+    for options in (None, yaw):
+        features = StateFeatures(scene, options, target=True)
+        features.fit(state, target)
+        found = features.normalizer.inverse(features(state, target=target))[:, -4 * len(features.nodes) :]
+        vectors, far = found[:, : -len(features.nodes)].unflatten(1, (-1, 3)), found[:, -len(features.nodes) :]
+        if options is None or scene.yaw_frame is None:
+            assert (vectors - away.unsqueeze(1)).abs().amax((0, 2)).min() < 1e-6
+        wanted = (away.square().sum(-1, keepdim=True) / features.sized.square()).log1p()
+        assert (far - wanted).abs().amax(0).min() < 1e-6
+
+
+def test_moving_geoms_and_sites_alone_have_places() -> None:
+    scene = load_scene("suite:reacher/hard")
+    features, model = StateFeatures(scene, target=True), scene.model
+    moving = [i for i in range(model.ngeom) if model.geom_bodyid[i] and model.geom(i).name != "target"]
+    assert len(features.nodes) == len(moving) == 3 and StateFeatures(scene).nodes == []
 
 
 def test_networks_keep_their_target_in_files(tmp_path) -> None:

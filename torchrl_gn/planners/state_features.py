@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.dynamics.features.canonical_state import CanonicalState
 from torchrl_gn.finite import require_real
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import BODY_STATE
-from torchrl_gn.rewards.bodies import require_bodies
+from torchrl_gn.rewards.bodies import find_body, require_bodies
 from torchrl_gn.scenes import PhysicalParameters, Scene, scene_from_description
 
 _STATES = 16  # to compare rewards at
 FLOOR, LIMIT = 1e-6, 5.0  # standard deviations: rounding noise, and where a planner has left the data
+_SMALLEST = 1e-3  # metres, of a geom or site
 
 
 class StateFeatures(Float64Buffers):
@@ -33,12 +36,16 @@ class StateFeatures(Float64Buffers):
     Args:
         canonicalizer: which of the scene's invariances are built in, see :func:`task_invariances`. Default: none.
         target: whether episodes have a target, a place ``[*B, 3]``, metres, world frame. Bodies are then seen from it
-            along the axes on which the scene may be shifted, without ``recenter``; the others of it are features.
+            along the axes on which the scene may be shifted, without ``recenter``; the others of it are features. So
+            is where every geom and site of a moving body is from it, and the logarithm of how far: what is paid close
+            to a target turns on less than the error of a network that must add a hand's length to its pose.
     """
 
     rest: Tensor
     pivot: Tensor
     shifted: Tensor
+    offset: Tensor
+    sized: Tensor
 
     def __init__(self, scene: Scene, canonicalizer: Canonicalizer | None = None, *, target: bool = False) -> None:
         super().__init__()
@@ -51,7 +58,10 @@ class StateFeatures(Float64Buffers):
         self.physical = PhysicalParameters.of(scene)
         self.constants({"rest": self.physical.rest, "pivot": self.physical.pivot})
         self.constants({"shifted": np.outer(scene.predicted, scene.translation_invariant)})  # [N, 3]
-        self.size = scene.num_nodes * scene.layout.encoded_size() + 3 * target
+        nodes, offset, sized = _places(scene) if target else ((), np.zeros((0, 3)), np.zeros(0))
+        self.nodes = list(nodes)
+        self.constants({"offset": offset, "sized": sized})
+        self.size = scene.num_nodes * scene.layout.encoded_size() + 3 * target + 4 * len(self.nodes)
         self.normalizer = Normalizer(self.size, floor=FLOOR, limit=LIMIT)
 
     @property
@@ -85,17 +95,33 @@ class StateFeatures(Float64Buffers):
     def _encoded(self, state: Tensor, target: Tensor | None) -> Tensor:
         check_states(self.scene, state)
         if not self.target:
-            return self._of_bodies(state)
+            return self._of(self._canonical(state))
         if target is None or target.shape != (*state.shape[:-2], 3):
             given = None if target is None else list(target.shape)
             raise ValueError(f"States {list(state.shape)} need a target {[*state.shape[:-2], 3]}, got {given}.")
         target, free = target.to(state.dtype), self.shifted.to(state.dtype)
-        seen = state - pad(target.unsqueeze(-2) * free, (0, state.shape[-1] - 3))
-        return torch.cat((self._of_bodies(seen), target * (1 - free.amax(0))), -1)
+        seen = self._canonical(state - pad(target.unsqueeze(-2) * free, (0, state.shape[-1] - 3)))
+        fixed = target * (1 - free.amax(0))
+        return torch.cat((self._of(seen), fixed, self._from(seen, fixed)), -1)
 
-    def _of_bodies(self, state: Tensor) -> Tensor:
-        canonical = self.canonicalizer(state, self.physical._replace(rest=self.rest, pivot=self.pivot))
-        return self.scene.layout.encode(canonical.state, "matrix", canonical.matrices).flatten(-2)
+    def _canonical(self, state: Tensor) -> CanonicalState:
+        return self.canonicalizer(state, self.physical._replace(rest=self.rest, pivot=self.pivot))
+
+    def _of(self, seen: CanonicalState) -> Tensor:
+        """Features of the bodies."""
+        return self.scene.layout.encode(seen.state, "matrix", seen.matrices).flatten(-2)
+
+    def _from(self, seen: CanonicalState, target: Tensor) -> Tensor:
+        """Where the moving geoms and sites are from a target ``[*B, 3]``, and how far, ``[*B, 4 P]``."""
+        if seen.rotation is not None:
+            pivot = self.pivot.to(target.dtype)
+            target = ((target - pivot).unsqueeze(-2) @ seen.rotation.matrix).squeeze(-2) + pivot
+        matrices = cast(Tensor, seen.matrices)[..., self.nodes, :, :]
+        place = seen.state[..., self.nodes, :3] + (matrices @ self.offset.to(matrices.dtype).unsqueeze(-1)).squeeze(-1)
+        away = place - target.unsqueeze(-2)
+        # Linear in a squared distance below the size of what is there, logarithmic above.
+        far = (away.square().sum(-1) / self.sized.to(away.dtype).square()).log1p()
+        return torch.cat((away.flatten(-2), far), -1)
 
     def description(self) -> dict[str, Any]:
         """JSON-able values for :meth:`arguments_from`."""
@@ -107,6 +133,26 @@ class StateFeatures(Float64Buffers):
         """``scene``, ``canonicalizer`` and the other options of a network's description."""
         scene, canonicalizer = scene_from_description(description["scene"]), description["canonicalizer"]
         return {**description, "scene": scene, "canonicalizer": Canonicalizer(**canonicalizer)}
+
+
+def _places(scene: Scene) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Nodes ``P``, offsets ``[P, 3]`` in their frames and sizes ``[P]``, metres, of moving bodies' geoms and sites."""
+    model, found = scene.model, {}
+    geoms = zip(model.geom_bodyid, model.geom_pos, model.geom_rbound, strict=True)
+    sites = zip(model.site_bodyid, model.site_pos, model.site_size.max(1, initial=0.0), strict=True)
+    for body, position, size in (*geoms, *sites):
+        if body == 0:  # the world
+            continue
+        welded, turned = find_body(scene, model.body(int(body)).name), np.empty(3)
+        if not scene.predicted[welded.node]:
+            continue
+        mujoco.mju_rotVecQuat(turned, position, welded.quat)
+        offset = welded.pos + turned
+        # A site at the centre of a geom is the same place: the smaller of both sizes tells more of it.
+        key = (welded.node, *np.round(offset, 9).tolist())
+        found[key] = min(max(float(size), _SMALLEST), found.get(key, np.inf))
+    places = np.array([key[1:] for key in found]).reshape(-1, 3)
+    return [int(key[0]) for key in found], places, np.array(list(found.values()))
 
 
 def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicalizer:
