@@ -76,10 +76,13 @@ class StateFeatures(Float64Buffers):
             self.update(state, target)
 
     @torch.no_grad()
-    def refit(self, state: Tensor, target: Tensor | None = None) -> None:
-        """Fit the normaliser to states ``[*B, N, 13]`` alone; ValueError if one is not finite."""
+    @without_autocast
+    def refit(self, state: Tensor, target: Tensor | None = None, dtype: torch.dtype | None = None) -> Tensor:
+        """Features of states ``[*B, N, 13]`` to which alone the normaliser is fitted; ValueError if one is not finite."""
+        encoded = self._encoded(state, target)
         self.normalizer.reset()
-        self.update(state, target)
+        self.normalizer.update(encoded)
+        return self.normalizer(encoded, dtype)
 
     @torch.no_grad()
     @without_autocast

@@ -62,14 +62,17 @@ class StateReward(Reward):
         target = None
         if self.target_shape is not None:
             target = self.require_task(task, next_state).expand(*next_state.shape[:-2], 3)
-        inputs = self.inputs(state, action, next_state, target)
-        return self.normalizer.inverse(self.network(inputs)).to(next_state.dtype)
+        before, after = (self.features(each, self.dtype, target) for each in (state, next_state))
+        return self.normalizer.inverse(self.network(self.inputs(before, action, after))).to(next_state.dtype)
 
-    def inputs(self, state: Tensor, action: Tensor, next_state: Tensor, target: Tensor | None = None) -> Tensor:
-        """What the network reads ``[*B, F]`` of a step."""
-        dtype = next(self.network.parameters()).dtype
-        before, after = (self.features(each, dtype, target) for each in (state, next_state))
-        return torch.cat((before, after, (action / self.scale.to(action.dtype)).to(dtype)), -1)
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the network."""
+        return next(self.network.parameters()).dtype
+
+    def inputs(self, before: Tensor, action: Tensor, after: Tensor) -> Tensor:
+        """What the network reads ``[*B, 2 F + A]`` of features ``[*B, F]`` before and after an action."""
+        return torch.cat((before, after, (action / self.scale.to(action.dtype)).to(after.dtype)), -1)
 
     def description(self) -> dict[str, Any]:
         """JSON-able values from which :meth:`from_description` rebuilds the network."""

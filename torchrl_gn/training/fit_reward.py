@@ -47,11 +47,10 @@ def fit_reward(
         given = f"{list(state.shape)}, {list(action.shape)} and {list(paid.shape)}"
         raise ValueError(f"state [K, T + 1, N, 13], action [K, T, A] and reward [K, T, 1] do not fit: {given}.")
     require_finite(paid, "'reward' of the data")
-    target = cast(Tensor, data["target"]).unsqueeze(1) if reward.features.target else None
-    reward.features.refit(state, None if target is None else target.expand(*state.shape[:2], 3))
+    target = cast(Tensor, data["target"]).unsqueeze(1).expand(*state.shape[:2], 3) if reward.features.target else None
     with torch.no_grad():
-        place = None if target is None else target.expand(*paid.shape[:2], 3)
-        inputs = reward.inputs(state[:, :-1], action, state[:, 1:], place).flatten(0, 1)
+        features = reward.features.refit(state, target, reward.dtype)
+        inputs = reward.inputs(features[:, :-1], action, features[:, 1:]).flatten(0, 1)
     paid = paid.flatten(0, 1).double()
     renormalize([reward.network], reward.normalizer, paid)
     normalized = reward.normalizer(paid, inputs.dtype)
