@@ -44,6 +44,7 @@ class StateFeatures(Float64Buffers):
     rest: Tensor
     pivot: Tensor
     shifted: Tensor
+    nodes: Tensor
     offset: Tensor
     sized: Tensor
 
@@ -58,10 +59,10 @@ class StateFeatures(Float64Buffers):
         self.physical = PhysicalParameters.of(scene)
         self.constants({"rest": self.physical.rest, "pivot": self.physical.pivot})
         self.constants({"shifted": np.outer(scene.predicted, scene.translation_invariant)})  # [N, 3]
-        nodes, offset, sized = _places(scene) if target else ((), np.zeros((0, 3)), np.zeros(0))
-        self.nodes = list(nodes)
-        self.constants({"offset": offset, "sized": sized})
-        self.size = scene.num_nodes * scene.layout.encoded_size() + 3 * target + 4 * len(self.nodes)
+        self.size = scene.num_nodes * scene.layout.encoded_size()
+        if target:
+            self.constants(_places(scene))
+            self.size += 3 + 4 * len(self.nodes)
         self.normalizer = Normalizer(self.size, floor=FLOOR, limit=LIMIT)
 
     @property
@@ -78,7 +79,7 @@ class StateFeatures(Float64Buffers):
     @torch.no_grad()
     @without_autocast
     def refit(self, state: Tensor, target: Tensor | None = None, dtype: torch.dtype | None = None) -> Tensor:
-        """Features of states ``[*B, N, 13]`` to which alone the normaliser is fitted; ValueError if one is not finite."""
+        """Fit the normaliser to states ``[*B, N, 13]`` alone; return their features. ValueError for NaN or Inf."""
         encoded = self._encoded(state, target)
         self.normalizer.reset()
         self.normalizer.update(encoded)
@@ -119,9 +120,9 @@ class StateFeatures(Float64Buffers):
         if seen.rotation is not None:
             pivot = self.pivot.to(target.dtype)
             target = ((target - pivot).unsqueeze(-2) @ seen.rotation.matrix).squeeze(-2) + pivot
-        matrices = cast(Tensor, seen.matrices)[..., self.nodes, :, :]
-        place = seen.state[..., self.nodes, :3] + (matrices @ self.offset.to(matrices.dtype).unsqueeze(-1)).squeeze(-1)
-        away = place - target.unsqueeze(-2)
+        matrices = cast(Tensor, seen.matrices).index_select(-3, self.nodes)
+        arm = (matrices @ self.offset.to(matrices.dtype).unsqueeze(-1)).squeeze(-1)
+        away = seen.state[..., :3].index_select(-2, self.nodes) + arm - target.unsqueeze(-2)
         # Linear in a squared distance below the size of what is there, logarithmic above.
         far = (away.square().sum(-1) / self.sized.to(away.dtype).square()).log1p()
         return torch.cat((away.flatten(-2), far), -1)
@@ -138,8 +139,8 @@ class StateFeatures(Float64Buffers):
         return {**description, "scene": scene, "canonicalizer": Canonicalizer(**canonicalizer)}
 
 
-def _places(scene: Scene) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Nodes ``P``, offsets ``[P, 3]`` in their frames and sizes ``[P]``, metres, of moving bodies' geoms and sites."""
+def _places(scene: Scene) -> dict[str, Any]:
+    """Moving geoms and sites: ``nodes`` ``[P]``, ``offset`` ``[P, 3]`` in a node's frame, ``sized`` ``[P]``, metres."""
     model, found = scene.model, {}
     geoms = zip(model.geom_bodyid, model.geom_pos, model.geom_rbound, strict=True)
     sites = zip(model.site_bodyid, model.site_pos, model.site_size.max(1, initial=0.0), strict=True)
@@ -154,8 +155,8 @@ def _places(scene: Scene) -> tuple[list[int], np.ndarray, np.ndarray]:
         # A site at the centre of a geom is the same place: the smaller of both sizes tells more of it.
         key = (welded.node, *np.round(offset, 9).tolist())
         found[key] = min(max(float(size), _SMALLEST), found.get(key, np.inf))
-    places = np.array([key[1:] for key in found]).reshape(-1, 3)
-    return [int(key[0]) for key in found], places, np.array(list(found.values()))
+    nodes, offset = np.array([key[0] for key in found], dtype=np.int64), [key[1:] for key in found]
+    return {"nodes": nodes, "offset": np.reshape(offset, (-1, 3)), "sized": np.array(list(found.values()))}
 
 
 def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicalizer:
