@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchrl_gn as gn
-from torchrl_gn.actor_critic import WINDOW, ActorCritic, ActorCriticTask, TargetSquares, windows
+from torchrl_gn.actor_critic import WINDOW, ActorCritic, ActorCriticTask, TargetSquares, colored_noise, windows
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ class Replayed(ActorCriticTask):
 
     def recorded(self, action):
         state = gn.collect_trajectories(self.scene, 2, steps=WINDOW, seed=3)["state"]
-        return windows(state, torch.full((2, WINDOW, 1), action))
+        return windows(state, torch.full((2, WINDOW, 1), action), torch.zeros(2, WINDOW, 1))
 
 
 def test_a_subclass_plays_elsewhere(pendulum, reward, small):
@@ -53,12 +53,55 @@ def test_draws_half_from_the_newest(pendulum, reward, small):
     task.collect()
     marked = task.newest.clone()
     marked["state"].fill_(7.0)
+    marked["reward"].fill_(3.0)
     task.add(marked)
-    drawn = task.starts()(1001)["state"]
-    newest = (drawn == 7.0).flatten(1).all(1)
-    assert drawn.shape == (1001, *task.newest["state"].shape[2:])
+    drawn = task.starts()(1001)
+    newest = (drawn["state"] == 7.0).flatten(1).all(1)
+    assert drawn["state"].shape == (1001, *task.newest["state"].shape[2:])
     assert bool(newest[501:].all())  # the last 500; of the first 501, drawn from all, about half
     assert 150 < int(newest[:501].sum()) < 350
+    assert torch.equal(drawn["reward"].squeeze(-1) == 3.0, newest)
+
+
+def test_the_value_is_scaled_by_what_was_paid_where_imagination_begins(pendulum, reward, small):
+    task = ActorCriticTask(pendulum, options := small(), reward)
+    learner = ActorCritic([task], options)
+    task.collect()
+    for paid in (0.0, 0.0, 1.0):  # a third of all, and half of what is drawn are the newest
+        task.add(task.data[0].clone())
+        task.newest["reward"].fill_(paid)
+    task.data[0]["reward"].zero_()
+    learner.learn(0)
+    share = 0.5 * 0.25 + 0.5
+    assert float(task.value.normalizer.std) * (1 - options.discount) == pytest.approx(
+        (share * (1 - share)) ** 0.5, rel=0.02
+    )
+    assert float(task.value.normalizer.mean) * (1 - options.discount) == pytest.approx(share, rel=0.04)
+
+
+@pytest.mark.parametrize("color", [0.0, 1.0, 2.0])
+def test_power_of_colored_noise_falls_with_the_frequency(color):
+    torch.manual_seed(0)
+    noise = colored_noise(512, (400, 2), color)
+    assert noise.shape == (512, 400, 2)
+    assert float(noise.var()) == pytest.approx(1.0, rel=0.15)
+    power = torch.fft.rfft(noise, dim=0).abs().square().mean((1, 2))[1:-1]
+    slope = ((power[99] / power[9]).log() / torch.tensor(10.0).log()).item()
+    assert slope == pytest.approx(-color, abs=0.25)
+    assert colored_noise(1, (3,), color).shape == (1, 3)
+
+
+def test_explores_by_colored_noise(pendulum, reward, small):
+    torch.manual_seed(0)
+    learner = ActorCritic([ActorCriticTask(pendulum, options := small(steps=200), reward)], options)
+    learner.policy.features.fit(torch.rand(20, 2, 13).double())
+    rest = {}
+    for color in (0.0, 2.0):
+        task = ActorCriticTask(pendulum, small(steps=200, noise_color=color), reward)
+        action = task.play(learner.playing(), seed=0)["action"]
+        change = (action[:, 1:] - action[:, :-1]).square().mean()
+        rest[color] = float(change / action.var())
+    assert rest[0.0] > 1.0 > 0.3 > rest[2.0]
 
 
 def test_a_round_that_left_nothing_is_passed_over(pendulum, reward, small):

@@ -234,6 +234,11 @@ def test_samples_have_the_density_of_a_bounded_normal(scenes, starts):
     normal = TanhNormal(before, policy.log_std.exp(), upscale=1.0, tanh_loc=False)
     scaled = (action - policy.middle) / policy.half_range
     torch.testing.assert_close(density, normal.log_prob(scaled), rtol=1e-3, atol=1e-3)
+    noise = torch.randn(action.shape)
+    given, density = policy.sample(starts, noise=noise)
+    scaled = (given - policy.middle) / policy.half_range
+    torch.testing.assert_close(scaled, (before + policy.log_std.exp() * noise).tanh())
+    torch.testing.assert_close(density, normal.log_prob(scaled), rtol=1e-3, atol=1e-3)
     now = TensorDict({"state": starts}, [32])
     with set_exploration_type(ExplorationType.RANDOM):
         assert not torch.equal(policy(now.copy())["action"], policy(now.copy())["action"])

@@ -136,6 +136,21 @@ def test_the_policy_acts_as_in_the_episodes(scene):
     assert history.losses[-1] < 0.1 * history.losses[0] and len(history.losses) == 10
 
 
+@pytest.mark.parametrize("combine", ["min", "mean"])
+def test_networks_are_combined(scene, tmp_path, combine):
+    value, state = small(scene, members=3, combine=combine), bodies(POINTS)
+    value.features.fit(state)
+    value.normalizer.update(torch.tensor([[-3.0], [5.0]]))
+    with torch.no_grad():
+        features = value.features(state, torch.float32)
+        each = torch.stack([value.normalizer.inverse(member(features)) for member in value.members])
+        wanted = each.amin(0) if combine == "min" else each.mean(0)
+        torch.testing.assert_close(value(state), wanted.double(), rtol=1e-5, atol=1e-5)
+        save_checkpoint(tmp_path / "value.safetensors", value, scene=scene)
+        again = load_pretrained(tmp_path / "value.safetensors").value
+        assert torch.equal(again(state), value(state))
+
+
 def test_checkpoints_hold_them(learned, scene, tmp_path):
     value, policy = learned[0], StatePolicy(scene, hidden=(8,))
     fit_policy(policy, play(4), steps=1)
@@ -181,6 +196,6 @@ def test_other_bad_inputs_are_refused_by_name(scene):
     wide = good.clone().set("action", torch.zeros(2, 15, 2))
     with pytest.raises(ValueError, match=r"actions must be \[M, T, 1\]"):
         fit_policy(StatePolicy(scene), wide)
-    for options in ({"discount": 0.0}, {"discount": 1.5}, {"members": 0}, {"hidden": ()}):
+    for options in ({"discount": 0.0}, {"discount": 1.5}, {"members": 0}, {"hidden": ()}, {"combine": "max"}):
         with pytest.raises(ValueError, match=next(iter(options))):
             StateValue(scene, **options)

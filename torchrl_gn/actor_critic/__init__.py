@@ -9,6 +9,8 @@ from torchrl_gn.actor_critic.target_squares import TargetSquares as TargetSquare
 from torchrl_gn.actor_critic.task import ActorCriticTask as ActorCriticTask
 from torchrl_gn.actor_critic.trainer import ActorCritic as ActorCritic
 from torchrl_gn.actor_critic.trajectories import WINDOW as WINDOW
+from torchrl_gn.actor_critic.trajectories import colored_noise as colored_noise
+from torchrl_gn.actor_critic.trajectories import exploring as exploring
 from torchrl_gn.actor_critic.trajectories import play as play
 from torchrl_gn.actor_critic.trajectories import unbroken as unbroken
 from torchrl_gn.actor_critic.trajectories import windows as windows

@@ -60,11 +60,12 @@ class ActorCriticOptions:
     first: FirstTrajectories = field(default_factory=FirstTrajectories)  # random control before the first round
     episodes: int = 5  # episodes of a task that a round plays, with exploration
     steps: int = 200  # control steps of each, a multiple of 50
+    noise_color: float = 1.0  # of exploration's noise in time: 0 white, 1 pink, 2 red, see colored_noise
     evaluate: JudgedEpisodes = field(default_factory=JudgedEpisodes)  # episodes that the policy is judged by
     action_repeat: int = 2  # frames of a control step, in tasks of the suite
     per_frame: bool = True  # whether the model of a task of the suite is of one frame, or else of a control step
 
-    horizon: int = 8  # control steps that are imagined
+    horizon: int = 5  # control steps that are imagined
     policy_lmbda: float = 0.6  # lambda of the policy's returns: 1 goes through the model to the last step
     outlier: float = 3.0  # gradients of a trajectory are shortened to so many times the batch's median
     discount: float = 0.99  # discount of a control step
@@ -112,6 +113,8 @@ class ActorCriticOptions:
         for name in ("lmbda", "policy_lmbda"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be from 0 to 1.")
+        if not 0 <= self.noise_color <= 2:
+            raise ValueError(f"noise_color={self.noise_color} must be from 0 to 2.")
         if not self.outlier > 0:
             raise ValueError(f"outlier={self.outlier} must be above 0.")
         if not math.isfinite(self.pessimism):

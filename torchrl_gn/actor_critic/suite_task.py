@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_gn.actor_critic.options import ActorCriticOptions
 from torchrl_gn.actor_critic.task import JUDGED_SEED, ActorCriticTask
-from torchrl_gn.actor_critic.trajectories import play, unbroken, windows
+from torchrl_gn.actor_critic.trajectories import exploring, play, unbroken, windows
 from torchrl_gn.data import spline_controls
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.envs import SuiteTaskEnv
@@ -28,8 +28,7 @@ class SuiteActorCriticTask(ActorCriticTask):
     """A task of the suite, whose policy is judged by what dm_control pays.
 
     The policy and value are of ``action_repeat`` frames of the suite, the model and the reward too, or with
-    ``per_frame`` of one frame, as what a body does in contact is predicted the worse the longer the step. Trajectories
-    have ``reward`` ``[K, 50, 1]``, what was paid, if it is learned.
+    ``per_frame`` of one frame, as what a body does in contact is predicted the worse the longer the step.
 
     Args:
         system: such as ``"suite:cheetah/run"``.
@@ -98,19 +97,20 @@ class SuiteActorCriticTask(ActorCriticTask):
         env = SuiteTaskEnv(self.scene, frames=self.options.per_frame, seed=self.options.seed)
         controls = spline_controls(self.scene, first.trajectories, first.length, self.options.seed)
         for sequence in torch.from_numpy(controls).float():
-            found.append(play(env, _replay(sequence), episodes=1, steps=first.length, explore=False))
+            found.append(play(env, _replay(sequence), episodes=1, steps=first.length))
         return self._windows(cast(TensorDict, torch.cat(found)))
 
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
         self._played.set_seed(seed)
         sizes = {"episodes": self.options.episodes, "steps": self.options.steps}
-        return self._windows(play(self._played, policy.for_scene(self.scene), **sizes, explore=True))
+        explorer = exploring(policy.for_scene(self.scene), **sizes, color=self.options.noise_color)
+        return self._windows(play(self._played, explorer, **sizes))
 
     def judged(self, policy: BoundedPolicy) -> TensorDict:
         self._judged.set_seed(JUDGED_SEED)
         evaluate = self.options.evaluate
         sizes = {"episodes": evaluate.episodes, "steps": evaluate.steps or self._judged.steps}
-        played = play(self._judged, policy.for_scene(self.scene), **sizes, explore=False)
+        played = play(self._judged, policy.for_scene(self.scene), **sizes)
         played["next", "reward"] = cast(Tensor, played["next", "reward"]) / self.options.action_repeat
         return played
 
@@ -124,7 +124,7 @@ class SuiteActorCriticTask(ActorCriticTask):
         state = torch.cat((played["state"][:, :1], state), 1)
         action = played["action"].repeat_interleave(self.model_steps, 1)
         target = played["target"][:, 0] if self.targeted else None
-        return windows(state, action, paid if self.learns_reward else None, target)
+        return windows(state, action, paid, target)
 
     def learn_reward(self, data: TensorDict, index: int) -> None:
         if self.learns_reward:

@@ -7,11 +7,11 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_gn.actor_critic.options import ActorCriticOptions
 from torchrl_gn.actor_critic.target_squares import TargetSquares
-from torchrl_gn.actor_critic.trajectories import WINDOW, play, unbroken, windows
+from torchrl_gn.actor_critic.trajectories import WINDOW, exploring, play, unbroken, windows
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import (
     BoundEnsemble,
@@ -33,7 +33,7 @@ from torchrl_gn.training import Workers, fit
 
 JUDGED_STEPS = 500  # control steps of an episode
 JUDGED_SEED = 10_000
-_SCALED_BY = 5  # last rounds whose rewards the value is scaled by
+_SCALED_BY = 10_000  # states to imagine from, by whose rewards the value is scaled
 
 
 class ActorCriticTask:
@@ -43,8 +43,8 @@ class ActorCriticTask:
     plays: :meth:`collect` once, then :meth:`play` and :meth:`add` after each round. Subclass it to play elsewhere (a
     robot): override :meth:`play_at_random`, :meth:`play` and :meth:`judged`; or to learn more: :meth:`learn_reward`.
 
-    Trajectories are ``[K]``: ``state`` ``[K, 51, N, 13]``, ``action`` ``[K, 50, A]`` of the model's steps and, where
-    they have one, ``target`` ``[K, 3]`` of the episode, metres.
+    Trajectories are ``[K]``: ``state`` ``[K, 51, N, 13]``, ``action`` ``[K, 50, A]`` of the model's steps, ``reward``
+    ``[K, 50, 1]``, what they were paid, and, where they have one, ``target`` ``[K, 3]`` of the episode, metres.
 
     Args:
         scene: with the control step of the policy.
@@ -116,7 +116,7 @@ class ActorCriticTask:
         if networks is None:
             model = self._new_model()
             given = {"discount": options.discount, "hidden": options.hidden, "target": self.targeted}
-            self.value = StateValue(self.scene, canonicalizer=self.invariances, **given)
+            self.value = StateValue(self.scene, combine="mean", canonicalizer=self.invariances, **given)
         else:
             if missing := set(self.network_names) - set(networks):
                 raise ValueError(f"networks= lacks {sorted(missing)}: give all of {list(self.network_names)}, or none.")
@@ -163,7 +163,9 @@ class ActorCriticTask:
         """Trajectories of random control."""
         first = self.options.first
         found = collect_trajectories(self.scene, first.trajectories, steps=first.length, seed=self.options.seed)
-        return windows(found["state"], found["action"])
+        state, action = cast(Tensor, found["state"]), cast(Tensor, found["action"])
+        with torch.no_grad():
+            return windows(state, action, self.reward(state[:, :-1], action, state[:, 1:]))
 
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
         """Trajectories of a round's episodes with exploration, without those that became unstable.
@@ -175,14 +177,16 @@ class ActorCriticTask:
         starts = None if self.squares is None else self.squares.start_states
         env = SceneEnv(self.scene, self.reward, seed=seed, start_states=starts)
         sizes = {"episodes": self.options.episodes, "steps": self.options.steps}
-        played = unbroken(play(env, policy.for_scene(self.scene), **sizes, explore=True))
-        return windows(torch.cat((played["state"], played["next", "state"][:, -1:]), 1), played["action"])
+        explorer = exploring(policy.for_scene(self.scene), **sizes, color=self.options.noise_color)
+        played = unbroken(play(env, explorer, **sizes))
+        state = torch.cat((played["state"], played["next", "state"][:, -1:]), 1)
+        return windows(state, cast(Tensor, played["action"]), cast(Tensor, played["next", "reward"]))
 
     def judged(self, policy: BoundedPolicy) -> TensorDict:
         """Episodes ``[M, T]`` without exploration, from the same starts every round; rewards of a frame."""
         env = SceneEnv(self.scene, self.judge, seed=JUDGED_SEED, start_states=self.judged_starts)
         sizes = {"episodes": self.options.evaluate.episodes, "steps": self.options.evaluate.steps or JUDGED_STEPS}
-        return play(env, policy.for_scene(self.scene), **sizes, explore=False)
+        return play(env, policy.for_scene(self.scene), **sizes)
 
     def learn_model(self, index: int) -> None:
         """Train the model, and what else is learned of the scene, on all data; tell normalisers of the newest.
@@ -205,14 +209,9 @@ class ActorCriticTask:
         self.learn_reward(data, index)
         self._take_snapshot()
         seen = self.newest["state"].flatten(0, 1)
-        last = cast(TensorDict, torch.cat(cast(Any, self.data[-_SCALED_BY:])))
-        with torch.no_grad():
-            reward = cast(Reward, self.loss.env.reward)  # on the device
-            targets = last["target"].unsqueeze(1).expand(*last["action"].shape[:2], 3) if self.targeted else None
-            rewards = self.model_steps * reward(last["state"][:, :-1], last["action"], last["state"][:, 1:], targets)
         target = self.newest["target"].repeat_interleave(WINDOW + 1, 0) if self.targeted else None
         seen = seen if self.squares is None else self.squares.move(seen)
-        self.loss.fit_normalizers(seen, rewards.flatten(0, 1), target)
+        self.loss.fit_normalizers(seen, self.model_steps * cast(Tensor, self.starts()(_SCALED_BY)["reward"]), target)
 
     def learn_reward(self, data: TensorDict, index: int) -> None:
         """Nothing: the reward is known. Override it to learn from all trajectories ``[K]`` in round ``index``."""
@@ -229,21 +228,29 @@ class ActorCriticTask:
             env.world_model = cast(Any, model.split() if isinstance(model, BoundEnsemble) else model)
 
     def starts(self) -> Callable[[int], TensorDict]:
-        """What draws states ``[size]`` to imagine from, half of the newest episodes, half of all."""
-        found = []
-        for data in self.data, [self.newest]:
-            states = torch.cat([part["state"][:, :-1].flatten(0, 1) for part in data])
-            entries = {"state": states}
-            if self.targeted:
-                entries["target"] = torch.cat([part["target"].repeat_interleave(WINDOW, 0) for part in data])
-            found.append(TensorDict(entries, [len(states)]))
+        """What draws states ``[size]`` to imagine from, half of the newest trajectories, half of all.
+
+        With the ``reward`` of the step that was played there.
+        """
+        states, newest = _steps(cast(TensorDict, torch.cat(cast(Any, self.data)))), _steps(self.newest)
 
         def draw(size: int) -> TensorDict:
-            counts = size - size // 2, size // 2
-            draws = zip(found, counts, strict=True)
-            parts = [of[torch.randint(len(of), (count,), device=self.device)] for of, count in draws]
+            found = [_any(states, size - size // 2), _any(newest, size // 2)]
             if self.squares is not None:
-                parts[0]["state"] = self.squares.move(parts[0]["state"])
-            return cast(TensorDict, torch.cat(cast(Any, parts)))
+                found[0]["state"] = self.squares.move(cast(Tensor, found[0]["state"]))
+            return cast(TensorDict, torch.cat(cast(Any, found)))
 
         return draw
+
+
+def _steps(data: TensorDict) -> TensorDict:
+    """States ``[K T]`` before the steps of trajectories ``[K]``, their rewards, and their targets."""
+    entries = {"state": cast(Tensor, data["state"])[:, :-1].flatten(0, 1), "reward": data["reward"].flatten(0, 1)}
+    if "target" in data.keys():
+        entries["target"] = cast(Tensor, data["target"]).repeat_interleave(WINDOW, 0)
+    return TensorDict(entries, [len(entries["state"])])
+
+
+def _any(states: TensorDict, count: int) -> TensorDict:
+    """States at random."""
+    return states[torch.randint(len(states), (count,), device=states["state"].device)]

@@ -79,7 +79,7 @@ class SHACLoss(LossModule):
         value: StateValue,
         env: ModelEnv,
         *,
-        steps: int = 8,
+        steps: int = 5,
         action_repeat: int = 1,
         lmbda: float = 0.95,
         policy_lmbda: float = 0.6,

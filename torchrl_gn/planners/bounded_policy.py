@@ -106,15 +106,21 @@ class BoundedPolicy(TensorDictModuleBase):
         """Actions ``[*B, A]`` in states ``[*B, N, 13]``; ValueError for another shape."""
         return self._bounded(self.unbounded(state, target))
 
-    def sample(self, state: Tensor, copies: int = 1, target: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def sample(
+        self, state: Tensor, copies: int = 1, target: Tensor | None = None, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Random actions ``[*B, A]``, reparameterised, and the log densities ``[*B]`` of their scaled ones.
 
-        Each of ``copies`` equal parts of the first dimension gets the same noise.
+        Args:
+            copies: equal parts of the first dimension, which get the same noise.
+            noise: ``[*B, A]`` of unit variance. Default: independent Gaussian noise.
         """
         std = self.log_stds.clamp(*_LOG_STD_BOUNDS).exp()
         before = self.unbounded(state, target)
-        noise = torch.randn_like(before if copies == 1 else before.chunk(copies)[0])
-        noise = noise if copies == 1 else torch.cat([noise] * copies)
+        if noise is None:
+            noise = torch.randn_like(before if copies == 1 else before.chunk(copies)[0])
+            noise = noise if copies == 1 else torch.cat([noise] * copies)
+        noise = noise.to(before)
         before = before + std * noise
         # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)), which does not cancel.
         slope = 2 * (math.log(2) - before - softplus(-2 * before))

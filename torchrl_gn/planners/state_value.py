@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -14,18 +14,22 @@ from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.planners.state_features import StateFeatures, check_hidden
 from torchrl_gn.scenes import Scene
 
+Combine = Literal["min", "mean"]
+
 
 class StateValue(nn.Module):
     r"""Discounted return :math:`V(s) = \sum_k \gamma^k r_k` of the policy in the data, from a state on.
 
-    The smallest of a few networks over the scene's :class:`~torchrl_gn.planners.StateFeatures`, so that states where
-    they disagree are not sought. Differentiable twice. For environments to plan on, as their ``terminal``; learned by
-    :func:`~torchrl_gn.training.fit_value`. 0 until then.
+    A few networks over the scene's :class:`~torchrl_gn.planners.StateFeatures`. Differentiable twice. For environments
+    to plan on, as their ``terminal``, learned by :func:`~torchrl_gn.training.fit_value`; or of an actor-critic
+    (:class:`~torchrl_gn.objectives.SHACLoss`). 0 until it has learned.
 
     Args:
         discount: :math:`\gamma` of a control step.
         hidden: hidden sizes of each network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
         members: number of networks.
+        combine: ``"min"``, the smallest of the networks: a planner does not seek states where they disagree, which are
+            not in the data; ``"mean"``: a policy that learns and plays must find them.
         canonicalizer, target: as of the features.
 
     Example:
@@ -43,6 +47,7 @@ class StateValue(nn.Module):
         discount: float = 0.99,
         hidden: Sequence[int] = (128, 128),
         members: int = 2,
+        combine: Combine = "min",
         canonicalizer: Canonicalizer | None = None,
         target: bool = False,
     ) -> None:
@@ -51,7 +56,9 @@ class StateValue(nn.Module):
             raise ValueError(f"discount={discount} must be above 0 and at most 1.")
         if members < 1:
             raise ValueError(f"members={members} must be at least 1.")
-        self.discount, self.hidden = float(discount), check_hidden(hidden)
+        if combine not in get_args(Combine):
+            raise ValueError(f"combine={combine!r} must be {' or '.join(get_args(Combine))}.")
+        self.discount, self.hidden, self.combine = float(discount), check_hidden(hidden), combine
         self.features = StateFeatures(scene, canonicalizer, target=target)
         self.members = nn.ModuleList(LayerNormMLP(self.features.size, 1, self.hidden) for _ in range(members))
         self.normalizer = Normalizer(1)
@@ -72,7 +79,8 @@ class StateValue(nn.Module):
 
     def of_features(self, features: Tensor) -> Tensor:
         """Values ``[*B, 1]`` of features ``[*B, F]``."""
-        return self.normalizer.inverse(self.normalized(features).amin(-1, keepdim=True))
+        each = self.normalized(features)
+        return self.normalizer.inverse(each.amin(-1, True) if self.combine == "min" else each.mean(-1, True))
 
     def normalized(self, features: Tensor) -> Tensor:
         """Every network's value ``[*B, members]``, in standard deviations from the mean."""
@@ -80,7 +88,7 @@ class StateValue(nn.Module):
 
     def description(self) -> dict[str, Any]:
         """JSON-able values from which :meth:`from_description` rebuilds the network."""
-        own = {"discount": self.discount, "hidden": self.hidden, "members": len(self.members)}
+        own = {"discount": self.discount, "hidden": self.hidden, "members": len(self.members), "combine": self.combine}
         return {**self.features.description(), **own}
 
     @classmethod
