@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.planners.state_features import StateFeatures, check_hidden
 from torchrl_gn.rewards import Reward
@@ -62,13 +63,9 @@ class StateReward(Reward):
         target = None
         if self.target_shape is not None:
             target = self.require_task(task, next_state).expand(*next_state.shape[:-2], 3)
-        before, after = (self.features(each, self.dtype, target) for each in (state, next_state))
+        dtype = dtype_of(self.network)
+        before, after = (self.features(each, dtype, target) for each in (state, next_state))
         return self.normalizer.inverse(self.network(self.inputs(before, action, after))).to(next_state.dtype)
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of the network."""
-        return next(self.network.parameters()).dtype
 
     def inputs(self, before: Tensor, action: Tensor, after: Tensor) -> Tensor:
         """What the network reads ``[*B, 2 F + A]`` of features ``[*B, F]`` before and after an action."""

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
+from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.layer_norm_mlp import renormalize
 from torchrl_gn.planners.state_reward import StateReward
 from torchrl_gn.training.fit_batches import fit_batches
@@ -49,7 +50,7 @@ def fit_reward(
     require_finite(paid, "'reward' of the data")
     target = cast(Tensor, data["target"]).unsqueeze(1).expand(*state.shape[:2], 3) if reward.features.target else None
     with torch.no_grad():
-        features = reward.features.refit(state, target, reward.dtype)
+        features = reward.features.refit(state, target, dtype_of(reward.network))
         inputs = reward.inputs(features[:, :-1], action, features[:, 1:]).flatten(0, 1)
     paid = paid.flatten(0, 1).double()
     renormalize([reward.network], reward.normalizer, paid)
