@@ -1,4 +1,4 @@
-"""A short-horizon actor-critic: a policy, its value and its model learn from what it plays, round by round."""
+"""Short-horizon actor-critic: policy, value and model learn from the policy's own episodes, round by round."""
 
 from torchrl_gn.actor_critic.optimizer import ActorCriticOptimizer as ActorCriticOptimizer
 from torchrl_gn.actor_critic.options import ActorCriticOptions as ActorCriticOptions

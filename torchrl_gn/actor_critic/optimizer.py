@@ -1,4 +1,4 @@
-"""The optimiser of a short-horizon actor-critic."""
+"""Optimiser of the short-horizon actor-critic."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _KEPT = {"reward": "imagined_reward", "loss_value": "loss_value", "entropy": "en
 
 
 class ActorCriticOptimizer:
-    """Updates policy, values and entropies' weights by Adam, each kind with its own rate and clipped gradients.
+    """Update policy, values and entropy weights by Adam, each with its own learning rate and clipped gradients.
 
-    The policy climbs the values, which must keep up with it: they take further steps on what was imagined. On an NVIDIA
-    GPU the third update is recorded as a CUDA graph, which all after it replay.
+    The policy climbs the values, so the values must keep up: they take further steps on the same imagined data. On an
+    NVIDIA GPU the third update is recorded as a CUDA graph, and all later updates replay it.
 
     Args:
-        losses: of every task, whose policies share their weights.
-        policy_lr, value_lr, alpha_lr: learning rates of the policy, of the values, and of the entropies' weights.
-        value_steps: of the values in every update, after the one together with the policy, each on a random half.
+        losses: one loss a task; their policies share weights.
+        policy_lr, value_lr, alpha_lr: learning rates of the policy, of the values, and of the entropy weights.
+        value_steps: further steps of the values in every update, each on a random half of the imagined steps.
     """
 
     def __init__(
@@ -55,11 +55,20 @@ class ActorCriticOptimizer:
     def learn(
         self, starts: Sequence[Callable[[int], TensorDict]], *, updates: int, batch_size: int, desc: str
     ) -> dict[str, float]:
-        """Update from the states ``[batch_size]`` that every task's ``starts`` draws; means of the last quarter.
+        """Run ``updates`` updates and return the means of their last quarter.
 
-        They have ``state`` ``[batch_size, N, 13]`` and, where episodes have one, ``target`` ``[batch_size, 3]``. The
-        means are ``imagined_reward`` (of a step), ``loss_value`` and ``entropy``. FloatingPointError if a gradient is
-        not finite; that step changes nothing.
+        Args:
+            starts: a function a task, which draws start states of imagination: ``state`` ``[batch_size, N, 13]`` and,
+                in tasks with a target, ``target`` ``[batch_size, 3]``.
+            updates: number of updates.
+            batch_size: start states of a task in an update.
+            desc: label of the progress bar.
+
+        Returns:
+            ``imagined_reward`` of a control step, ``loss_value`` and ``entropy``.
+
+        Raises:
+            FloatingPointError: a gradient is not finite; that step changes nothing.
         """
         kept: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
@@ -72,7 +81,7 @@ class ActorCriticOptimizer:
         return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in kept.items()}
 
     def _update(self, draws: Sequence[Callable[[], TensorDict]], when: str) -> list[dict[str, Tensor]]:
-        """Update from the states that are drawn for every loss; numbers of each. See :meth:`learn` for errors."""
+        """Update once from newly drawn states; return the numbers of each loss. See :meth:`learn` for errors."""
         if self._graph is None and self._by_torch < 1:
             self._record([draw() for draw in draws])
         if self._graph is None:
@@ -91,7 +100,7 @@ class ActorCriticOptimizer:
     def _steps(
         self, states: Sequence[TensorDict], clip: Callable[[Sequence[Tensor]], object]
     ) -> list[dict[str, Tensor]]:
-        """Update from states ``[B]`` of every loss, with gradients that ``clip`` clips; numbers of each."""
+        """Update once from states ``[B]`` for each loss, clipping gradients by ``clip``; return each loss's numbers."""
         self.optimizer.zero_grad()
         found = [loss(each) for loss, each in zip(self.losses, states, strict=True)]
         for out in found:
@@ -99,7 +108,7 @@ class ActorCriticOptimizer:
         self._step(self.clipped, clip)
         imagined = [out["imagined"].flatten() for out in found]
         for _ in range(self.value_steps):
-            self.optimizer.zero_grad()  # the policy, without a gradient, stays
+            self.optimizer.zero_grad()  # the policy has no gradient now and stays as it is
             for loss, steps in zip(self.losses, imagined, strict=True):
                 rows = torch.randint(len(steps), (-(-len(steps) // 2),), device=loss.log_alpha.device)
                 loss.value_loss(steps[rows]).backward()
@@ -112,9 +121,9 @@ class ActorCriticOptimizer:
         self.optimizer.step()
 
     def _record(self, states: list[TensorDict]) -> None:
-        """Record the update of as many states."""
+        """Record the update on states of these shapes as a CUDA graph."""
         self._states = states
-        gc.collect()  # what earlier updates left of their gradients belongs to another stream
+        gc.collect()  # gradients of earlier updates belong to another stream
         self._set_capturable(True)
         self.optimizer.zero_grad()
         parameters = [each for of in self.clipped for each in of]
@@ -128,17 +137,17 @@ class ActorCriticOptimizer:
             group["capturable"] = value
 
     def _on_device(self) -> Tensor:
-        """The update without waiting for the device: numbers of the losses, and norms of the gradients it clips."""
+        """Update without waiting for the device; return the losses' numbers, then the norms of all gradients."""
         norms: list[Tensor] = []
         found = self._steps(self._states, lambda group: norms.append(clip_on_device(group, _MAX_NORM)))
         return torch.stack([*(value.double() for of in found for value in of.values()), *norms])
 
     def state_dict(self) -> dict[str, Any]:
-        """State to resume from, without the networks."""
+        """Return the state to resume from, without the networks."""
         return {"adam": self.optimizer.state_dict(), "log_alphas": [alpha.detach() for alpha in self.alphas]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from what :meth:`state_dict` returned; ValueError if it is of other networks, or forged."""
+        """Resume from a :meth:`state_dict`; ValueError if it belongs to other networks or is malformed."""
         require_like(self.state_dict()["log_alphas"], state["log_alphas"], "training.log_alphas")
         load_optimizer(self.optimizer, state["adam"])
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Options of a short-horizon actor-critic, checked before anything is played."""
+"""Options of the short-horizon actor-critic, checked before anything is played."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ PolicyKind = Literal["mlp", "graph"]
 
 @dataclass(frozen=True, kw_only=True)
 class FirstTrajectories:
-    """Trajectories of random control, before the first round. ValueError if an option is out of range."""
+    """Random control before the first round. ValueError if an option is out of range."""
 
-    trajectories: int = 25  # number of them
+    trajectories: int = 25  # number of trajectories
     length: int = 100  # control steps of each, at least 50
     steps: int = 1000  # training steps of the model on them
 
@@ -30,9 +30,9 @@ class FirstTrajectories:
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedEpisodes:
-    """Episodes without exploration, from the same starts every round. ValueError if an option is out of range."""
+    """Evaluation episodes: no exploration, same starts every round. ValueError if an option is out of range."""
 
-    episodes: int = 5  # number of them
+    episodes: int = 5  # number of episodes
     steps: int | None = None  # control steps of each; None: a whole episode of the suite, elsewhere 500
 
     def __post_init__(self) -> None:
@@ -61,23 +61,23 @@ class ActorCriticOptions:
     episodes: int = 5  # episodes of a task that a round plays, with exploration
     steps: int = 200  # control steps of each, a multiple of 50
     noise_color: float = 1.0  # of exploration's noise in time: 0 white, 1 pink, 2 red, see colored_noise
-    evaluate: JudgedEpisodes = field(default_factory=JudgedEpisodes)  # episodes that the policy is judged by
+    evaluate: JudgedEpisodes = field(default_factory=JudgedEpisodes)  # episodes that evaluate the policy
     action_repeat: int = 2  # frames of a control step, in tasks of the suite
-    per_frame: bool = True  # whether the model of a task of the suite is of one frame, or else of a control step
+    per_frame: bool = True  # suite tasks: the model predicts one frame; False: one control step
 
     horizon: int = 5  # control steps that are imagined
-    policy_lmbda: float = 0.6  # lambda of the policy's returns: 1 goes through the model to the last step
-    outlier: float = 3.0  # gradients of a trajectory are shortened to so many times the batch's median
+    policy_lmbda: float = 0.6  # lambda of the policy's returns; 1: gradients pass through all imagined steps
+    outlier: float = 3.0  # longest gradient of a trajectory, in medians of the batch; longer ones are shortened
     discount: float = 0.99  # discount of a control step
     lmbda: float = 0.95  # lambda of the value's TD(lambda) targets
     updates: int = 100  # updates of policy and value in a round
     value_steps: int = 6  # further steps of the value in an update
-    batch_size: int = 128  # imagined trajectories of an update, half from the states of the last round
-    pessimism: float = 0.0  # standard deviations of the members' returns that the policy's return is less by
+    batch_size: int = 128  # imagined trajectories of an update, half from states of the last round
+    pessimism: float = 0.0  # the policy maximises the members' mean return less this many standard deviations
     policy_lr: float = 1e-3  # learning rate of the policy
     value_lr: float = 1e-3  # learning rate of the value
     alpha_lr: float = 5e-3  # learning rate of the entropy's weight
-    average: int = 10  # rounds whose policies are averaged to be judged, an eighth of all at most
+    average: int = 10  # evaluate the mean of the last policies: this many rounds, at most an eighth of all
 
     policy: PolicyKind = "mlp"  # "mlp", or "graph": a graph network, for several scenes
     hidden: Sequence[int] = (128, 128)  # hidden sizes of value, learned reward and a policy of kind "mlp"
@@ -87,13 +87,13 @@ class ActorCriticOptions:
     model: Mapping[str, Any] = field(
         default_factory=lambda: {"hidden": 64, "latent": 64}
     )  # options of ForwardModel.for_scene
-    members: int = 1  # models of an ensemble; each imagines its share of the batch
+    members: int = 1  # models of the ensemble; each imagines its share of the batch
 
-    model_steps: int = 300  # training steps of every model in a round, on all trajectories
+    model_steps: int = 300  # training steps of each model in a round, on all trajectories
     model_lr: float = 3e-3  # highest learning rate of the model after the first round
-    reward_steps: int = 300  # training steps of a learned reward in a round, thrice as many in the first
+    reward_steps: int = 300  # training steps of a learned reward in a round; three times as many in the first
 
-    seed: int = 0  # seed of random control and of the batches of model and reward; the rest draws from torch's own
+    seed: int = 0  # seed of random control and of model and reward batches; the rest uses torch's generator
     device: str = "cpu"  # device of the networks, or "cuda"; MuJoCo plays on the processor
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A task of the control suite for an actor-critic: played by dm_control, its reward known or learned."""
+"""Task of the control suite for an actor-critic: dm_control plays it; its reward is known or learned."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ LEARNED = "learned"
 
 
 class SuiteActorCriticTask(ActorCriticTask):
-    """A task of the suite, whose policy is judged by what dm_control pays.
+    """A task of the control suite; dm_control's reward evaluates the policy.
 
-    The policy and value are of ``action_repeat`` frames of the suite, the model and the reward too, or with
-    ``per_frame`` of one frame, as what a body does in contact is predicted the worse the longer the step.
+    A control step of policy and value is ``action_repeat`` frames of the suite. Model and reward predict one frame
+    with ``per_frame``, else one control step: longer steps make contacts harder to predict.
 
     Args:
-        system: such as ``"suite:cheetah/run"``.
-        reward: ``"learned"`` from what was paid, or what :func:`~torchrl_gn.rewards.make_reward` takes: None for the
-            task's own, known exactly.
+        system: the task's name, such as ``"suite:cheetah/run"``.
+        reward: ``"learned"`` from paid rewards, None for the task's own reward, known exactly, or other terms of
+            :func:`~torchrl_gn.rewards.make_reward`.
 
     Raises:
-        ValueError: there is no such task, its reward is not known, or episodes are longer than its own.
+        ValueError: there is no such task, its reward is not known, or episodes are longer than the task's.
         ImportError: dm_control is missing.
 
     Example:
@@ -115,7 +115,7 @@ class SuiteActorCriticTask(ActorCriticTask):
         return played
 
     def _windows(self, played: TensorDict) -> TensorDict:
-        """Trajectories of the model's steps."""
+        """Cut episodes into trajectories with the model's steps."""
         played = unbroken(played)
         if self.options.per_frame:
             state, paid = (played["next", name].flatten(1, 2) for name in ("frames", "paid"))
@@ -133,6 +133,6 @@ class SuiteActorCriticTask(ActorCriticTask):
 
 
 def _replay(actions: Tensor) -> Callable[[TensorDictBase], TensorDictBase]:
-    """A policy that gives ``actions`` ``[T, A]`` one after another."""
+    """Return a policy that replays ``actions`` ``[T, A]``."""
     rest = iter(actions.unsqueeze(1))
     return lambda tensordict: tensordict.set("action", next(rest))

@@ -1,4 +1,4 @@
-"""Targets of swimmers, in squares around the start."""
+"""Random targets of swimmers, in squares around the start."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from torchrl_gn.scenes import ObservationGraph, Scene
 
 
 class TargetSquares:
-    """Targets anywhere in a square around the start, one of several sizes. The target is the origin: the scene moves.
+    """Random targets in a square around the start. The origin is the target, so the scene moves instead.
 
     Args:
-        scene: with a root that slides along x and y, in physics that are the same everywhere: a swimmer, say.
-        half_sides: of the squares, metres, equally likely.
+        scene: a scene whose root slides along x and y and whose physics do not depend on the place, such as a swimmer.
+        half_sides: half sides of the squares, metres; all equally likely.
 
     Raises:
         ValueError: a half side is not positive, or the scene cannot move so.
@@ -35,7 +35,7 @@ class TargetSquares:
     def __init__(self, scene: Scene, half_sides: Sequence[float]) -> None:
         model, self.scene = scene.model, scene
         self.half_sides = np.array([float(each) for each in half_sides])
-        self._sizes = torch.from_numpy(self.half_sides)  # where states are
+        self._sizes = torch.from_numpy(self.half_sides)  # on the device of the states
         if not (self.half_sides > 0).all():
             raise ValueError(f"half_sides={list(half_sides)} must be positive half sides of squares, metres.")
         slides = [
@@ -47,16 +47,17 @@ class TargetSquares:
         self.where = [1 + model.jnt_qposadr[found[0]] for found in slides]  # in a MuJoCo state, after the time
 
     def start_states(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Full MuJoCo states ``[n, S]``, for :class:`~torchrl_gn.envs.SceneEnv`."""
+        """Draw full MuJoCo states ``[n, S]``, for :class:`~torchrl_gn.envs.SceneEnv`."""
         states = sample_start_states(self.scene, n, rng)
         size = rng.choice(self.half_sides, (n, 1))
         states[:, self.where] = rng.uniform(-size, size, (n, 2))
         return states
 
     def suite_states(self, n: int, seed: int) -> np.ndarray:
-        """Full MuJoCo states ``[n, S]`` of the suite's own starts and targets, as recipes/svg.py judges by.
+        """Draw full MuJoCo states ``[n, S]`` with the suite's own starts and targets, as recipes/svg.py evaluates.
 
-        ValueError if the scene is no swimmer of the suite.
+        Raises:
+            ValueError: the scene is not a swimmer of the suite.
         """
         scene, links = self.scene, self.scene.num_nodes - 1
         if scene.name != f"swimmer{links}":
@@ -72,7 +73,7 @@ class TargetSquares:
         return states
 
     def move(self, state: Tensor) -> Tensor:
-        """States ``[B, N, 13]`` with the first body somewhere else in a square around the target."""
+        """Move states ``[B, N, 13]`` so that the first body lies at random in a square around the target."""
         device, count = state.device, len(state)
         self._sizes = self._sizes.to(device)
         sizes = self._sizes[torch.randint(len(self._sizes), (count, 1, 1), device=device)]

@@ -1,4 +1,4 @@
-"""A task of a short-horizon actor-critic: a scene with its reward, and what learns of them."""
+"""Task of the short-horizon actor-critic: a scene, its reward, its trajectories and its networks."""
 
 from __future__ import annotations
 
@@ -31,32 +31,35 @@ from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import Workers, fit
 
-JUDGED_STEPS = 500  # control steps of an episode
+JUDGED_STEPS = 500  # control steps of an evaluation episode
 JUDGED_SEED = 10_000
-_SCALED_BY = 10_000  # states to imagine from, by whose rewards the value is scaled
+_SCALED_BY = 10_000  # start states of imagination, whose rewards scale the value
 
 
 class ActorCriticTask:
-    """A scene with its reward, and the model and value that learn for it, with their trajectories on one device.
+    """A scene and its reward, with the model and value that learn for it and their trajectories on one device.
 
-    :class:`ActorCritic` calls :meth:`begin`, and in every round :meth:`learn_model` and :meth:`starts`. The caller
-    plays: :meth:`collect` once, then :meth:`play` and :meth:`add` after each round. Subclass it to play elsewhere (a
-    robot): override :meth:`play_at_random`, :meth:`play` and :meth:`judged`; or to learn more: :meth:`learn_reward`.
+    :class:`ActorCritic` calls :meth:`begin` once, and :meth:`learn_model` and :meth:`starts` in every round. The caller
+    plays: :meth:`collect` once, then :meth:`play` and :meth:`add` in every round. Subclass it to play elsewhere, such
+    as on a robot (override :meth:`play_at_random`, :meth:`play` and :meth:`judged`), or to learn more
+    (:meth:`learn_reward`).
 
-    Trajectories are ``[K]``: ``state`` ``[K, 51, N, 13]``, ``action`` ``[K, 50, A]`` of the model's steps, ``reward``
-    ``[K, 50, 1]``, what they were paid, and, where they have one, ``target`` ``[K, 3]`` of the episode, metres.
+    Trajectories are ``[K]``, in steps of the model: ``state`` ``[K, 51, N, 13]``, ``action`` ``[K, 50, A]``, the paid
+    ``reward`` ``[K, 50, 1]`` and, in tasks with a target, the episode's ``target`` ``[K, 3]``, metres.
 
     Args:
-        scene: with the control step of the policy.
-        reward: of a step of the model, differentiable.
-        judge: reward of the judged episodes. Default: the same.
-        squares: where the targets of a reward lie that goes to the origin. Default: the scene's own starts.
-        judged_starts: of the judged episodes, as of :class:`~torchrl_gn.envs.SceneEnv`. Default: those of ``squares``.
-        modelled: the scene with the control step of the model, of which an action is as many as fill it. Default: its.
-        invariances: of the task. Default: those of scene and reward.
+        scene: scene with the control step of the policy.
+        reward: differentiable reward of a model step.
+        judge: reward of the evaluation episodes. Default: ``reward``.
+        squares: random targets, for a reward whose target is the origin. Default: the scene's own starts.
+        judged_starts: start states of the evaluation episodes, see :class:`~torchrl_gn.envs.SceneEnv`. Default: those
+            of ``squares``.
+        modelled: scene with the control step of the model, a whole number of which fill one of the policy. Default:
+            ``scene``.
+        invariances: invariances of the task. Default: those of scene and reward.
 
     Raises:
-        ValueError: the reward has a target that the policy cannot know, or there is no such device.
+        ValueError: the reward has a target that the policy cannot read, or there is no such device.
 
     Example:
         >>> from torchrl_gn.actor_critic import FirstTrajectories
@@ -76,7 +79,7 @@ class ActorCriticTask:
     loss: SHACLoss
 
     network_names: tuple[str, ...] = ("value", "model")
-    """What learns for the task beside the policy, by name."""
+    """Names of the task's networks, without the policy."""
 
     def __init__(
         self,
@@ -95,7 +98,7 @@ class ActorCriticTask:
             raise ValueError(f"A policy of states does not know the target of {reward}.")
         self.scene, self.options, self.reward, self.judge = scene, options, reward, judge or reward
         self.modelled = modelled or scene
-        self.model_steps = round(scene.timestep / self.modelled.timestep)  # under an action
+        self.model_steps = round(scene.timestep / self.modelled.timestep)  # model steps of an action
         self.device = Workers().device(options.device)
         self.squares = squares
         own_starts = None if squares is None else squares.start_states
@@ -104,10 +107,11 @@ class ActorCriticTask:
         self.data: list[TensorDict] = []
 
     def begin(self, policy: BoundedPolicy, networks: Mapping[str, nn.Module] | None = None) -> None:
-        """Make the networks and the loss of a policy, bound to the scene.
+        """Make the networks, and the loss of ``policy``.
 
         Args:
-            networks: to go on with, by :attr:`network_names`. Default: new ones, from torch's generator.
+            policy: a policy for the scene.
+            networks: networks to continue with, by :attr:`network_names`. Default: new ones, from torch's generator.
 
         Raises:
             ValueError: one of the networks is missing.
@@ -123,13 +127,13 @@ class ActorCriticTask:
             model, self.value = networks["model"], cast(StateValue, networks["value"])
         self.trained = cast("ForwardModel | Ensemble", model).to(self.device)
         self.model = self.trained.bind(self.modelled)
-        imagined = ModelEnv(self.model, self.reward)  # until the model has learned: learn_model() takes a snapshot
+        imagined = ModelEnv(self.model, self.reward)  # replaced by a snapshot in learn_model()
         given = {"steps": options.horizon, "lmbda": options.lmbda, "pessimism": options.pessimism}
         given |= {"action_repeat": self.model_steps, "policy_lmbda": options.policy_lmbda, "outlier": options.outlier}
         self.loss = SHACLoss(policy, self.value, imagined, **given).to(self.device)
 
     def _new_model(self) -> ForwardModel | Ensemble:
-        """A model with fresh weights, or an ensemble."""
+        """Return a model, or an ensemble, with fresh weights."""
         members, options = self.options.members, self.options.model
         if members == 1:
             return ForwardModel.for_scene(self.modelled, **options)
@@ -137,7 +141,7 @@ class ActorCriticTask:
 
     @property
     def networks(self) -> dict[str, nn.Module]:
-        """The networks by :attr:`network_names`, once begun."""
+        """The networks by :attr:`network_names`, after :meth:`begin`."""
         return {"value": self.value, "model": self.trained}
 
     @property
@@ -146,21 +150,21 @@ class ActorCriticTask:
         return cast(Any, self.model.members) if isinstance(self.model, BoundEnsemble) else [self.model]
 
     def collect(self) -> None:
-        """Play at random, and begin the trajectories with these."""
+        """Play random control; its trajectories replace all others."""
         self.data = []
         self.add(self.play_at_random())
 
     def add(self, played: TensorDict) -> None:
-        """Keep trajectories that were played."""
+        """Add played trajectories."""
         self.data.append(played.to(self.device))
 
     @property
     def newest(self) -> TensorDict:
-        """The last trajectories. A round whose episodes all became unstable left none."""
+        """The latest trajectories that are not empty. A round is empty if all its episodes became unstable."""
         return next(played for played in reversed(self.data) if len(played))
 
     def play_at_random(self) -> TensorDict:
-        """Trajectories of random control."""
+        """Play random control and return its trajectories."""
         first = self.options.first
         found = collect_trajectories(self.scene, first.trajectories, steps=first.length, seed=self.options.seed)
         state, action = cast(Tensor, found["state"]), cast(Tensor, found["action"])
@@ -168,11 +172,11 @@ class ActorCriticTask:
             return windows(state, action, self.reward(state[:, :-1], action, state[:, 1:]))
 
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
-        """Trajectories of a round's episodes with exploration, without those that became unstable.
+        """Play a round's episodes with exploration; return their trajectories, without unstable episodes.
 
         Args:
-            policy: on the processor, of this scene or one that drives it (:meth:`BoundedPolicy.for_scene`).
-            seed: of the starts. Noise is drawn by torch's generator.
+            policy: policy on the CPU, for this scene or able to drive it (:meth:`BoundedPolicy.for_scene`).
+            seed: seed of the start states. Exploration noise comes from torch's generator.
         """
         starts = None if self.squares is None else self.squares.start_states
         env = SceneEnv(self.scene, self.reward, seed=seed, start_states=starts)
@@ -183,16 +187,16 @@ class ActorCriticTask:
         return windows(state, cast(Tensor, played["action"]), cast(Tensor, played["next", "reward"]))
 
     def judged(self, policy: BoundedPolicy) -> TensorDict:
-        """Episodes ``[M, T]`` without exploration, from the same starts every round; rewards of a frame."""
+        """Play evaluation episodes ``[M, T]``: no exploration, the same starts every round, rewards a frame."""
         env = SceneEnv(self.scene, self.judge, seed=JUDGED_SEED, start_states=self.judged_starts)
         sizes = {"episodes": self.options.evaluate.episodes, "steps": self.options.evaluate.steps or JUDGED_STEPS}
         return play(env, policy.for_scene(self.scene), **sizes)
 
     def learn_model(self, index: int) -> None:
-        """Train the model, and what else is learned of the scene, on all data; tell normalisers of the newest.
+        """Train the model and a learned reward on all data, and update the normalisers by the newest.
 
         Args:
-            index: of the round; the first, 0, trains for ``first.steps``.
+            index: the round, from 0. Round 0 trains for ``first.steps``.
 
         Raises:
             RuntimeError: there are no trajectories.
@@ -202,7 +206,7 @@ class ActorCriticTask:
         options, first = self.options, index == 0
         steps, lr = (options.first.steps, None) if first else (options.model_steps, options.model_lr)
         data = cast(TensorDict, torch.cat(cast(Any, self.data)))
-        # All samples count alike, as when the results were measured.
+        # No size floor: all samples weigh the same, as in the published results.
         for number, member in enumerate(self.members):
             seed = options.seed + index + 1_000_000 * number
             fit(member, data, steps=steps, lr=lr, seed=seed, size_floor=None)
@@ -214,10 +218,10 @@ class ActorCriticTask:
         self.loss.fit_normalizers(seen, self.model_steps * cast(Tensor, self.starts()(_SCALED_BY)["reward"]), target)
 
     def learn_reward(self, data: TensorDict, index: int) -> None:
-        """Nothing: the reward is known. Override it to learn from all trajectories ``[K]`` in round ``index``."""
+        """Train the reward on all trajectories ``[K]`` in round ``index``. Here it is known: override to learn it."""
 
     def _take_snapshot(self) -> None:
-        """Imagine with the model as it is now."""
+        """Snapshot the model: imagination uses its current weights."""
         env = self.loss.env
         before = env.world_model.members if isinstance(env.world_model, SplitEnsemble) else [env.world_model]
         if isinstance(before[0], SpecializedPredictor):
@@ -228,9 +232,9 @@ class ActorCriticTask:
             env.world_model = cast(Any, model.split() if isinstance(model, BoundEnsemble) else model)
 
     def starts(self) -> Callable[[int], TensorDict]:
-        """What draws states ``[size]`` to imagine from, half of the newest trajectories, half of all.
+        """Return a sampler of imagination's start states ``[size]``, half from the newest trajectories, half from all.
 
-        With the ``reward`` of the step that was played there.
+        It draws ``state``, the ``reward`` that was paid there and, in tasks with a target, ``target``.
         """
         states, newest = _steps(cast(TensorDict, torch.cat(cast(Any, self.data)))), _steps(self.newest)
 
@@ -244,7 +248,7 @@ class ActorCriticTask:
 
 
 def _steps(data: TensorDict) -> TensorDict:
-    """States ``[K T]`` before the steps of trajectories ``[K]``, their rewards, and their targets."""
+    """Flatten trajectories ``[K]`` to start states ``[K T]`` with rewards and targets."""
     entries = {"state": cast(Tensor, data["state"])[:, :-1].flatten(0, 1), "reward": data["reward"].flatten(0, 1)}
     if "target" in data.keys():
         entries["target"] = cast(Tensor, data["target"]).repeat_interleave(WINDOW, 0)
@@ -252,5 +256,5 @@ def _steps(data: TensorDict) -> TensorDict:
 
 
 def _any(states: TensorDict, count: int) -> TensorDict:
-    """States at random."""
+    """Draw ``count`` states at random."""
     return states[torch.randint(len(states), (count,), device=states["state"].device)]

@@ -1,4 +1,4 @@
-"""A short-horizon actor-critic: how a policy learns on its tasks, from one round to the next."""
+"""Trainer of the short-horizon actor-critic: one policy, one or several tasks, round by round."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy
 
 
 class ActorCritic:
-    """A policy that learns in models of its tasks (:class:`~torchrl_gn.objectives.SHACLoss`), round by round.
+    """Train a policy in learned models of its tasks (:class:`~torchrl_gn.objectives.SHACLoss`), round by round.
 
-    In a round :meth:`learn` trains every task's model, and its reward if that is learned, on all trajectories, and
-    then policy and values in them; the caller plays :meth:`playing`, with exploration, and adds what was played.
-    Weights and imagined noise are drawn by torch's global generator, ``torch.manual_seed``.
+    In a round :meth:`learn` trains each task's model and, if learned, its reward on all trajectories, and then the
+    policy and the values in these models. The caller plays the policy :meth:`playing` with exploration and adds the
+    trajectories. Weights and imagined noise come from torch's global generator: seed it by ``torch.manual_seed``.
 
     Args:
-        tasks: one; or several, with a policy of kind ``"graph"``, which learns on all at once.
-        policy: to go on with. Default: a new one, of ``options``.
-        networks: of every task, to go on with, as of :attr:`ActorCriticTask.networks`. Default: new ones.
+        tasks: one task; or several with a policy of kind ``"graph"``, which learns on all of them at once.
+        policy: policy to continue with. Default: a new one, as ``options`` say.
+        networks: networks of each task to continue with, see :attr:`ActorCriticTask.networks`. Default: new ones.
 
     Raises:
-        ValueError: the kind of policy does not suit the tasks, or networks do not fit together.
+        ValueError: the kind of policy does not suit the tasks, or the networks do not fit together.
 
     Example:
         >>> from torchrl_gn.actor_critic import FirstTrajectories, SuiteActorCriticTask
@@ -79,11 +79,11 @@ class ActorCritic:
         return StatePolicy(first.scene, **given)
 
     def learn(self, index: int) -> dict[str, float]:
-        """Train the models, then policy and values in them: round ``index``, from 0.
+        """Train the models, then policy and values in the models, in round ``index`` (from 0).
 
         Returns:
-            Means over tasks and the last quarter of the updates: ``imagined_reward`` of a step, ``loss_value`` in
-            variances of the value, and ``entropy`` of actions in units of half their range.
+            Means over tasks and the last quarter of the updates: ``imagined_reward`` of a control step, ``loss_value``
+            in variances of the value, and ``entropy`` of the actions, scaled to [-1, 1].
 
         Raises:
             RuntimeError: a task has no trajectories.
@@ -96,18 +96,18 @@ class ActorCritic:
         return self.optimizer.learn(batches, **sizes, desc=f"policy, round {index}")
 
     def playing(self) -> BoundedPolicy:
-        """A copy of the policy on the processor, where MuJoCo is."""
+        """Return a copy of the policy on the CPU, where MuJoCo runs."""
         return copy.deepcopy(self.policy).cpu()
 
     def averaged_rounds(self, index: int) -> range:
-        """Rounds before ``index`` whose policies are averaged with its own: an eighth of all, or ``average``."""
+        """Return the earlier rounds to average with round ``index``: an eighth of all, at most ``average - 1``."""
         return range(index + 1 - min(self.options.average, 1 + index // 8), index)
 
     def averaged(self, before: Sequence[BoundedPolicy]) -> BoundedPolicy:
-        """:meth:`playing` with mean weights of it and of earlier rounds' policies: steadier than one.
+        """Return :meth:`playing` with weights averaged over earlier rounds; the average is steadier than one policy.
 
         Args:
-            before: on the processor, of the rounds :meth:`averaged_rounds`, say.
+            before: policies on the CPU, of the rounds :meth:`averaged_rounds`.
         """
         policy = self.playing()
         with torch.no_grad():
@@ -116,9 +116,9 @@ class ActorCritic:
         return policy
 
     def state_dict(self) -> dict[str, Any]:
-        """State to resume from, without the networks."""
+        """Return the state to resume from, without the networks."""
         return self.optimizer.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from what :meth:`state_dict` returned; ValueError if it is of other networks, or forged."""
+        """Resume from a :meth:`state_dict`; ValueError if it belongs to other networks or is malformed."""
         self.optimizer.load_state_dict(state)

@@ -1,4 +1,4 @@
-"""Play episodes, and cut them into the trajectories that the model learns from."""
+"""Play episodes and cut them into trajectories for training."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.planners import BoundedPolicy
 
 WINDOW = 50
-"""Steps of a trajectory that the model learns from."""
+"""Steps of a training trajectory."""
 
 
 def play(
@@ -25,11 +25,11 @@ def play(
     episodes: int,
     steps: int,
 ) -> TensorDict:
-    """Play episodes ``[M, T]`` in MuJoCo, from new starts, without exploration but for that of the policy.
+    """Play episodes ``[M, T]`` in MuJoCo from new starts. Only the policy adds exploration.
 
     Args:
-        policy: writes ``action`` ``[M, A]``, in the range of the environment.
-        episodes: ``M``; those of the suite's environment are as many as it has.
+        policy: writes ``action`` ``[M, A]`` within the environment's bounds.
+        episodes: ``M``; for the suite's environment, its number of environments.
         steps: ``T``, control steps.
     """
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -43,7 +43,7 @@ def play(
 def exploring(
     policy: BoundedPolicy, *, episodes: int, steps: int, color: float
 ) -> Callable[[TensorDictBase], TensorDictBase]:
-    """The policy of :func:`play` that explores by :func:`colored_noise`, from torch's generator, for one rollout."""
+    """Return a policy for one :func:`play` that explores by :func:`colored_noise`, drawn by torch's generator."""
     rest = iter(colored_noise(steps, (episodes, len(policy.middle)), color))
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
@@ -54,16 +54,16 @@ def exploring(
 
 
 def colored_noise(steps: int, shape: tuple[int, ...], color: float) -> Tensor:
-    r"""Gaussian noise ``[steps, *shape]`` of unit variance whose power falls with the frequency as :math:`f^{-color}`.
+    r"""Draw Gaussian noise ``[steps, *shape]`` of unit variance with power spectrum :math:`f^{-color}`.
 
-    0 is white, 1 pink, 2 red. Pink noise explores at all scales of time at once (Eberhard et al. 2023): white noise of
-    every control step hardly moves a body that averages it out.
+    A ``color`` of 0 is white, 1 pink, 2 red. Pink noise explores all time scales at once (Eberhard et al. 2023); white
+    noise averages out and hardly moves a body.
     """
     frequencies = torch.fft.rfftfreq(steps)
-    frequencies[0] = frequencies[1] if steps > 1 else 1.0  # the mean of an episode varies as its slowest wave
+    frequencies[0] = frequencies[1] if steps > 1 else 1.0  # an episode's mean varies as much as its slowest wave
     scale = frequencies.pow(-color / 2).view(-1, *[1] * len(shape))
     noise = torch.fft.irfft(scale * torch.fft.rfft(torch.randn(steps, *shape), dim=0), n=steps, dim=0)
-    double = torch.full_like(scale, 2.0)  # waves that stand for themselves and their mirror image
+    double = torch.full_like(scale, 2.0)  # each wave also stands for its negative frequency
     double[0] = 1
     if steps % 2 == 0:
         double[-1] = 1
@@ -71,13 +71,13 @@ def colored_noise(steps: int, shape: tuple[int, ...], color: float) -> Tensor:
 
 
 def windows(state: Tensor, action: Tensor, reward: Tensor, target: Tensor | None = None) -> TensorDict:
-    """Cut trajectories into those of :data:`WINDOW` steps, ``[K * (T // WINDOW)]``; the rest of each is left out.
+    """Cut trajectories into windows of :data:`WINDOW` steps, ``[K * (T // WINDOW)]``; drop the remainder.
 
     Args:
         state: ``[K, T + 1, N, 13]``.
         action: ``[K, T, A]``.
-        reward: ``[K, T, 1]`` that was paid.
-        target: ``[K, 3]`` of the episodes, if they have one.
+        reward: ``[K, T, 1]``, as paid.
+        target: ``[K, 3]``, one an episode, in tasks with a target.
     """
     first = range(0, action.shape[1] - WINDOW + 1, WINDOW)
     parts = {
@@ -91,5 +91,5 @@ def windows(state: Tensor, action: Tensor, reward: Tensor, target: Tensor | None
 
 
 def unbroken(played: TensorDict) -> TensorDict:
-    """Episodes ``[M, T]`` without those whose simulation became unstable."""
+    """Drop episodes of ``[M, T]`` whose simulation became unstable."""
     return played[~cast(Tensor, played["next", "terminated"]).flatten(1).any(1)]
